@@ -1,0 +1,66 @@
+# The README's two commands are `make train` and `make test`; every target installs what it needs into .venv first.
+# Another interpreter: make PYTHON=python3.12 test. Fewer tests: make test PYTEST_ARGS="-k monitor -x".
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+# Test processes. Tests run torch with one thread each.
+JOBS ?= 2
+
+VENV = .venv
+RUN = $(VENV)/bin/python -m
+INSTALLED = $(VENV)/.installed
+
+.PHONY: help install train test check format-check lint types format clean distclean
+
+help: ## this list (the default)
+	@echo "make TARGET, with TARGET one of"
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 16
+
+train: $(INSTALLED) ## train SAF on TeamSupport, compare it with a random team, leave model, curve and GIF
+	@$(RUN) sb3_saf.quickstart
+
+test: $(INSTALLED) ## run the tests
+	@$(RUN) pytest -n $(JOBS) --dist loadscope $(PYTEST_ARGS)
+
+check: $(INSTALLED) ## what CI runs: format, lint, types, tests
+	@$(MAKE) --no-print-directory format-check
+	@$(MAKE) --no-print-directory lint
+	@$(MAKE) --no-print-directory types
+	@$(MAKE) --no-print-directory test
+
+format-check: $(INSTALLED)
+	@echo "== format"
+	@$(RUN) ruff format --check . || { echo "The files above are not formatted: run 'make format'." >&2; exit 1; }
+
+lint: $(INSTALLED) ## ruff's rules (pyproject.toml)
+	@echo "== lint"
+	@$(RUN) ruff check .
+
+types: $(INSTALLED) ## mypy over everything (setup.cfg)
+	@echo "== types"
+	@$(RUN) mypy
+
+format: $(INSTALLED) ## format the code and repair what ruff can repair
+	@$(RUN) ruff check --fix-only --quiet .
+	@$(RUN) ruff format .
+
+install: $(INSTALLED) ## only set up .venv
+
+# Repeated when one of these files changes; an interrupted installation leaves no stamp and is continued.
+$(INSTALLED): setup.cfg pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+	    echo "'$(PYTHON)' is not Python 3.10 or newer. Name one that is: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' || { \
+	    echo "'$(PYTHON)' cannot make virtual environments. On Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	@echo "== install into $(VENV) (some minutes the first time)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
+	@$(RUN) pip install --constraint constraints.txt --editable '.[render,dev]'
+	@touch $@
+
+clean: ## remove caches and what was built
+	rm -rf build dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +
+
+distclean: clean ## also remove .venv
+	rm -rf $(VENV)

@@ -1,0 +1,299 @@
+"""E games of one task, stepped and observed by one compiled call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain, TreasureState
+from hecogrid_envs.core.batch_step import reset_games, step_games
+from hecogrid_envs.core.generation import clear, draw_level
+from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
+from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.core.view import draw_pictures, observe_tiles
+from hecogrid_envs.fields_of_view import seen_cells
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, TASK_NAMES, HECOGridParams, TaskName, check_task
+from hecogrid_envs.seeding import fresh_seed, generator_word
+from hecogrid_envs.state import StateMapping, check_state
+from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
+
+U8 = npt.NDArray[np.uint8]
+
+#: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
+_SLACK: Final = 64
+
+
+class GameBatch:
+    """
+    Games that share a task and parameters, but neither levels nor randomness.
+
+    :param task: ``"TeamTogether"``, ``"TeamSupport"`` or ``"KeyForTreasure"``
+    :param params: parameters of all games
+    :param n_games: E
+    :param n_threads: threads that share the games; results do not depend on it
+    :raises ValueError: for an unknown task or objects that do not fit on the map
+    """
+
+    def __init__(self, task: str, params: HECOGridParams, n_games: int = 1, n_threads: int = 1):
+        self.task: TaskName = check_task(task)
+        params.check_fits(self.task)
+        self.params = params
+        self.n_games = _positive("n_games", n_games)
+        self.n_threads = _positive("n_threads", n_threads)
+        atlases = turned_atlases(self.task, params.rules, params.view_tile_size)
+        self._atlas = atlases.reshape(-1)
+        self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
+        self._book = _rule_book(self.task, params)
+        self._games = _empty_games(self._book, self.n_games)
+        self._seeded = np.zeros(self.n_games, dtype=bool)
+        n, v = params.n_agents, params.view_size
+        self._codes = np.zeros((self.n_games, n, v, v), dtype=np.uint8)
+
+    def reset(self, which: npt.NDArray[np.bool_] | None = None, seeds: Sequence[int | None] | None = None) -> None:
+        """
+        Give games new levels.
+
+        :param which: (E,) the games to reset; all by default
+        :param seeds: (E,) a seed starts a game's randomness and history anew, None continues it
+        """
+        chosen = np.ones(self.n_games, dtype=bool) if which is None else np.asarray(which, dtype=bool)
+        for e in np.flatnonzero(chosen).tolist():
+            self._seed(e, None if seeds is None else seeds[e])
+        self._run(reset_games, chosen.astype(np.uint8))
+
+    def _seed(self, game: int, seed: int | None) -> None:
+        if seed is None and self._seeded[game]:
+            return
+        self._games.rng[game] = generator_word(fresh_seed() if seed is None else seed)
+        # Released rules keep directions from the last episode; a seed starts the history anew, facing east.
+        self._games.direction[game] = 0
+        self._seeded[game] = True
+
+    def step(self, actions: npt.NDArray[np.integer[Any]]) -> None:
+        """
+        Play one game step everywhere.
+
+        :param actions: (E, N) integers from 0 to 6
+        """
+        self._run(step_games, np.ascontiguousarray(actions, dtype=np.uint8))
+
+    def observe(self, out: U8 | None = None) -> U8:
+        """
+        Views of all agents.
+
+        :param out: array to write to; a new one by default
+        :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
+        """
+        params = self.params
+        tiles = params.observation == "tiles"
+        if out is None:
+            side, depth = (params.view_size, ()) if tiles else (params.view_pixels, (3,))
+            out = np.empty((self.n_games, params.n_agents, side, side, *depth), dtype=np.uint8)
+        codes = out if tiles else self._codes
+        self._run(observe_tiles, codes.reshape(-1))
+        if not tiles:
+            n, facing = params.n_agents, self._games.direction.reshape(-1)
+            self._share(lambda first, last: self._draw(codes, facing, out, first * n, last * n))
+        return out
+
+    def observe_game(self, game: int) -> U8:
+        """
+        Views of the agents of one game.
+
+        :return: as :meth:`observe` without its first axis
+        """
+        observe_tiles(self._games, self._book, self._codes.reshape(-1), game, game + 1)
+        codes = self._codes[game]
+        if self.params.observation == "tiles":
+            return codes.copy()
+        side = self.params.view_pixels
+        out = np.empty((self.params.n_agents, side, side, 3), dtype=np.uint8)
+        self._draw(codes, self._games.direction[game], out, 0, self.params.n_agents)
+        return out
+
+    def _draw(self, codes: U8, facing: U8, out: U8, first: int, last: int) -> None:
+        size, tile = self.params.view_size, self.params.view_tile_size
+        draw_pictures(
+            codes.reshape(-1), facing, self._atlas, self._turn_bytes, size, tile, out.reshape(-1), first, last
+        )
+
+    def _run(self, kernel: Callable[..., None], array: U8) -> None:
+        self._share(lambda first, last: kernel(self._games, self._book, array, first, last))
+
+    def _share(self, work: Callable[[int, int], None]) -> None:
+        if self.n_threads == 1:
+            work(0, self.n_games)
+            return
+        edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int)
+        with ThreadPoolExecutor(self.n_threads) as pool:
+            for done in [pool.submit(work, int(a), int(b)) for a, b in pairwise(edges)]:
+                done.result()
+
+    @property
+    def rewards(self) -> npt.NDArray[np.float64]:
+        """(E,) what each agent of a game received in the last step: treasures collected / N."""
+        return self._games.paid / self.params.n_agents
+
+    @property
+    def truncated(self) -> npt.NDArray[np.bool_]:
+        """(E,) whether the episode is over."""
+        return self._games.steps >= self.params.max_cycles
+
+    @property
+    def steps(self) -> npt.NDArray[np.int32]:
+        """(E,) game steps since the reset."""
+        return self._games.steps
+
+    @property
+    def collected(self) -> npt.NDArray[np.int32]:
+        """(E,) treasures collected since the reset: the team's return so far."""
+        return self._games.collected
+
+    @property
+    def order(self) -> npt.NDArray[np.int32]:
+        """(E, N) the order in which agents acted in the last step."""
+        return self._games.order
+
+    def get_state(self, game: int = 0) -> StateMapping:
+        """Copy the state of one game (see :class:`~hecogrid_envs.state.StateMapping`)."""
+        games, width = self._games, self.params.grid_size
+        terrain = games.terrain[game].reshape(width, width).T
+        treasures = np.zeros((width, width), dtype=np.uint8)
+        treasures[terrain == Terrain.TREASURE] = TreasureState.AVAILABLE
+        treasures[terrain == Terrain.COLLECTED] = TreasureState.COLLECTED
+        return StateMapping(
+            walls=terrain == Terrain.WALL,
+            treasures=treasures,
+            keys=terrain == Terrain.KEY,
+            agent_pos=np.stack([games.x[game], games.y[game]], axis=1).astype(np.int64),
+            agent_dir=games.direction[game].astype(np.int64),
+            agent_has_key=games.has_key[game].astype(bool),
+        )
+
+    def set_state(self, mapping: object, game: int = 0) -> None:
+        """
+        Start an episode of one game from a given state; agents in one cell arrived in index order.
+
+        :param mapping: see :class:`~hecogrid_envs.state.StateMapping`
+        :raises ValueError: naming the first fault of an inconsistent mapping
+        """
+        state = check_state(mapping, self.params)
+        games, width = self._games, self.params.grid_size
+        clear(games, self._book, game)
+        terrain = np.zeros((width, width), dtype=np.uint8)
+        terrain[state["walls"]] = Terrain.WALL
+        terrain[state["treasures"] == TreasureState.AVAILABLE] = Terrain.TREASURE
+        terrain[state["treasures"] == TreasureState.COLLECTED] = Terrain.COLLECTED
+        terrain[state["keys"]] = Terrain.KEY
+        games.terrain[game] = terrain.T.reshape(-1)
+        games.x[game], games.y[game] = state["agent_pos"].T
+        games.direction[game] = state["agent_dir"]
+        games.has_key[game] = state["agent_has_key"]
+        for agent in range(self.params.n_agents):
+            arrive(games, game, agent, int(games.y[game, agent] * width + games.x[game, agent]))
+        draw_level(games, self._book, game)
+
+    def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:
+        """
+        Which cells each agent sees.
+
+        :return: (N, W, H)
+        """
+        observe_tiles(self._games, self._book, self._codes.reshape(-1), game, game + 1)
+        state = self.get_state(game)
+        return seen_cells(
+            self._codes[game] != INVISIBLE,
+            state["agent_pos"],
+            state["agent_dir"],
+            self.params.view_offset,
+            self.params.grid_size,
+        )
+
+
+def _positive(name: str, value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+    return int(value)
+
+
+def _rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
+    view, offset = params.view_size, params.view_offset
+    pad = max(view - 1 - offset, offset, view // 2)
+    stride = params.grid_size + 2 * pad
+    zone_of_column = params.zone_of_column()
+    n_zones = int(zone_of_column.max()) + 1
+    released = params.rules == "released"
+    spread = [sum(0xFF << (8 * i) for i in range(8) if bits >> i & 1) for bits in range(256)]
+    book = RuleBook(
+        task=TASK_NAMES.index(task),
+        released=released,
+        random_order=params.agent_order == "random",
+        n_agents=params.n_agents,
+        width=params.grid_size,
+        coordination=params.coordination,
+        support_radius=params.support_radius,
+        n_treasures=params.n_treasures,
+        n_clutter=params.n_clutter,
+        n_keys=params.n_keys if task == "KeyForTreasure" else 0,
+        max_cycles=params.max_cycles,
+        view_size=view,
+        view_offset=offset,
+        stride=stride,
+        pad=pad,
+        plane_bytes=stride * stride + _SLACK,
+        bits_bytes=(stride * stride + 7) // 8 + _SLACK,
+        zone_of_column=zone_of_column.astype(np.int32),
+        command_of=params.command_of(),
+        zone_colour=(np.arange(n_zones) % len(ZONE_COLOURS)).astype(np.uint8),
+        key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
+        first_colour=BLUE_INDEX,
+        blank_planes=np.zeros(0, dtype=np.uint8),
+        blank_bits=np.zeros(0, dtype=np.uint8),
+        spread=np.array(spread, dtype=np.uint64),
+    )
+    return _with_blank_map(book)
+
+
+def _with_blank_map(book: RuleBook) -> RuleBook:
+    """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
+    planes = np.full((4, book.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
+    book = book._replace(blank_bits=np.zeros(4 * book.bits_bytes, dtype=np.uint8))
+    bits = _empty_games(book, 1)._replace(wall_bits=book.blank_bits)
+    for i in range(book.width):
+        for x, y in ((i, 0), (i, book.width - 1), (0, i), (book.width - 1, i)):
+            set_wall_bits(bits, book, 0, x, y)
+            for facing in range(4):
+                planes[facing, plane_offset(book, facing, x, y)] = FIRST_TERRAIN + Terrain.WALL
+    return book._replace(blank_planes=planes.reshape(-1))
+
+
+def _empty_games(book: RuleBook, n_games: int) -> Games:
+    agents, cells = (n_games, book.n_agents), (n_games, book.width * book.width)
+    order = np.tile(np.arange(book.n_agents, dtype=np.int32), (n_games, 1))
+    return Games(
+        rng=np.zeros(n_games, dtype=np.uint64),
+        terrain=np.zeros(cells, dtype=np.uint8),
+        head=np.full(cells, -1, dtype=np.int16),
+        tail=np.full(cells, -1, dtype=np.int16),
+        crowd=np.zeros(cells, dtype=np.int16),
+        after=np.full(agents, -1, dtype=np.int16),
+        before=np.full(agents, -1, dtype=np.int16),
+        x=np.ones(agents, dtype=np.int32),
+        y=np.ones(agents, dtype=np.int32),
+        direction=np.zeros(agents, dtype=np.uint8),
+        has_key=np.zeros(agents, dtype=np.uint8),
+        colour=np.zeros(agents, dtype=np.uint8),
+        order=order,
+        sight=np.zeros(n_games * book.n_agents * book.view_size, dtype=np.uint64),
+        sight_known=np.zeros(agents, dtype=np.uint8),
+        planes=np.zeros(n_games * 4 * book.plane_bytes, dtype=np.uint8),
+        wall_bits=np.zeros(n_games * 4 * book.bits_bytes, dtype=np.uint8),
+        steps=np.zeros(n_games, dtype=np.int32),
+        collected=np.zeros(n_games, dtype=np.int32),
+        paid=np.zeros(n_games, dtype=np.int32),
+    )

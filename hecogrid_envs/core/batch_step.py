@@ -1,0 +1,49 @@
+"""The compiled loops over games."""
+
+from __future__ import annotations
+
+from numba import njit
+
+from hecogrid_envs.core.generation import new_level
+from hecogrid_envs.core.rng import below
+from hecogrid_envs.core.rules import act
+from hecogrid_envs.core.types import U8, Games, RuleBook
+
+
+@njit(cache=True, nogil=True)
+def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int) -> None:
+    """
+    Play one step of games ``first`` to ``last - 1``.
+
+    :param actions: (E, N) action integers, 0 to 6
+    """
+    for e in range(first, last):
+        if book.random_order:
+            _shuffle_order(games, book, e)
+        games.paid[e] = 0
+        for turn in range(book.n_agents):
+            agent = games.order[e, turn]
+            act(games, book, e, agent, actions[e, agent])
+        games.collected[e] += games.paid[e]
+        games.steps[e] += 1
+
+
+@njit(cache=True, nogil=True)
+def reset_games(games: Games, book: RuleBook, which: U8, first: int, last: int) -> None:
+    """
+    Give new levels to the games that ``which`` marks.
+
+    :param which: (E,) 0 or 1
+    """
+    for e in range(first, last):
+        if which[e]:
+            new_level(games, book, e)
+
+
+@njit(cache=True, nogil=True)
+def _shuffle_order(games: Games, book: RuleBook, e: int) -> None:
+    for agent in range(book.n_agents):
+        games.order[e, agent] = agent
+    for k in range(book.n_agents - 1, 0, -1):
+        other = below(games.rng, e, k + 1)
+        games.order[e, k], games.order[e, other] = games.order[e, other], games.order[e, k]

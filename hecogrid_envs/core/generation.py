@@ -1,0 +1,106 @@
+"""A new level: treasures, clutter and keys on distinct cells, then the agents."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hecogrid_envs.constants import Terrain
+from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
+from hecogrid_envs.core.rng import below
+from hecogrid_envs.core.types import Games, RuleBook
+
+_EMPTY = int(Terrain.EMPTY)
+_WALL = int(Terrain.WALL)
+_TREASURE = int(Terrain.TREASURE)
+_KEY = int(Terrain.KEY)
+
+
+@njit(cache=True, nogil=True)
+def new_level(games: Games, book: RuleBook, e: int) -> None:
+    """Reset game ``e`` to a random level."""
+    clear(games, book, e)
+    _place_objects(games, book, e)
+    for agent in range(book.n_agents):
+        _place_agent(games, book, e, agent)
+        if not book.released:
+            games.direction[e, agent] = below(games.rng, e, 4)
+    draw_level(games, book, e)
+
+
+@njit(cache=True, nogil=True)
+def clear(games: Games, book: RuleBook, e: int) -> None:
+    """Empty map inside the outer wall, counters at zero."""
+    width = book.width
+    games.terrain[e, :] = _EMPTY
+    for i in range(width):
+        games.terrain[e, i] = _WALL
+        games.terrain[e, (width - 1) * width + i] = _WALL
+        games.terrain[e, i * width] = _WALL
+        games.terrain[e, i * width + width - 1] = _WALL
+    games.head[e, :] = -1
+    games.tail[e, :] = -1
+    games.crowd[e, :] = 0
+    games.has_key[e, :] = 0
+    games.steps[e] = 0
+    games.collected[e] = 0
+    games.paid[e] = 0
+
+
+@njit(cache=True, nogil=True)
+def _place_objects(games: Games, book: RuleBook, e: int) -> None:
+    inside = book.width - 2
+    n_cells = inside * inside
+    cells = np.arange(n_cells)
+    n_objects = book.n_treasures + book.n_clutter + book.n_keys
+    for k in range(n_objects):
+        pick = k + below(games.rng, e, n_cells - k)
+        cell = cells[pick]
+        cells[pick] = cells[k]
+        terrain = _KEY
+        if k < book.n_treasures:
+            terrain = _TREASURE
+        elif k < book.n_treasures + book.n_clutter:
+            terrain = _WALL
+        games.terrain[e, (cell // inside + 1) * book.width + cell % inside + 1] = terrain
+
+
+@njit(cache=True, nogil=True)
+def _place_agent(games: Games, book: RuleBook, e: int, agent: int) -> None:
+    inside = book.width - 2
+    while True:
+        x = 1 + below(games.rng, e, inside)
+        y = 1 + below(games.rng, e, inside)
+        ground = games.terrain[e, y * book.width + x]
+        if ground not in (_WALL, _KEY):
+            break
+    games.x[e, agent] = x
+    games.y[e, agent] = y
+    arrive(games, e, agent, y * book.width + x)
+
+
+@njit(cache=True, nogil=True)
+def draw_level(games: Games, book: RuleBook, e: int) -> None:
+    """Derive everything that views need from terrain and agents, at the start of an episode."""
+    planes, bits = e * 4 * book.plane_bytes, e * 4 * book.bits_bytes
+    games.planes[planes : planes + 4 * book.plane_bytes] = book.blank_planes
+    games.wall_bits[bits : bits + 4 * book.bits_bytes] = book.blank_bits
+    games.sight_known[e, :] = 0
+    for agent in range(book.n_agents):
+        games.colour[e, agent] = book.first_colour if book.released else present_colour(games, book, e, agent)
+    for y in range(1, book.width - 1):
+        for x in range(1, book.width - 1):
+            cell = y * book.width + x
+            ground = games.terrain[e, cell]
+            if ground != _EMPTY or games.head[e, cell] >= 0:
+                redraw_cell(games, book, e, x, y)
+                if ground == _WALL:
+                    set_wall_bits(games, book, e, x, y)
+
+
+@njit(cache=True, nogil=True)
+def present_colour(games: Games, book: RuleBook, e: int, agent: int) -> int:
+    """Palette index of an agent by its present zone and key."""
+    if games.has_key[e, agent]:
+        return book.key_colour
+    return book.zone_colour[book.zone_of_column[games.x[e, agent]]]

@@ -1,0 +1,112 @@
+"""Who stands where, in order of arrival, and what every cell looks like from the four directions."""
+
+from __future__ import annotations
+
+from numba import njit
+
+from hecogrid_envs.constants import AGENT_PALETTE, Terrain
+from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.tiles import FIRST_AGENT, FIRST_KEY, FIRST_TERRAIN
+
+_N_COLOURS = len(AGENT_PALETTE)
+_TREASURE = int(Terrain.TREASURE)
+_COLLECTED = int(Terrain.COLLECTED)
+_KEY = int(Terrain.KEY)
+
+
+@njit(cache=True, nogil=True)
+def arrive(games: Games, e: int, agent: int, cell: int) -> None:
+    """Put an agent last in the order of arrival of a cell."""
+    last = games.tail[e, cell]
+    games.before[e, agent] = last
+    games.after[e, agent] = -1
+    if last < 0:
+        games.head[e, cell] = agent
+    else:
+        games.after[e, last] = agent
+    games.tail[e, cell] = agent
+    games.crowd[e, cell] += 1
+
+
+@njit(cache=True, nogil=True)
+def leave(games: Games, e: int, agent: int, cell: int) -> None:
+    """Take an agent out of its cell; if it was first, the next becomes first."""
+    previous, following = games.before[e, agent], games.after[e, agent]
+    if previous < 0:
+        games.head[e, cell] = following
+    else:
+        games.after[e, previous] = following
+    if following < 0:
+        games.tail[e, cell] = previous
+    else:
+        games.before[e, following] = previous
+    games.crowd[e, cell] -= 1
+
+
+@njit(cache=True, nogil=True)
+def count_around(games: Games, book: RuleBook, e: int, x: int, y: int) -> int:
+    """Agents within ``support_radius`` (Chebyshev) of a cell."""
+    radius, width = book.support_radius, book.width
+    total = 0
+    if (2 * radius + 1) * (2 * radius + 1) > book.n_agents:
+        for agent in range(book.n_agents):
+            if abs(games.x[e, agent] - x) <= radius and abs(games.y[e, agent] - y) <= radius:
+                total += 1
+        return total
+    for row in range(max(0, y - radius), min(width, y + radius + 1)):
+        for column in range(max(0, x - radius), min(width, x + radius + 1)):
+            total += games.crowd[e, row * width + column]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def agent_code(ground: int, colour: int, direction: int) -> int:
+    """Tile code of an agent; ``ground`` is the terrain it stands on."""
+    layer = 0
+    if ground == _TREASURE:
+        layer = 1
+    elif ground == _COLLECTED:
+        layer = 2
+    return FIRST_AGENT + (layer * _N_COLOURS + colour) * 4 + direction
+
+
+@njit(cache=True, nogil=True)
+def plane_offset(book: RuleBook, facing: int, x: int, y: int) -> int:
+    """
+    Where a cell lies in the plane that is turned for a viewer facing ``facing``.
+
+    In each plane the viewer looks towards smaller rows and its right is towards larger columns.
+    """
+    last = book.stride - 1
+    px, py = x + book.pad, y + book.pad
+    if facing == 0:
+        return (last - px) * book.stride + py
+    if facing == 1:
+        return (last - py) * book.stride + last - px
+    if facing == 2:
+        return px * book.stride + last - py
+    return py * book.stride + px
+
+
+@njit(cache=True, nogil=True)
+def redraw_cell(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
+    """Write a cell's present tile code into the four planes."""
+    cell = y * book.width + x
+    ground = games.terrain[e, cell]
+    first = games.head[e, cell]
+    for facing in range(4):
+        if first >= 0:
+            code = agent_code(ground, games.colour[e, first], (games.direction[e, first] - facing + 3) & 3)
+        elif ground == _KEY:
+            code = FIRST_KEY + ((facing + 1) & 3)
+        else:
+            code = FIRST_TERRAIN + ground
+        games.planes[(e * 4 + facing) * book.plane_bytes + plane_offset(book, facing, x, y)] = code
+
+
+@njit(cache=True, nogil=True)
+def set_wall_bits(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
+    """Mark a cell as opaque in the four orientations."""
+    for facing in range(4):
+        bit = plane_offset(book, facing, x, y)
+        games.wall_bits[(e * 4 + facing) * book.bits_bytes + (bit >> 3)] |= 1 << (bit & 7)

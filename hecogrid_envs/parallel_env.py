@@ -1,0 +1,250 @@
+"""One HECOGrid game as a PettingZoo ParallelEnv."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from inspect import cleandoc
+from typing import Any, ClassVar, NamedTuple, get_args
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from hecogrid_envs.batch import GameBatch
+from hecogrid_envs.constants import N_ACTIONS, RenderMode
+from hecogrid_envs.page import COMMON_PAGE
+from hecogrid_envs.params import HECOGridParams, TaskName
+from hecogrid_envs.state import STATE_PLANES, StateMapping, central_view, state_option
+from hecogrid_envs.tiles import observation_space
+
+Observations = dict[str, npt.NDArray[np.uint8]]
+Infos = dict[str, dict[str, Any]]
+
+
+class StepResult(NamedTuple):
+    """What a step returns, one entry per agent in each dict."""
+
+    observations: Observations
+    rewards: dict[str, float]
+    terminations: dict[str, bool]
+    truncations: dict[str, bool]
+    infos: Infos
+
+
+class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
+    """
+    What the three tasks share; the classes in :mod:`hecogrid_envs.tasks` document the games.
+
+    :param render_mode: ``"rgb_array"``, ``"human"`` (a window), ``"ansi"`` (text) or None
+    :param params: the fields of :class:`~hecogrid_envs.params.HECOGridParams`
+    :raises ValueError: for an unknown parameter, a value out of range, or objects that do not fit on the map
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "hecogrid_v0",
+        "render_modes": list(get_args(RenderMode)),
+        "render_fps": 8,
+        "is_parallelizable": True,
+    }
+    task: ClassVar[TaskName]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        # Each task's docstring is its documentation page; what all tasks share is written once.
+        cls.__doc__ = f"{cleandoc(cls.__doc__ or '')}\n\n{COMMON_PAGE}"
+
+    def __init__(self, render_mode: RenderMode | None = None, **params: Any):
+        self._setup(GameBatch(self.task, HECOGridParams.from_kwargs(params)), 0, render_mode)
+
+    @classmethod
+    def of_batch(cls, batch: GameBatch, game: int, render_mode: RenderMode | None = None) -> HECOGridEnv:
+        """View one game of a batch as an environment; both see every change."""
+        env = cls.__new__(cls)
+        env._setup(batch, game, render_mode)
+        return env
+
+    def _setup(self, batch: GameBatch, game: int, render_mode: RenderMode | None) -> None:
+        if render_mode is not None and render_mode not in get_args(RenderMode):
+            raise ValueError(f"render_mode must be one of {get_args(RenderMode)} or None, got {render_mode!r}")
+        self.params = batch.params
+        self.render_mode = render_mode
+        self._batch = batch
+        self._game = game
+        self._window: Any = None
+        self.possible_agents = [f"agent_{i}" for i in range(self.params.n_agents)]
+        self.agents: list[str] = []
+        own_space = observation_space(self.task, self.params)
+        size = self.params.grid_size
+        # One object per agent and call: seeding a space must be seen by the next call.
+        self.observation_spaces = dict.fromkeys(self.possible_agents, own_space)
+        self.action_spaces = {agent: spaces.Discrete(N_ACTIONS) for agent in self.possible_agents}
+        self.state_space = spaces.Box(0, 255, (size, size, len(STATE_PLANES)), np.uint8)
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Space of an agent's observation."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        """Seven action integers; what they do depends on the agent's zone."""
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observations, Infos]:
+        """
+        Start an episode.
+
+        :param seed: starts the game's randomness anew; None continues it
+        :param options: ``{"state": mapping}`` starts from a given state instead of a random level
+        :return: observations and empty infos, per agent
+        :raises ValueError: for a negative seed or an inconsistent state
+        """
+        # A refused state leaves the game as it was: checked before anything changes.
+        state = state_option(options, self.params)
+        which = np.zeros(self._batch.n_games, dtype=bool)
+        which[self._game] = True
+        seeds: list[int | None] = [None] * self._batch.n_games
+        seeds[self._game] = seed
+        self._batch.reset(which, seeds)
+        if state is not None:
+            self._batch.set_state(state, self._game)
+        self.agents = list(self.possible_agents)
+        if self.render_mode == "human":
+            self.render()
+        return self.observations(), {agent: {} for agent in self.agents}
+
+    def step(self, actions: Mapping[str, int]) -> StepResult:
+        """
+        Play one game step.
+
+        :param actions: an integer from 0 to 6 for every agent
+        :return: observations, rewards (treasures collected in this step / N), terminations (never), truncations
+            (after ``max_cycles`` steps) and infos, per agent
+        :raises ValueError: for a missing or unknown agent, an action outside the space, or a step without a reset
+        """
+        self._batch.step(self._checked(actions))
+        agents, reward = self.agents, float(self._batch.rewards[self._game])
+        over = bool(self._batch.truncated[self._game])
+        result = StepResult(
+            observations=self.observations(),
+            rewards=dict.fromkeys(agents, reward),
+            terminations=dict.fromkeys(agents, False),
+            truncations=dict.fromkeys(agents, over),
+            infos={agent: {} for agent in agents},
+        )
+        if over:
+            self.agents = []
+        if self.render_mode == "human":
+            self.render()
+        return result
+
+    def _checked(self, actions: Mapping[str, int]) -> npt.NDArray[np.uint8]:
+        if self._batch.n_games > 1:
+            raise ValueError("this game is one of a batch and steps with it: call step on the vector environment")
+        if not self.agents:
+            raise ValueError("the episode has not begun or is over: call reset() before step()")
+        if not isinstance(actions, Mapping):
+            raise ValueError(f"actions must be a dict from agent to action, got {type(actions).__name__}")
+        if actions.keys() != set(self.agents):
+            for agent in self.agents:
+                if agent not in actions:
+                    raise ValueError(f"no action for {agent!r}; every agent needs one: {', '.join(self.agents)}")
+            unknown = next(agent for agent in actions if agent not in self.agents)
+            raise ValueError(f"unknown agent {unknown!r}; the agents are {', '.join(self.agents)}")
+        row = np.empty((1, len(self.agents)), dtype=np.uint8)
+        for i, agent in enumerate(self.agents):
+            row[0, i] = _checked_action(agent, actions[agent])
+        return row
+
+    def observations(self) -> Observations:
+        """Views of all agents at this moment, also after :meth:`set_state`."""
+        return dict(zip(self.possible_agents, self._batch.observe_game(self._game), strict=True))
+
+    def state(self) -> npt.NDArray[np.uint8]:
+        """The central view: (W, H, 10), planes as in :data:`hecogrid_envs.state.STATE_PLANES`."""
+        return central_view(self.get_state(), self.params.zone_of_column())
+
+    def get_state(self) -> StateMapping:
+        """The whole game as plain arrays (see :class:`hecogrid_envs.state.StateMapping`)."""
+        return self._batch.get_state(self._game)
+
+    def set_state(self, state: object) -> None:
+        """
+        Start an episode from a given state; :meth:`observations` gives its views.
+
+        :param state: see :class:`hecogrid_envs.state.StateMapping`
+        :raises ValueError: naming the first fault of an inconsistent mapping
+        """
+        self.reset(options={"state": state})
+
+    @property
+    def n_steps(self) -> int:
+        """Game steps since the reset."""
+        return int(self._batch.steps[self._game])
+
+    @property
+    def collected(self) -> int:
+        """Treasures collected since the reset: the team's return so far."""
+        return int(self._batch.collected[self._game])
+
+    @property
+    def acting_order(self) -> list[int]:
+        """Agent indices in the order in which they acted in the last step."""
+        return self._batch.order[self._game].tolist()
+
+    def render(self) -> npt.NDArray[np.uint8] | str | None:
+        """
+        Show the game.
+
+        :return: (height, width, 3) uint8 for ``"rgb_array"``, text for ``"ansi"``, None for ``"human"``
+        """
+        if self.render_mode is None:
+            first = self.metadata["render_modes"][0]
+            raise ValueError(f"no render_mode was given; create the environment with render_mode={first!r}")
+        if self.render_mode == "ansi":
+            from hecogrid_envs.text import render_text
+
+            zones = self.params.zone_of_column() if self.params.heterogeneity > 1 else None
+            return render_text(self.get_state(), zones=zones, step=self.n_steps, collected=self.collected)
+        frame = self._frame()
+        if self.render_mode == "rgb_array":
+            return frame
+        self._show(frame)
+        return None
+
+    def _frame(self) -> npt.NDArray[np.uint8]:
+        from hecogrid_envs.rendering import Scene, fit_tile_size, render_scene
+
+        scene = Scene(
+            task=self.task,
+            params=self.params,
+            state=self.get_state(),
+            step=self.n_steps,
+            collected=self.collected,
+            visible=self._batch.fields_of_view(self._game),
+        )
+        return render_scene(scene, fit_tile_size(self.params.grid_size) if self.render_mode == "human" else None)
+
+    def _show(self, frame: npt.NDArray[np.uint8]) -> None:
+        from hecogrid_envs.window import HumanWindow
+
+        if self._window is None:
+            self._window = HumanWindow(f"HECOGrid: {self.task}", fps=self.metadata["render_fps"])
+        self._window.show(frame)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def __str__(self) -> str:
+        return f"hecogrid/{self.task}-v0"
+
+
+def _checked_action(agent: str, action: object) -> int:
+    integer = isinstance(action, (int, np.integer)) and not isinstance(action, bool)
+    if isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu":
+        action, integer = int(action), True
+    if not integer or not 0 <= action < N_ACTIONS:  # type: ignore[operator]
+        raise ValueError(f"action of {agent!r} must be an integer from 0 to {N_ACTIONS - 1}, got {action!r}")
+    return int(action)  # type: ignore[call-overload]

@@ -1,0 +1,217 @@
+"""The parameters of a HECOGrid world, checked once, where they enter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from numbers import Real
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from hecogrid_envs.constants import (
+    MAX_ZONES_AT_STRIDE,
+    ZONE_STRIDE,
+    AgentOrder,
+    Observation,
+    Rules,
+    action_permutations,
+)
+
+TaskName = Literal["TeamTogether", "TeamSupport", "KeyForTreasure"]
+TASK_NAMES: tuple[TaskName, ...] = get_args(TaskName)
+
+#: Largest view whose rows still fit into one unaligned 64-bit word of wall bits.
+MAX_VIEW_SIZE = 57
+MAX_GRID_SIZE = 1000
+MAX_AGENTS = 32_000
+MAX_TILE_SIZE = 128
+#: Larger tiles have grid lines, which turn with the viewer, so that a tile code alone does not tell its pixels.
+MAX_CODED_TILE_SIZE = 10
+
+
+@dataclass(frozen=True)
+class HECOGridParams:
+    """
+    Parameters of a world; the defaults are the paper's.
+
+    :param n_agents: N, agents in the team
+    :param grid_size: width and height of the map in cells, the outer wall included
+    :param coordination: c, agents needed for one treasure, the collector included; 1 <= c <= N
+    :param heterogeneity: h, number of zones (vertical stripes) with different dynamics; 1 <= h <= grid_size - 2
+    :param n_treasures: treasures on the map
+    :param n_keys: keys on the map; KeyForTreasure only, other tasks place none
+    :param clutter_density: share of the interior that is wall: ``int(density * (grid_size - 2) ** 2)`` cells
+    :param view_size: side of an agent's square view in cells; odd
+    :param view_tile_size: pixels per cell in an ``"rgb"`` observation
+    :param view_offset: rows visible behind the agent
+    :param support_radius: Chebyshev distance that counts as support
+    :param max_cycles: game steps per episode
+    :param rules: ``"paper"``, or ``"released"`` for the behaviour of the code that published numbers came from
+    :param agent_order: order in which agents act within a step, ``"random"`` (drawn anew each step) or ``"index"``
+    :param observation: ``"rgb"`` pictures or ``"tiles"``, the same views as one code per cell
+    :raises ValueError: if a value is outside its range or the objects do not fit on the map
+    """
+
+    n_agents: int = 10
+    grid_size: int = 30
+    coordination: int = 1
+    heterogeneity: int = 1
+    n_treasures: int = 100
+    n_keys: int = 30
+    clutter_density: float = 0.1
+    view_size: int = 7
+    view_tile_size: int = 4
+    view_offset: int = 1
+    support_radius: int = 2
+    max_cycles: int = 50
+    rules: Rules = "paper"
+    agent_order: AgentOrder = "random"
+    observation: Observation = "rgb"
+
+    def __post_init__(self) -> None:
+        self._check_integers()
+        self._check_density()
+        self._check_choice("rules", get_args(Rules))
+        self._check_choice("agent_order", get_args(AgentOrder))
+        self._check_choice("observation", get_args(Observation))
+        if self.observation == "tiles" and self.view_tile_size > MAX_CODED_TILE_SIZE:
+            raise ValueError(
+                f"observation='tiles' needs a view_tile_size from 1 to {MAX_CODED_TILE_SIZE}, got "
+                f"{self.view_tile_size}: larger tiles have grid lines that turn with the viewer, so a code alone does "
+                "not tell its pixels; use observation='rgb'"
+            )
+
+    @classmethod
+    def from_kwargs(cls, params: Mapping[str, Any]) -> HECOGridParams:
+        """
+        Build from keyword arguments.
+
+        :raises ValueError: for a name that is no parameter, with the nearest one that is
+        """
+        known = [field.name for field in fields(cls)]
+        for name in params:
+            if name not in known:
+                raise ValueError(
+                    f"unknown parameter {name!r}{_did_you_mean(name, known)}; the parameters are {', '.join(known)}"
+                )
+        return cls(**params)
+
+    def _check_integers(self) -> None:
+        self._check_integer("n_agents", 1, MAX_AGENTS)
+        self._check_integer("grid_size", 3, MAX_GRID_SIZE)
+        self._check_integer("coordination", 1, self.n_agents, " (1 <= coordination <= n_agents)")
+        self._check_integer("heterogeneity", 1, self.grid_size - 2, " (1 <= heterogeneity <= grid_size - 2)")
+        self._check_integer("n_treasures", 0, self.n_interior_cells)
+        # Tasks without keys ignore their number, so whether they fit is for check_fits to say.
+        self._check_integer("n_keys", 0, MAX_GRID_SIZE**2)
+        self._check_integer("view_size", 1, MAX_VIEW_SIZE, " and odd")
+        if self.view_size % 2 == 0:
+            raise ValueError(f"view_size must be odd, from 1 to {MAX_VIEW_SIZE}, got {self.view_size!r}")
+        self._check_integer("view_tile_size", 1, MAX_TILE_SIZE)
+        self._check_integer("view_offset", 0, self.view_size - 1, " (0 <= view_offset < view_size)")
+        self._check_integer("support_radius", 0, self.grid_size)
+        self._check_integer("max_cycles", 1, 2**31 - 1)
+
+    def _check_integer(self, name: str, low: int, high: int, note: str = "") -> None:
+        value = getattr(self, name)
+        if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
+            raise ValueError(f"{name} must be an integer from {low} to {high}{note}, got {value!r}")
+        object.__setattr__(self, name, int(value))
+
+    def _check_density(self) -> None:
+        value = self.clutter_density
+        if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real) or not 0 <= value < 1:
+            raise ValueError(f"clutter_density must be a number from 0 (included) to 1 (excluded), got {value!r}")
+        object.__setattr__(self, "clutter_density", float(value))
+
+    def _check_choice(self, name: str, allowed: tuple[str, ...]) -> None:
+        value = getattr(self, name)
+        if value not in allowed:
+            choices = " or ".join(repr(choice) for choice in allowed)
+            raise ValueError(f"{name} must be {choices}, got {value!r}{_did_you_mean(value, list(allowed))}")
+
+    def check_fits(self, task: TaskName) -> None:
+        """
+        Check that treasures, clutter, keys and agents fit on the map.
+
+        :raises ValueError: with the number of cells wanted and available
+        """
+        n_keys = self.n_keys if task == "KeyForTreasure" else 0
+        wanted = self.n_treasures + self.n_clutter + n_keys
+        if wanted > self.n_interior_cells:
+            raise ValueError(
+                f"the map is too small: {self.n_treasures} treasures (n_treasures) + {self.n_clutter} walls "
+                f"(clutter_density={self.clutter_density}) + {n_keys} keys (n_keys) need {wanted} cells, "
+                f"grid_size={self.grid_size} has {self.n_interior_cells}; lower them or raise grid_size"
+            )
+        if self.n_clutter + n_keys >= self.n_interior_cells:
+            raise ValueError(
+                f"no cell is left for agents to stand on: {self.n_clutter} walls (clutter_density="
+                f"{self.clutter_density}) + {n_keys} keys (n_keys) fill all {self.n_interior_cells} cells of "
+                f"grid_size={self.grid_size}; lower them or raise grid_size"
+            )
+
+    @property
+    def n_interior_cells(self) -> int:
+        """Cells inside the outer wall."""
+        return (self.grid_size - 2) ** 2
+
+    @property
+    def n_clutter(self) -> int:
+        """Wall cells inside the outer wall."""
+        return int(self.clutter_density * self.n_interior_cells)
+
+    @property
+    def view_pixels(self) -> int:
+        """Side of an ``"rgb"`` observation in pixels."""
+        return self.view_size * self.view_tile_size
+
+    def zone_of_column(self) -> npt.NDArray[np.int64]:
+        """
+        Zone of each column x.
+
+        The released rules make one zone too many (or more) when h does not divide the width.
+
+        :return: (grid_size,)
+        """
+        columns = np.arange(self.grid_size)
+        if self.rules == "paper":
+            return columns * self.heterogeneity // self.grid_size
+        return columns // (self.grid_size // self.heterogeneity)
+
+    def command_of(self) -> npt.NDArray[np.uint8]:
+        """
+        What each action integer triggers in each zone.
+
+        Beyond the last permutation the table starts again; the paper's rules never get there.
+
+        :return: (n_zones, 7), the command that action integer ``a`` triggers in zone ``z``
+        """
+        n_zones = int(self.zone_of_column().max()) + 1
+        table = action_permutations()
+        few = self.heterogeneity <= MAX_ZONES_AT_STRIDE
+        stride = ZONE_STRIDE if few else len(table) // self.heterogeneity
+        action_of = table[(stride * np.arange(n_zones)) % len(table)]
+        return np.argsort(action_of, axis=1).astype(np.uint8)
+
+
+def _did_you_mean(value: object, known: list[str]) -> str:
+    close = get_close_matches(str(value), known, n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def check_task(task: object) -> TaskName:
+    """
+    Check a task's name.
+
+    :raises ValueError: with the nearest name that exists
+    """
+    for name in TASK_NAMES:
+        if task == name:
+            return name
+    raise ValueError(
+        f"unknown task {task!r}{_did_you_mean(task, list(TASK_NAMES))}; the tasks are {', '.join(TASK_NAMES)}"
+    )

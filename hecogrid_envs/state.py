@@ -1,0 +1,160 @@
+"""The state of one game as plain arrays: fixed, drawn, stored and replayed levels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple, TypedDict
+
+import numpy as np
+import numpy.typing as npt
+
+from hecogrid_envs.constants import TreasureState
+from hecogrid_envs.params import HECOGridParams
+
+Bools = npt.NDArray[np.bool_]
+
+
+class StateMapping(TypedDict):
+    """
+    One game. W x H cells, N agents; planes are indexed ``[x, y]``.
+
+    ``walls`` bool (W, H), ``treasures`` uint8 (W, H) with 0 none, 1 available, 2 collected, ``keys`` bool (W, H),
+    ``agent_pos`` int (N, 2) as x, y, ``agent_dir`` int (N,), ``agent_has_key`` bool (N,).
+    """
+
+    walls: Bools
+    treasures: npt.NDArray[np.uint8]
+    keys: Bools
+    agent_pos: npt.NDArray[np.int64]
+    agent_dir: npt.NDArray[np.int64]
+    agent_has_key: Bools
+
+
+class _Entry(NamedTuple):
+    shape: tuple[int, ...]
+    kind: str
+    high: int
+
+
+#: Planes of the central view, the last axis of ``state()``.
+STATE_PLANES: Final = (
+    "wall",
+    "treasure available",
+    "treasure collected",
+    "key",
+    "agents facing east",
+    "agents facing south",
+    "agents facing west",
+    "agents facing north",
+    "agents with a key",
+    "zone",
+)
+
+
+def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
+    """
+    Check a state mapping and bring its arrays to their types.
+
+    :param mapping: see :class:`StateMapping`
+    :raises ValueError: naming the first fault
+    """
+    if not isinstance(mapping, Mapping):
+        raise ValueError(f"a state must be a mapping of arrays, got {type(mapping).__name__}")
+    entries = _entries(params)
+    missing = [name for name in entries if name not in mapping]
+    if missing:
+        raise ValueError(f"state lacks {missing[0]!r}; it needs {', '.join(entries)}")
+    unknown = [name for name in mapping if name not in entries]
+    if unknown:
+        raise ValueError(f"state has an unknown entry {unknown[0]!r}; it needs just {', '.join(entries)}")
+    arrays: Any = {name: _check_array(name, mapping[name], entry) for name, entry in entries.items()}
+    state: StateMapping = arrays
+    _check_board(state)
+    _check_agents(state)
+    return state
+
+
+def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> StateMapping | None:
+    """
+    The state that the options of a reset ask for, if any.
+
+    :raises ValueError: naming the first fault of an inconsistent mapping
+    """
+    if options is None or options.get("state") is None:
+        return None
+    return check_state(options["state"], params)
+
+
+def _entries(params: HECOGridParams) -> dict[str, _Entry]:
+    plane, n = (params.grid_size, params.grid_size), params.n_agents
+    return {
+        "walls": _Entry(plane, "bool", 1),
+        "treasures": _Entry(plane, "uint8", max(TreasureState)),
+        "keys": _Entry(plane, "bool", 1),
+        "agent_pos": _Entry((n, 2), "int64", params.grid_size - 1),
+        "agent_dir": _Entry((n,), "int64", 3),
+        "agent_has_key": _Entry((n,), "bool", 1),
+    }
+
+
+def _check_array(name: str, value: object, entry: _Entry) -> npt.NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"state entry {name!r} is no array: {error}") from error
+    if array.shape != entry.shape:
+        raise ValueError(f"state entry {name!r} must have shape {entry.shape}, got {array.shape}")
+    if array.dtype.kind not in "bui":
+        raise ValueError(f"state entry {name!r} must be {entry.kind}, got {array.dtype}")
+    wrong = (array < 0) | (array > entry.high)
+    if wrong.any():
+        raise ValueError(
+            f"state entry {name!r} must hold values from 0 to {entry.high}, "
+            f"got {array[wrong][0]} at index {_first(wrong)}"
+        )
+    return array.astype(entry.kind)
+
+
+def _first(where: Bools) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.argwhere(where)[0])
+
+
+def _check_board(state: StateMapping) -> None:
+    walls, treasures, keys = state["walls"], state["treasures"] != TreasureState.NONE, state["keys"]
+    ring = np.ones_like(walls)
+    ring[1:-1, 1:-1] = False
+    for fault, where in (
+        ("the outer ring must be wall, but there is none", ring & ~walls),
+        ("a treasure lies in a wall", treasures & walls),
+        ("a key lies in a wall", keys & walls),
+        ("a key and a treasure share a cell", keys & treasures),
+    ):
+        if where.any():
+            raise ValueError(f"inconsistent state: {fault} at (x, y) = {_first(where)}")
+
+
+def _check_agents(state: StateMapping) -> None:
+    for agent, (x, y) in enumerate(state["agent_pos"]):
+        for thing, plane in (("in a wall", state["walls"]), ("on a key", state["keys"])):
+            if plane[x, y]:
+                raise ValueError(f"inconsistent state: agent {agent} stands {thing} at (x, y) = ({x}, {y})")
+
+
+def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+    """
+    The whole game in planes, for a critic that may see everything.
+
+    :param zone_of_column: (W,)
+    :return: (W, H, 10) uint8, planes as in :data:`STATE_PLANES`; counts stop at 255
+    """
+    width, height = state["walls"].shape
+    counts = np.zeros((width, height, len(STATE_PLANES)), dtype=np.int64)
+    counts[..., 0] = state["walls"]
+    counts[..., 1] = state["treasures"] == TreasureState.AVAILABLE
+    counts[..., 2] = state["treasures"] == TreasureState.COLLECTED
+    counts[..., 3] = state["keys"]
+    x, y = state["agent_pos"].T
+    np.add.at(counts, (x, y, 4 + state["agent_dir"]), 1)
+    np.add.at(counts, (x, y, np.full_like(x, 8)), state["agent_has_key"].astype(np.int64))
+    counts[..., 9] = zone_of_column[:, None]
+    return np.minimum(counts, 255).astype(np.uint8)

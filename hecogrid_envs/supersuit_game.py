@@ -1,0 +1,499 @@
+"""One game as SuperSuit sees it: the repairs that sit below SuperSuit's own vector environments."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import traceback
+from collections.abc import Callable, Container, Mapping, Sequence
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import cloudpickle
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+
+#: Key of the letters, in the options of a reset on its way down.
+LETTERS = "supersuit_bridge/letters"
+#: Keys of what a game packs into the infos on their way up; the bridge unpacks all of it.
+REPLY = "supersuit_bridge/reply"
+STEP_INFO = "supersuit_bridge/step_info"
+RESET_INFOS = "supersuit_bridge/reset_infos"
+FAILED_STEP = "supersuit_bridge/failed_step"
+
+AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
+MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
+#: Something to do with a game.
+Letter: TypeAlias = "Callable[[Game], Any]"
+Info: TypeAlias = "dict[str, Any]"
+
+#: Info of an agent that does not take part: it has ended before its team, or not joined yet.
+INACTIVE: Info = {"active": False}
+
+_FIXED_SHAPE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+_UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
+_MISSING = object()
+
+
+class Failure(NamedTuple):
+    """An exception on its way from a game to whoever called the bridge."""
+
+    error: BaseException
+    trace: str
+
+    @classmethod
+    def of(cls, error: BaseException, remote: bool) -> Failure:
+        """
+        Pack the exception that is being handled.
+
+        :param error: the exception
+        :param remote: whether it goes to another process; one that cannot be pickled is then told in a RuntimeError
+        """
+        trace = traceback.format_exc()
+        if remote:
+            try:
+                pickle.loads(pickle.dumps(error))
+            except Exception:
+                error = RuntimeError(f"{type(error).__name__}: {error}")
+        return cls(error, trace)
+
+
+@dataclass(frozen=True)
+class Blueprint:
+    """
+    What it takes to build a game anywhere, and what is known of it before it is built.
+
+    :param parcel: the environment, or the function that makes it, pickled
+    :param is_factory: whether the parcel holds the function
+    :param agents: N names, in the order of the rows
+    :param observation_space: of every agent
+    :param action_space: of every agent
+    :param metadata: of the environment
+    :param render_mode: of the environment
+    """
+
+    parcel: bytes
+    is_factory: bool
+    agents: tuple[Any, ...]
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    metadata: dict[str, Any]
+    render_mode: str | None
+
+    @classmethod
+    def of(cls, make_env: MakeEnv) -> Blueprint:
+        """
+        Draw the blueprint of an environment.
+
+        :param make_env: an environment, or a function that makes one
+        :raises ValueError: if it is no ParallelEnv, cannot be copied, or its agents differ in their spaces
+        """
+        is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
+        example: Any = make_env() if is_factory else make_env
+        _check_is_parallel(example, is_factory)
+        try:
+            agents = tuple(example.possible_agents)
+            return cls(
+                _pickled(make_env, is_factory),
+                is_factory,
+                agents,
+                _checked_space("observation", agents, example.observation_space),
+                _checked_space("action", agents, example.action_space),
+                metadata=dict(getattr(example, "metadata", None) or {}),
+                render_mode=getattr(example, "render_mode", None),
+            )
+        finally:
+            if is_factory:
+                # Games may rely on having been reset before they are closed; this one has only been looked at.
+                with suppress(Exception):
+                    example.close()
+
+    def build(self) -> AnyParallelEnv:
+        """Build a game."""
+        content = pickle.loads(self.parcel)
+        env: AnyParallelEnv = content() if self.is_factory else content
+        return env
+
+
+def _check_is_parallel(env: Any, is_factory: bool) -> None:
+    origin = "a function that returned " if is_factory else ""
+    if isinstance(env, AECEnv):
+        raise ValueError(
+            f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
+            "convert it with pettingzoo.utils.conversions.aec_to_parallel"
+        )
+    if not isinstance(env, ParallelEnv):
+        hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""
+        raise ValueError(
+            "expected a PettingZoo ParallelEnv or a function that makes one, "
+            f"got {origin}an object of type {type(env).__name__}{hint}"
+        )
+    if not getattr(env, "possible_agents", None):
+        raise ValueError(f"expected {env} to list its agents in possible_agents (each gets a row), got none")
+
+
+def _checked_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], spaces.Space[Any]]) -> spaces.Space[Any]:
+    """The one space of all agents."""
+    space_by_agent = {agent: space_of(agent) for agent in agents}
+    first = space_by_agent[agents[0]]
+    others = [f"{agent} has {space}" for agent, space in space_by_agent.items() if space != first]
+    if others:
+        repair = "pad_observations_v0" if kind == "observation" else "pad_action_space_v0"
+        raise ValueError(
+            f"expected one {kind} space for all agents, got: {agents[0]} has {first}, {', '.join(others)}; "
+            f"make them equal with supersuit.{repair}"
+        )
+    parts = _leaves(first) if kind == "observation" else [first]
+    if not all(isinstance(part, _FIXED_SHAPE) for part in parts):
+        names = ", ".join(part.__name__ for part in _FIXED_SHAPE)
+        containers = ", or a Dict or Tuple of those" if kind == "observation" else ""
+        raise ValueError(f"expected an {kind} space that is one of {names}{containers}, got {first}")
+    return first
+
+
+def _leaves(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
+    if isinstance(space, spaces.Dict):
+        return [leaf for part in space.spaces.values() for leaf in _leaves(part)]
+    if isinstance(space, spaces.Tuple):
+        return [leaf for part in space.spaces for leaf in _leaves(part)]
+    return [space]
+
+
+def dumps(content: Any) -> bytes:
+    """
+    Pickle, also what only cloudpickle can.
+
+    :param content: anything; what is defined in an importable module stays what it is on the other side
+    """
+    try:
+        return pickle.dumps(content)
+    except Exception:  # pickle, and the objects it asks, have many ways to decline
+        return bytes(cloudpickle.dumps(content))
+
+
+def _pickled(make_env: MakeEnv, is_factory: bool) -> bytes:
+    try:
+        return dumps(make_env)
+    except Exception as error:
+        advice = (
+            "it holds something that cannot be pickled, let it create that itself"
+            if is_factory
+            else "pass a function that makes the environment instead"
+        )
+        raise ValueError(
+            f"each game needs its own copy of {make_env}, but pickling it failed ({error}); {advice}"
+        ) from error
+
+
+def blank(space: spaces.Space[Any]) -> Any:
+    """
+    Build an observation of zeros.
+
+    :param space: observation space of one agent
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: blank(part) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(blank(part) for part in space.spaces)
+    assert space.shape is not None
+    return np.zeros(space.shape, space.dtype)
+
+
+def fitted(space: spaces.Space[Any], observation: Any, owner: str) -> Any:
+    """
+    Bring an observation into the shape and dtype of its space.
+
+    What does not fit would otherwise stop SuperSuit somewhere inside NumPy, and a worker process for good.
+
+    :param space: observation space of one agent
+    :param observation: the agent's observation
+    :param owner: the agent, for the message
+    :raises ValueError: if it does not fit
+    """
+    if isinstance(space, spaces.Dict):
+        if not isinstance(observation, Mapping) or set(observation) != set(space.spaces):
+            got = list(observation) if isinstance(observation, Mapping) else type(observation).__name__
+            raise ValueError(f"observation of {owner}: expected a dict with {list(space.spaces)}, got {got}")
+        return {key: fitted(part, observation[key], f"{owner}, {key!r}") for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(observation, (tuple, list)) or len(observation) != len(space.spaces):
+            raise ValueError(f"observation of {owner}: expected {len(space.spaces)} parts, got {observation!r}")
+        parts = zip(space.spaces, observation, strict=True)
+        return tuple(fitted(part, value, f"{owner}, part {i}") for i, (part, value) in enumerate(parts))
+    if type(observation) is np.ndarray and observation.dtype == space.dtype and observation.shape == space.shape:
+        return observation
+    assert space.dtype is not None
+    array = np.asarray(observation)
+    if array.shape != space.shape or not np.can_cast(array.dtype, space.dtype, "same_kind"):
+        raise ValueError(
+            f"observation of {owner}: expected {space.dtype} of shape {space.shape}, "
+            f"got {array.dtype} of shape {array.shape}"
+        )
+    return array.astype(space.dtype, copy=False)
+
+
+class Game(ParallelEnv[Any, Any, Any]):
+    """
+    A PettingZoo game below SuperSuit's ``MarkovVectorEnv``.
+
+    Upwards it looks like a game whose agents all live until the whole team is done, so that SuperSuit does not
+    stop at an agent's death. Infos go up packed, because SuperSuit mixes those of the next episode's reset into
+    those of the last step.
+
+    Whatever SuperSuit has no words for (a seed for each game, attributes, methods, pictures) comes down as a
+    *letter*, a function of the game, among the options of a reset. ``ConcatVecEnv`` hands the same options to all
+    its games and ``seed + i`` to its i-th: with seed 0, the seed is the game's place in the list of letters.
+    Letters to a worker process are pickled, and so are the replies to them.
+
+    :param blueprint: how to build the game. That happens at the first letter, so the spare copies that SuperSuit
+        makes and drops cost nothing.
+    """
+
+    def __init__(self, blueprint: Blueprint):
+        self._blueprint = blueprint
+        self._env: AnyParallelEnv | None = None
+        self._remote = False
+        self._playing: dict[Any, None] = {}  # an ordered set
+        self._ended: set[Any] = set()
+        self.possible_agents = list(blueprint.agents)
+        self.agents = self.possible_agents
+        self.metadata = blueprint.metadata
+        self.render_mode = blueprint.render_mode
+        self._blank = blank(blueprint.observation_space)
+        self._observations = dict.fromkeys(self.possible_agents, self._blank)
+
+    @property
+    def env(self) -> AnyParallelEnv:
+        """The game itself."""
+        if self._env is None:
+            self._env = self._blueprint.build()
+        return self._env
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        """Observation space of every agent."""
+        return self._blueprint.observation_space
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        """Action space of every agent."""
+        return self._blueprint.action_space
+
+    # ---- called by SuperSuit
+
+    def reset(self, seed: int | None = None, options: Info | None = None) -> tuple[dict[Any, Any], dict[Any, Info]]:
+        """
+        Answer the letter to this game; without letters, begin the next episode.
+
+        :param seed: place of this game's letter
+        :param options: the letters
+        :return: the latest observations, and infos with the packed reply
+        """
+        infos: dict[Any, Info] = {agent: {} for agent in self.possible_agents}
+        if options is None:  # SuperSuit's own reset, after the last step of an episode
+            infos[self.agents[0]][RESET_INFOS] = self._reply_to(Game.begin)
+        else:
+            assert seed is not None
+            letter = options[LETTERS][seed]
+            self._remote = isinstance(letter, bytes)
+            infos[self.agents[0]][REPLY] = self._reply_to(letter)
+        return self._observations, infos
+
+    def _reply_to(self, letter: Letter | bytes) -> Any:
+        """Do what a letter says; an exception is a reply too, a worker process must survive it."""
+        try:
+            opened: Letter = pickle.loads(letter) if isinstance(letter, bytes) else letter
+            return self._packed(opened(self), "this reply")
+        except (Exception, SystemExit) as error:
+            return self._packed(Failure.of(error, self._remote), "this exception")
+
+    def _packed(self, content: Any, what: str) -> Any:
+        """Make something ready for its way up; only from here to the same process may it be any object."""
+        if not self._remote:
+            return content
+        try:
+            return dumps(content)
+        except Exception as error:
+            raise TypeError(
+                f"{what} cannot leave its worker process ({error}), it is {content!r}; "
+                "make it something that can be pickled, or use n_cpus=1"
+            ) from error
+
+    def step(self, actions: dict[Any, Any]) -> Any:
+        """
+        Step the game; agents that have ended wait for the rest of the team.
+
+        :param actions: of all agents
+        :return: observations, rewards, terminations, truncations and infos of all agents
+        """
+        try:
+            return self._step(actions)
+        except (Exception, SystemExit) as error:
+            infos: dict[Any, Info] = {agent: {} for agent in self.possible_agents}
+            infos[self.agents[0]][FAILED_STEP] = self._packed(Failure.of(error, self._remote), "this exception")
+            flags = dict.fromkeys(self.possible_agents, False)
+            return self._observations, dict.fromkeys(self.possible_agents, 0.0), flags, flags, infos
+
+    def _step(self, actions: dict[Any, Any]) -> Any:
+        acted = self._playing
+        observations, rewards, terminations, truncations, infos = self.env.step({a: actions[a] for a in acted})
+        ended = {a for a in acted if terminations.get(a, False) or truncations.get(a, False)}
+        self._ended |= ended
+        self._playing = self._alive()
+        over = not self._playing
+        # An ended agent's last observation is not the input of a decision: it goes where SB3 looks for it, into
+        # the info (MarkovVectorEnv does that when the team is done), and the row shows zeros.
+        self._show(observations, acted if over else self._playing)
+        packed: dict[Any, Info] = {}
+        for agent in self.possible_agents:
+            info = dict(infos.get(agent) or {}) if agent in acted else INACTIVE
+            if agent in ended and not over:
+                info["terminal_observation"] = self._own(observations, agent)
+            packed[agent] = {STEP_INFO: self._frozen(info, agent)} if info else {}
+        rewards = {a: rewards.get(a, 0.0) if a in acted else 0.0 for a in self.possible_agents}
+        truncated = {a: over and a in acted and bool(truncations.get(a, False)) for a in self.possible_agents}
+        terminated = {a: over and (not truncated[a] or bool(terminations.get(a, False))) for a in self.possible_agents}
+        # Copies, because the observations outlive the reset that follows, and games may reuse their arrays.
+        return deepcopy(self._observations) if over else self._observations, rewards, terminated, truncated, packed
+
+    def _frozen(self, info: Info, agent: Any) -> Any:
+        """Take an info as it is now; games may go on to use theirs."""
+        if not self._remote and all(type(value) in _UNCHANGING for value in info.values()):
+            return dict(info)  # as good as a deep copy, and ten times faster
+        try:
+            return dumps(info) if self._remote else deepcopy(info)
+        except Exception as error:
+            raise TypeError(
+                f"the info of {agent} cannot be copied ({error}), it is {info}; leave out what cannot be pickled"
+            ) from error
+
+    def close(self) -> None:
+        """Close the game, once."""
+        env, self._env = self._env, None
+        if env is not None:
+            env.close()
+
+    # ---- helpers of step and begin
+
+    def _alive(self) -> dict[Any, None]:
+        present = set(self.env.agents)
+        return {agent: None for agent in self.possible_agents if agent in present and agent not in self._ended}
+
+    def _own(self, observations: Mapping[Any, Any], agent: Any) -> Any:
+        if agent not in observations:
+            return self._blank
+        return fitted(self._blueprint.observation_space, observations[agent], str(agent))
+
+    def _show(self, observations: Mapping[Any, Any], agents: Container[Any]) -> None:
+        """Set the rows of these agents to their observations and all others to zeros."""
+        self._observations = {
+            agent: self._own(observations, agent) if agent in agents else self._blank for agent in self.possible_agents
+        }
+
+    # ---- what letters say
+
+    def begin(self, seed: int | None = None, options: Info | None = None) -> list[Info]:
+        """
+        Begin an episode.
+
+        :param seed: the game's seed, None to go on with its random stream
+        :param options: for the game's reset
+        :return: reset infos of the N agents
+        """
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._ended.clear()
+        self._playing = self._alive()
+        self._show(observations, self._playing)
+        return [
+            deepcopy(infos.get(agent) or {}) if agent in self._playing else dict(INACTIVE)
+            for agent in self.possible_agents
+        ]
+
+    def _layers(self) -> list[Any]:
+        """The environment, what it wraps, and so on to the bare game."""
+        layers: list[Any] = [self.env]
+        while True:
+            # Not getattr: PettingZoo's wrappers pass unknown names on to what they wrap.
+            own = getattr(layers[-1], "__dict__", {})
+            inner = own.get("env", own.get("aec_env"))
+            if inner is None:
+                break
+            layers.append(inner)
+        bare = self.env.unwrapped
+        return layers if any(layer is bare for layer in layers) else [*layers, bare]
+
+    def has_attr(self, name: str) -> bool:
+        """
+        Tell whether the game, or a wrapper around it, has an attribute.
+
+        :param name: of the attribute
+        """
+        return any(hasattr(layer, name) for layer in self._layers())
+
+    def get_attr(self, name: str) -> Any:
+        """
+        Get an attribute of the game or of a wrapper around it.
+
+        :param name: of the attribute
+        :raises AttributeError: if none has it
+        """
+        for layer in self._layers():
+            value = getattr(layer, name, _MISSING)
+            if value is not _MISSING:
+                return value
+        if name == "render_mode":  # SB3 asks every environment; PettingZoo does not demand one
+            return None
+        raise AttributeError(f"neither {self.env} nor what it wraps has an attribute {name!r}")
+
+    def set_attr(self, name: str, value: Any) -> None:
+        """
+        Set an attribute where it is: on the outermost layer that has it of its own, else on the bare game.
+
+        :param name: of the attribute
+        :param value: new value
+        """
+        layers = self._layers()
+        owners = (x for x in layers if name in getattr(x, "__dict__", {}) or hasattr(type(x), name))
+        setattr(next(owners, layers[-1]), name, value)
+
+    def call(self, name: str, args: tuple[Any, ...], kwargs: Info, times: int = 1) -> list[Any]:
+        """
+        Call a method.
+
+        :param name: of the method
+        :param args: positional arguments
+        :param kwargs: keyword arguments
+        :param times: how often
+        :return: what each call returned
+        """
+        method = self.get_attr(name)
+        return [method(*args, **kwargs) for _ in range(times)]
+
+    def action_masks(self) -> list[Any]:
+        """
+        Ask the game for the masks of its agents.
+
+        :return: N masks. A game that answers with a dict may leave out agents that have ended: they may do anything.
+        """
+        masks = self.get_attr("action_masks")()
+        if not isinstance(masks, Mapping):
+            return [masks] * len(self.possible_agents)
+        anything = np.ones_like(next(iter(masks.values())), dtype=bool) if masks else None
+        return [masks.get(agent, anything) for agent in self.possible_agents]
+
+    def is_wrapped(self, module: str, qualname: str) -> bool:
+        """
+        Tell whether a wrapper of a class, or one derived from it, is around the game.
+
+        Classes are compared by name, because a class that travelled to another process may be a copy.
+
+        :param module: of the class
+        :param qualname: of the class
+        """
+        classes = {kind for layer in self._layers() for kind in type(layer).__mro__}
+        return any((kind.__module__, kind.__qualname__) == (module, qualname) for kind in classes)
+
+    def identity(self) -> tuple[int, int]:
+        """Tell which object the bare game is: process and address."""
+        return os.getpid(), id(self.env.unwrapped)

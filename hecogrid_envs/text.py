@@ -1,0 +1,290 @@
+"""
+Games as text, for terminals and tests, and levels from text.
+
+One character per cell, then the agents one by one, because a cell has no room for whose they are and what lies under
+them. Everything that a state mapping holds is on the page, so that a printed game can be read back::
+
+    step 3  collected 1
+    000000111111
+    ############
+    #.>.$..k.W.#
+    #.#._2.....#
+    ############
+    agents 0>2,1 1W9,1 2^5,2$ 3<5,2$
+    legend: # wall  . floor  $ treasure  _ collected  k key  > v < ^ agent  E S W N agent with a key  2-9 + several
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hecogrid_envs.constants import AGENT_PALETTE, KEY_CARRIER_INDEX, ZONE_COLOURS, Colour, TreasureState
+from hecogrid_envs.state import StateMapping
+
+WALL: Final = "#"
+FLOOR: Final = "."
+TREASURE: Final = "$"
+COLLECTED: Final = "_"
+KEY: Final = "k"
+#: An agent by its direction (east, south, west, north), without and with a key.
+AGENT: Final = ">v<^"
+CARRIER: Final = "ESWN"
+#: Ten or more agents in one cell.
+MANY: Final = "+"
+
+LEGEND: Final = (
+    "legend: # wall  . floor  $ treasure  _ collected  k key  > v < ^ agent  E S W N agent with a key  2-9 + several"
+)
+
+_ZONE_DIGITS: Final = "0123456789abcdefghijklmnopqrstuvwxyz"
+_AGENT_WORD: Final = re.compile(rf"(\d+)([{re.escape(AGENT + CARRIER)}])(\d+),(\d+)([$_]?)")
+_ESCAPE: Final = re.compile(r"\x1b\[[0-9;]*m")
+_PAGE_WIDTH: Final = 100
+
+_INKS: Final[dict[str, Colour]] = {
+    WALL: (150, 155, 170),
+    FLOOR: (90, 95, 110),
+    TREASURE: (38, 222, 129),
+    COLLECTED: (120, 125, 140),
+    KEY: (255, 214, 64),
+}
+
+_Planes = tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8], npt.NDArray[np.bool_]]
+
+
+class _Ink(NamedTuple):
+    front: Colour
+    back: Colour
+
+
+class _Agent(NamedTuple):
+    x: int
+    y: int
+    direction: int
+    has_key: bool
+
+
+def render_text(
+    state: Mapping[str, Any],
+    *,
+    zones: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
+    step: int | None = None,
+    collected: int | None = None,
+    colour: bool = False,
+    legend: bool = True,
+) -> str:
+    """
+    Write a state as text.
+
+    :param state: state mapping
+    :param zones: (W,) zone of each column, written above the map as digits and letters
+    :param step: game steps so far
+    :param collected: treasures collected so far
+    :param colour: colour it for a terminal (ANSI, 24 bits)
+    :param legend: end with a line that explains the characters
+    :return: lines, without a final newline; :func:`parse_level` reads them back
+    """
+    lines = []
+    known = [f"{name} {value}" for name, value in (("step", step), ("collected", collected)) if value is not None]
+    if known:
+        lines.append("  ".join(known))
+    columns = None if zones is None else [int(zone) for zone in zones]
+    if columns is not None:
+        heading = "".join(_ZONE_DIGITS[zone % len(_ZONE_DIGITS)] for zone in columns)
+        lines.append(_painted(heading, columns, _zone_ink) if colour else heading)
+    rows = ["".join(row) for row in _characters(state).T]
+    lines += [_painted(row, columns or [0] * len(row), _cell_ink) for row in rows] if colour else rows
+    lines += _agent_lines(state)
+    if legend:
+        lines.append(LEGEND)
+    return "\n".join(lines)
+
+
+def _characters(state: Mapping[str, Any]) -> npt.NDArray[np.str_]:
+    """(W, H) the character of each cell."""
+    treasures = np.asarray(state["treasures"])
+    characters = np.full(treasures.shape, FLOOR)
+    characters[np.asarray(state["walls"], dtype=bool)] = WALL
+    characters[treasures == TreasureState.AVAILABLE] = TREASURE
+    characters[treasures == TreasureState.COLLECTED] = COLLECTED
+    characters[np.asarray(state["keys"], dtype=bool)] = KEY
+    agents = _agents(state)
+    for agent in agents:
+        characters[agent.x, agent.y] = (CARRIER if agent.has_key else AGENT)[agent.direction]
+    for (x, y), count in Counter((agent.x, agent.y) for agent in agents).items():
+        if count > 1:
+            characters[x, y] = str(count) if count <= 9 else MANY
+    return characters
+
+
+def _agents(state: Mapping[str, Any]) -> list[_Agent]:
+    positions = np.asarray(state["agent_pos"]).reshape(-1, 2).tolist()
+    directions, keys = np.asarray(state["agent_dir"]).tolist(), np.asarray(state["agent_has_key"]).tolist()
+    return [_Agent(x, y, int(d), bool(key)) for (x, y), d, key in zip(positions, directions, keys, strict=True)]
+
+
+def _agent_lines(state: Mapping[str, Any]) -> list[str]:
+    """Who stands where on what: ``index, direction, x,y, ground``, wrapped into lines of a page's width."""
+    grounds = {TreasureState.NONE: "", TreasureState.AVAILABLE: TREASURE, TreasureState.COLLECTED: COLLECTED}
+    lines: list[str] = []
+    for index, agent in enumerate(_agents(state)):
+        ground = grounds[TreasureState(int(state["treasures"][agent.x, agent.y]))]
+        word = f" {index}{(CARRIER if agent.has_key else AGENT)[agent.direction]}{agent.x},{agent.y}{ground}"
+        if not lines or len(lines[-1]) + len(word) > _PAGE_WIDTH:
+            lines.append("agents")
+        lines[-1] += word
+    return lines
+
+
+# --- colours of a terminal
+
+
+def _painted(row: str, zones: list[int], ink: Callable[[str, int], _Ink]) -> str:
+    """Colour a line, one escape sequence for neighbours that look the same."""
+    parts = []
+    inks = (ink(character, zone) for character, zone in zip(row, zones, strict=True))
+    for look, run in groupby(zip(inks, row, strict=True), key=lambda pair: pair[0]):
+        front, back = (";".join(map(str, part)) for part in look)
+        parts.append(f"\x1b[38;2;{front};48;2;{back}m{''.join(character for _, character in run)}\x1b[0m")
+    return "".join(parts)
+
+
+def _zone_colour(zone: int) -> Colour:
+    return ZONE_COLOURS[zone % len(ZONE_COLOURS)]
+
+
+def _zone_ink(character: str, zone: int) -> _Ink:
+    red, green, blue = _zone_colour(zone)
+    return _Ink((0, 0, 0) if red + 2 * green > 250 else (255, 255, 255), (red, green, blue))
+
+
+def _cell_ink(character: str, zone: int) -> _Ink:
+    """The ground is the zone's colour, darkened; agents are the zone's colour, lightened."""
+    red, green, blue = _zone_colour(zone)
+    if character in AGENT:
+        front: Colour = (64 + 3 * red // 4, 64 + 3 * green // 4, 64 + 3 * blue // 4)
+    elif character in CARRIER:
+        front = AGENT_PALETTE[KEY_CARRIER_INDEX]
+    else:
+        front = _INKS.get(character, (255, 255, 255))
+    return _Ink(front, (28 + red // 9, 28 + green // 9, 28 + blue // 9))
+
+
+# --- reading
+
+
+def parse_level(text: str) -> StateMapping:
+    """
+    Read a level that was printed by :func:`render_text` or drawn by hand.
+
+    The map is the block of lines that begin with ``#``. Without an ``agents`` line the agents are numbered in reading
+    order and stand on plain floor; with one, its numbers, grounds and directions count, and agents may be left out
+    of the map (``#.$.#`` with ``agents 0>2,1`` puts agent 0 on the treasure). Spaces are floor, too.
+
+    :param text: the level; colours, indentation, empty lines, step, zones and legend are passed over
+    :return: state mapping; whether it fits an environment is checked by the environment
+    :raises ValueError: naming the first line or cell that cannot be read
+    """
+    rows, words = _sort_lines(text)
+    planes, drawn, crowds = _read_map(rows)
+    if words:
+        agents = _place_agents(words, planes, {(a.x, a.y) for a in drawn} | set(crowds))
+    elif crowds:
+        x, y = crowds[0]
+        raise ValueError(f"several agents share cell ({x}, {y}); add a line that lists all, such as 'agents 0>{x},{y}'")
+    else:
+        agents = drawn
+    walls, treasures, keys = planes
+    return StateMapping(
+        walls=walls,
+        treasures=treasures,
+        keys=keys,
+        agent_pos=np.array([(agent.x, agent.y) for agent in agents], dtype=np.int64).reshape(-1, 2),
+        agent_dir=np.array([agent.direction for agent in agents], dtype=np.int64),
+        agent_has_key=np.array([agent.has_key for agent in agents], dtype=np.bool_),
+    )
+
+
+def _sort_lines(text: str) -> tuple[list[str], list[str]]:
+    """Rows of the map, words about agents."""
+    rows: list[str] = []
+    words: list[str] = []
+    ended = False
+    for line in (raw.strip() for raw in _ESCAPE.sub("", text).splitlines()):
+        if line.startswith("agents"):
+            words += line.split()[1:]
+        elif line.startswith(WALL) and not ended:
+            rows.append(line)
+            continue
+        elif line and not _is_remark(line, after_map=bool(rows)):
+            raise ValueError(f"line {line!r} is no row of the map (they begin with '#'), and no 'agents' line either")
+        ended = bool(rows)
+    if not rows:
+        raise ValueError("the text holds no map: its rows begin with '#'")
+    return rows, words
+
+
+def _is_remark(line: str, after_map: bool) -> bool:
+    """Step, score and zones come above the map, the legend anywhere."""
+    heading = not after_map and re.fullmatch(r"(step|collected) \d+.*|[0-9a-z]+", line) is not None
+    return heading or line.startswith("legend")
+
+
+def _read_map(rows: list[str]) -> tuple[_Planes, list[_Agent], list[tuple[int, int]]]:
+    """Planes, the agents drawn alone in their cells, and the cells of crowds, both in reading order."""
+    shape = (len(rows[0]), len(rows))
+    walls, treasures, keys = np.zeros(shape, np.bool_), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
+    drawn: list[_Agent] = []
+    crowds: list[tuple[int, int]] = []
+    for y, row in enumerate(rows):
+        if len(row) != shape[0]:
+            raise ValueError(f"all rows of the map must be {shape[0]} long as the first is, row {y} is {len(row)}")
+        for x, character in enumerate(row):
+            if character == WALL:
+                walls[x, y] = True
+            elif character == KEY:
+                keys[x, y] = True
+            elif character in (TREASURE, COLLECTED):
+                treasures[x, y] = TreasureState.AVAILABLE if character == TREASURE else TreasureState.COLLECTED
+            elif character in AGENT + CARRIER:
+                drawn.append(_Agent(x, y, (AGENT + CARRIER).index(character) % 4, character in CARRIER))
+            elif character in "23456789" + MANY:
+                crowds.append((x, y))
+            elif character not in (FLOOR, " "):
+                raise ValueError(f"cell ({x}, {y}) holds {character!r}, which means nothing ({LEGEND})")
+    return (walls, treasures, keys), drawn, crowds
+
+
+def _place_agents(words: list[str], planes: _Planes, occupied: set[tuple[int, int]]) -> list[_Agent]:
+    """Read the ``agents`` line and lay treasures under those who stand on them."""
+    walls, treasures, _ = planes
+    agents: dict[int, _Agent] = {}
+    for word in words:
+        match = _AGENT_WORD.fullmatch(word)
+        if match is None:
+            raise ValueError(
+                f"agent {word!r} cannot be read; write index, direction, x,y, ground, such as 0>2,1 or 3N4,5$"
+            )
+        index, x, y = (int(match[group]) for group in (1, 3, 4))
+        if index in agents:
+            raise ValueError(f"agent {index} is listed twice")
+        if x >= walls.shape[0] or y >= walls.shape[1]:
+            raise ValueError(
+                f"agent {index} stands at ({x}, {y}), beyond the map of {walls.shape[0]} x {walls.shape[1]}"
+            )
+        agents[index] = _Agent(x, y, (AGENT + CARRIER).index(match[2]) % 4, match[2] in CARRIER)
+        if match[5]:
+            treasures[x, y] = TreasureState.AVAILABLE if match[5] == TREASURE else TreasureState.COLLECTED
+    if sorted(agents) != list(range(len(agents))):
+        raise ValueError(f"agents must be numbered from 0 to {len(agents) - 1}, got {sorted(agents)}")
+    unknown = sorted(occupied - {(agent.x, agent.y) for agent in agents.values()})
+    if unknown:
+        raise ValueError(f"the map shows an agent at {unknown[0]}, the 'agents' line does not")
+    return [agents[index] for index in range(len(agents))]

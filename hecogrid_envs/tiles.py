@@ -1,0 +1,232 @@
+"""
+Tile codes: what a cell of a view can look like, and the atlas that turns a code into pixels.
+
+A view is made of few distinct tiles. Everything that computes views works on codes; pixels are looked up last.
+Shapes are drawn at three times the size and averaged down, as MiniGrid does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from hecogrid_envs.constants import (
+    AGENT_PALETTE,
+    BLACK,
+    EMPTY_COLOUR,
+    GREEN,
+    GREY,
+    INVISIBLE_COLOUR,
+    KEY_COLOUR,
+    WALL_COLOUR,
+    YELLOW,
+    Colour,
+    Direction,
+    Rules,
+    Terrain,
+)
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName
+
+Image = npt.NDArray[np.uint8]
+Shape = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.bool_]]
+
+INVISIBLE: Final = 0
+#: Code of a cell without agents and keys: ``FIRST_TERRAIN + terrain``.
+FIRST_TERRAIN: Final = 1
+#: Code of a key: ``FIRST_KEY + quarter turns`` of its picture, which turns with the map (see :func:`quarter_turns`).
+FIRST_KEY: Final = FIRST_TERRAIN + Terrain.KEY
+#: Code of an agent: ``FIRST_AGENT + (ground * len(AGENT_PALETTE) + colour) * 4 + direction relative to the viewer``,
+#: ground being 0 for a plain cell, 1 for an available and 2 for a collected treasure.
+FIRST_AGENT: Final = FIRST_KEY + 4
+N_GROUNDS: Final = 3
+N_CODES: Final = FIRST_AGENT + N_GROUNDS * len(AGENT_PALETTE) * 4
+
+_SUPERSAMPLING: Final = 3
+
+
+class TreasureColours(NamedTuple):
+    """Colours of a treasure before and after it is collected."""
+
+    available: Colour
+    collected: Colour
+
+
+def treasure_colours(task: TaskName, rules: Rules) -> TreasureColours:
+    """Colours of the treasures of a task."""
+    together = task == "TeamTogether"
+    return TreasureColours(
+        available=YELLOW if together else GREEN,
+        collected=BLACK if together and rules == "released" else GREY,
+    )
+
+
+def quarter_turns(facing: int) -> int:
+    """Counterclockwise quarter turns that bring the map, drawn with north up, to a viewer facing ``facing``."""
+    return (facing + 1) % 4
+
+
+def tile_atlas(task: TaskName, rules: Rules, tile_size: int) -> Image:
+    """
+    Pixels of every tile code.
+
+    :param task: decides the colour of treasures
+    :param rules: decides the colour of collected treasures
+    :param tile_size: t, pixels per cell; at most :data:`MAX_CODED_TILE_SIZE` for the atlas to be exact, since larger
+        tiles have grid lines, which turn with the viewer
+    :return: (n_codes, t, t, 3) uint8, read-only
+    """
+    return turned_atlases(task, rules, tile_size)[Direction.NORTH]
+
+
+def turned_atlases(task: TaskName, rules: Rules, tile_size: int) -> Image:
+    """
+    Pixels of every tile code for viewers facing each direction.
+
+    :return: (4, n_codes, t, t, 3) uint8, read-only; the four are equal up to :data:`MAX_CODED_TILE_SIZE`
+    """
+    return _atlases(treasure_colours(task, rules), tile_size)
+
+
+@lru_cache(maxsize=64)
+def _atlases(colours: TreasureColours, size: int) -> Image:
+    plain = _plain_tiles(colours, size)
+    atlases = np.stack([_with_grid_lines(plain, quarter_turns(facing)) for facing in Direction])
+    atlases.flags.writeable = False
+    return atlases
+
+
+def _plain_tiles(colours: TreasureColours, size: int) -> Image:
+    """(n_codes, t, t, 3) tiles without grid lines."""
+    tiles = np.empty((N_CODES, size, size, 3), dtype=np.uint8)
+    tiles[INVISIBLE] = _solid(INVISIBLE_COLOUR, size)
+    solids = (EMPTY_COLOUR, WALL_COLOUR, colours.available, colours.collected)
+    tiles[FIRST_TERRAIN:FIRST_KEY] = [_solid(colour, size) for colour in solids]
+    tiles[FIRST_KEY:FIRST_AGENT] = [np.rot90(_key(size), turns) for turns in range(4)]
+    code = FIRST_AGENT
+    for ground in (None, colours.available, colours.collected):
+        for colour in AGENT_PALETTE:
+            for direction in range(4):
+                agent = _drawn(_turned(_agent_shape, direction), colour, size)
+                tiles[code] = agent if ground is None else _blend(_solid(ground, size), agent)
+                code += 1
+    return tiles
+
+
+def _solid(colour: Colour, size: int) -> Image:
+    return np.full((size, size, 3), colour, dtype=np.uint8)
+
+
+def _canvas_points(size: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Centres of the supersampled pixels as x, y in [0, 1], each (3t, 3t)."""
+    centres = (np.arange(size * _SUPERSAMPLING) + 0.5) / (size * _SUPERSAMPLING)
+    return np.meshgrid(centres, centres)
+
+
+def _averaged(canvas: Image) -> Image:
+    """Average blocks of supersampled pixels: (3t, 3t, 3) to (t, t, 3); fractions are cut off."""
+    size = len(canvas) // _SUPERSAMPLING
+    blocks = canvas.reshape(size, _SUPERSAMPLING, size, _SUPERSAMPLING, 3)
+    return blocks.mean(axis=3).mean(axis=1).astype(np.uint8)
+
+
+def _drawn(shape: Shape, colour: Colour, size: int) -> Image:
+    canvas = np.zeros((size * _SUPERSAMPLING, size * _SUPERSAMPLING, 3), dtype=np.uint8)
+    canvas[shape(*_canvas_points(size))] = colour
+    return _averaged(canvas)
+
+
+def _agent_shape(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81): an agent that faces east."""
+    slope = (0.50 - 0.19) / (0.87 - 0.12)
+    return (x >= 0.12) & (y >= 0.19 + slope * (x - 0.12)) & (y <= 0.81 - slope * (x - 0.12))
+
+
+def _turned(shape: Shape, direction: int) -> Shape:
+    """Rotate a shape about the tile's centre from east to ``direction`` (clockwise, y grows downwards)."""
+    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[direction]
+
+    def turned(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        dx, dy = x - 0.5, y - 0.5
+        return shape(0.5 + cos * dx + sin * dy, 0.5 + cos * dy - sin * dx)
+
+    return turned
+
+
+def _key(size: int) -> Image:
+    """MiniGrid's key: a shaft with two teeth and a ring."""
+    x, y = _canvas_points(size)
+    canvas = np.zeros((size * _SUPERSAMPLING, size * _SUPERSAMPLING, 3), dtype=np.uint8)
+    shaft = _in_rectangle(x, y, 0.50, 0.63, 0.31, 0.88)
+    teeth = _in_rectangle(x, y, 0.38, 0.50, 0.59, 0.66) | _in_rectangle(x, y, 0.38, 0.50, 0.81, 0.88)
+    radius_squared = (x - 0.56) ** 2 + (y - 0.28) ** 2
+    canvas[shaft | teeth | (radius_squared <= 0.190**2)] = KEY_COLOUR
+    canvas[radius_squared <= 0.064**2] = BLACK
+    return _averaged(canvas)
+
+
+def _in_rectangle(
+    x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], left: float, right: float, top: float, bottom: float
+) -> npt.NDArray[np.bool_]:
+    return (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+
+
+def _blend(ground: Image, agent: Image) -> Image:
+    """Lay an agent over its ground, the brighter the more opaque: (ground * (A - a) + agent * a) / A."""
+    alpha = agent.sum(axis=2, keepdims=True, dtype=np.int64)
+    top = alpha.max()
+    if top == 0:
+        return ground
+    return ((ground * (top - alpha) + agent * alpha) / top).astype(np.uint8)
+
+
+def _with_grid_lines(tiles: Image, turns: int) -> Image:
+    """Tiles with a pure black corner get a thin line on the map's north and east side, if they are large enough."""
+    size = tiles.shape[1]
+    line = np.full((size, size, 3), max(0, min(20, size - MAX_CODED_TILE_SIZE)), dtype=np.uint8)
+    line[1:, :-1] = 0
+    corners = tiles[:, [0, 0, -1, -1], [0, -1, 0, -1]]
+    black_corner = (corners == 0).all(axis=2).any(axis=1)
+    return np.where(black_corner[:, None, None, None], tiles + np.rot90(line, turns), tiles)
+
+
+class TileSpace(spaces.Box):
+    """
+    Views as tile codes: ``Box(0, n_codes - 1, (view_size, view_size), uint8)`` that knows what its codes look like.
+
+    :param view_size: side of a view in cells
+    :param atlas: (n_codes, t, t, 3) uint8, pixels of every code
+    """
+
+    def __init__(self, view_size: int, atlas: Image, seed: int | np.random.Generator | None = None):
+        super().__init__(0, len(atlas) - 1, (view_size, view_size), np.uint8, seed=seed)
+        self.atlas = atlas
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, TileSpace) and super().__eq__(other) and np.array_equal(self.atlas, other.atlas)
+
+    def pixels(self, codes: npt.NDArray[np.uint8]) -> Image:
+        """
+        Draw views.
+
+        :param codes: (..., V, V)
+        :return: (..., V t, V t, 3), exactly the ``"rgb"`` observation of the same views
+        """
+        size, t = codes.shape[-1], self.atlas.shape[1]
+        tiles = np.moveaxis(self.atlas[codes], -4, -3)
+        return tiles.reshape(*codes.shape[:-2], size * t, size * t, 3)
+
+
+def observation_space(task: TaskName, params: HECOGridParams) -> spaces.Box:
+    """
+    Space of one agent's observation.
+
+    :return: ``Box(0, 255, (V t, V t, 3), uint8)`` for ``"rgb"``, a :class:`TileSpace` for ``"tiles"``
+    """
+    if params.observation == "tiles":
+        return TileSpace(params.view_size, tile_atlas(task, params.rules, params.view_tile_size))
+    return spaces.Box(0, 255, (params.view_pixels, params.view_pixels, 3), np.uint8)

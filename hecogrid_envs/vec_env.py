@@ -1,0 +1,213 @@
+"""HECOGrid as a Stable-Baselines3 VecEnv: one row per agent, game-major, then agent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn, tile_images
+
+from hecogrid_envs.batch import GameBatch
+from hecogrid_envs.constants import N_ACTIONS, RenderMode
+from hecogrid_envs.parallel_env import HECOGridEnv
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.seeding import game_seeds
+from hecogrid_envs.state import state_option
+from hecogrid_envs.supersuit_bridge import supersuit_vec_env
+from hecogrid_envs.tasks import TASKS
+from hecogrid_envs.tiles import observation_space
+
+Backend = Literal["native", "supersuit"]
+U8 = npt.NDArray[np.uint8]
+
+
+class NativeVecEnv(VecEnv):
+    """
+    E games of N agents as B = E N rows, driven by the batched core.
+
+    Row ``e * N + i`` is agent ``i`` of game ``e``. Games reset by themselves at their time limit; the last observation
+    is then in ``infos[row]["terminal_observation"]`` and ``infos[row]["TimeLimit.truncated"]`` is True.
+
+    :param batch: the games
+    :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
+    :param render_mode: as in :func:`hecogrid_envs.parallel_env`
+    """
+
+    def __init__(self, batch: GameBatch, seed: int | None = None, render_mode: RenderMode | None = None):
+        self.batch = batch
+        self.params = batch.params
+        self.n_games = batch.n_games
+        self.n_agents = batch.params.n_agents
+        env_class = TASKS[batch.task]
+        self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
+        self._actions: npt.NDArray[np.integer[Any]] | None = None
+        self._running = False
+        own_space = observation_space(batch.task, batch.params)
+        super().__init__(self.n_games * self.n_agents, own_space, spaces.Discrete(N_ACTIONS))
+        if seed is not None:
+            self.seed(seed)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Choose the seeds of the games at the next reset.
+
+        :return: (B,) the seed of each row's game
+        """
+        per_game = [None] * self.n_games if seed is None else game_seeds(seed, self.n_games)
+        self._seeds = [game_seed for game_seed in per_game for _ in range(self.n_agents)]
+        return self._seeds
+
+    def reset(self) -> U8:
+        """
+        Start new episodes everywhere.
+
+        :return: (B, *observation shape)
+        """
+        states = [state_option(options, self.params) for options in self._options[:: self.n_agents]]
+        self.batch.reset(seeds=self._seeds[:: self.n_agents])
+        for game, state in enumerate(states):
+            if state is not None:
+                self.batch.set_state(state, game)
+            self.games[game].agents = list(self.games[game].possible_agents)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._running = True
+        return self._rows(self.batch.observe())
+
+    def _rows(self, per_game: U8) -> U8:
+        return per_game.reshape(self.num_envs, *per_game.shape[2:])
+
+    def step_async(self, actions: npt.NDArray[np.integer[Any]]) -> None:
+        """
+        Take the actions of the next step.
+
+        :param actions: (B,) integers from 0 to 6
+        :raises ValueError: for a wrong shape, type or value, or a step without a reset
+        """
+        if not self._running:
+            raise ValueError("the games have not begun: call reset() before step()")
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs,):
+            raise ValueError(
+                f"actions must have shape ({self.num_envs},), one per agent of {self.n_games} games x {self.n_agents} "
+                f"agents, got {actions.shape}"
+            )
+        if actions.dtype.kind not in "iu":
+            raise ValueError(f"actions must be integers, got {actions.dtype}")
+        if actions.min() < 0 or actions.max() >= N_ACTIONS:
+            row = int(np.flatnonzero((actions < 0) | (actions >= N_ACTIONS))[0])
+            raise ValueError(f"actions must be from 0 to {N_ACTIONS - 1}, got {actions[row]} in row {row}")
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Play one game step.
+
+        :return: observations (B, *observation shape), rewards (B,) float32, dones (B,) bool, infos
+        """
+        assert self._actions is not None
+        self.batch.step(self._actions.reshape(self.n_games, self.n_agents))
+        self._actions = None
+        rewards = np.repeat(self.batch.rewards.astype(np.float32), self.n_agents)
+        over = self.batch.truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        observations = self._rows(self.batch.observe())
+        dones = np.repeat(over, self.n_agents)
+        if over.any():
+            for row in np.flatnonzero(dones):
+                infos[row] = {"TimeLimit.truncated": True, "terminal_observation": observations[row].copy()}
+                self.reset_infos[row] = {}
+            self.batch.reset(over)
+            observations = self._rows(self.batch.observe())
+        return observations, rewards, dones, infos
+
+    def close(self) -> None:
+        """Close the windows, if any."""
+        for env in self.games:
+            env.close()
+
+    def get_images(self) -> Sequence[U8 | None]:
+        """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
+        pictures = self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games
+        return [picture for picture in pictures for _ in range(self.n_agents)]
+
+    def render(self, mode: str | None = None) -> U8 | None:
+        """
+        Draw every game once.
+
+        :param mode: None, or the environment's own
+        :return: one picture of all games for ``"rgb_array"``, else None
+        """
+        if self.render_mode is None or mode not in (None, self.render_mode):
+            return super().render(mode)  # which explains what is wrong
+        pictures = self.game_method("render")
+        return tile_images(pictures) if self.render_mode == "rgb_array" else None
+
+    def _games_of(self, indices: VecEnvIndices) -> list[HECOGridEnv]:
+        return [self.games[row // self.n_agents] for row in self._get_indices(indices)]
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Attribute of each row's game."""
+        return [getattr(env, attr_name) for env in self._games_of(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of each row's game."""
+        for env in self._games_of(indices):
+            setattr(env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method of each row's game, once per row; :meth:`game_method` calls it once per game."""
+        return [getattr(env, method_name)(*method_args, **kwargs) for env in self._games_of(indices)]
+
+    def game_method(self, method_name: str, *args: Any, games: Sequence[int] | None = None, **kwargs: Any) -> list[Any]:
+        """Call a method of each game once."""
+        chosen = range(self.n_games) if games is None else games
+        return [getattr(self.games[game], method_name)(*args, **kwargs) for game in chosen]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """No row is wrapped in a Gymnasium wrapper."""
+        return [False for _ in self._get_indices(indices)]
+
+
+def make_vec_env(
+    task: str,
+    n_envs: int = 1,
+    seed: int | None = None,
+    backend: Backend = "native",
+    render_mode: RenderMode | None = None,
+    n_threads: int = 1,
+    n_cpus: int = 1,
+    **params: Any,
+) -> VecEnv:
+    """
+    Make a parameter-shared vector environment: one row per agent, game-major, then agent.
+
+    Both backends give the same numbers, row for row, for the same seed.
+
+    :param task: ``"TeamTogether"``, ``"TeamSupport"`` or ``"KeyForTreasure"``
+    :param n_envs: E, games
+    :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``
+    :param backend: ``"native"`` drives the batched core; ``"supersuit"`` goes through SuperSuit's
+        ``pettingzoo_env_to_vec_env_v1`` and ``concat_vec_envs_v1``
+    :param render_mode: as in :func:`hecogrid_envs.parallel_env`
+    :param n_threads: threads of the native backend
+    :param n_cpus: worker processes of the SuperSuit backend
+    :param params: fields of :class:`~hecogrid_envs.params.HECOGridParams`
+    :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
+    :raises ValueError: for an unknown task, backend or parameter, or a value out of range
+    """
+    if backend not in get_args(Backend):
+        raise ValueError(f"backend must be 'native' or 'supersuit', got {backend!r}")
+    batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
+    if backend == "native":
+        return NativeVecEnv(batch, seed, render_mode)
+    env_class = TASKS[batch.task]
+    return supersuit_vec_env(lambda: env_class(render_mode=render_mode, **params), n_envs, seed=seed, n_cpus=n_cpus)

@@ -1,0 +1,135 @@
+"""A window on the screen, for watching and playing."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from types import ModuleType, TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Picture = npt.NDArray[np.uint8]
+
+
+class HumanWindow:
+    """
+    A window that shows pictures and collects keys; it opens with the first picture.
+
+    Once the person has closed it, pictures are dropped silently, so that a program that draws goes on running.
+
+    :param title: text of the title bar
+    :param fps: most pictures per second, :meth:`show` waits if need be; None never waits
+    """
+
+    def __init__(self, title: str = "HECOGrid", fps: float | None = None) -> None:
+        self.title = title
+        self.fps = fps
+        self.closed_by_user = False
+        self._pygame: ModuleType | None = None
+        self._screen: Any = None
+        self._clock: Any = None
+        self._keys: list[str] = []
+
+    def __enter__(self) -> HumanWindow:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a window now."""
+        return self._screen is not None
+
+    def show(self, picture: Picture) -> None:
+        """
+        Show a picture; the window takes its size.
+
+        :param picture: (height, width, 3)
+        :raises ImportError: if pygame is missing
+        :raises RuntimeError: if there is no display
+        """
+        if self.closed_by_user:
+            return
+        pygame = self._open(picture.shape[1], picture.shape[0])
+        pygame.surfarray.blit_array(self._screen, picture.transpose(1, 0, 2))
+        pygame.display.flip()
+        self._collect_events()
+        if self.fps is not None:
+            self._clock.tick(self.fps)
+
+    def poll(self) -> list[str]:
+        """
+        Keys pressed since the last call.
+
+        :return: names such as ``"left"``, ``"space"``, ``"p"``, ``"3"``; ``"quit"`` if the window was closed
+        """
+        self._collect_events()
+        keys, self._keys = self._keys, []
+        return keys
+
+    def close(self) -> None:
+        """Close the window; a later picture opens a new one unless the person closed this one."""
+        if self._pygame is not None and self.is_open:
+            self._pygame.display.quit()
+        self._screen = None
+
+    def _open(self, width: int, height: int) -> ModuleType:
+        if self._pygame is None:
+            self._pygame = _import_pygame()
+        pygame = self._pygame
+        if self._screen is None:
+            _start_display(pygame)
+            pygame.display.set_caption(self.title)
+            self._clock = pygame.time.Clock()
+        if self._screen is None or self._screen.get_size() != (width, height):
+            self._screen = pygame.display.set_mode((width, height))
+            pygame.key.set_repeat(300, 90)
+        return pygame
+
+    def _collect_events(self) -> None:
+        pygame = self._pygame
+        if pygame is None or not self.is_open:
+            return
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT:
+                self._keys.append("quit")
+                self.closed_by_user = True
+                self.close()
+                return
+            if event.type == pygame.KEYDOWN:
+                # Keys of the number pad are called "[4]".
+                self._keys.append(pygame.key.name(event.key).strip("[]"))
+
+
+def _import_pygame() -> ModuleType:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        # Some versions of pygame warn about setuptools when imported; that is not the user's business.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import pygame
+    except ImportError as error:
+        raise ImportError("a window needs pygame: pip install sb3-saf[render]") from error
+    return pygame
+
+
+def _start_display(pygame: ModuleType) -> None:
+    """
+    Start the display, and refuse to draw for nobody.
+
+    Where there is no screen, SDL quietly takes a driver that shows nothing; only who asked for it shall get it.
+    """
+    help_text = 'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
+    try:
+        pygame.display.init()
+    except pygame.error as error:
+        raise RuntimeError(f"no window can be opened ({error}); {help_text}") from error
+    driver = pygame.display.get_driver()
+    if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
+        pygame.display.quit()
+        raise RuntimeError(f"no window can be opened (there is no display); {help_text}")

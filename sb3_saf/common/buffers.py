@@ -1,0 +1,200 @@
+"""Rollouts of teams: each observation stored once, minibatches of whole teams."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, TensorDict
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_saf.common.teams import AGENT_KEY, OBS_KEY, TEAM_KEY, Array, TeamSpaces, check_whole_teams
+
+#: Arrays with one entry per step and row, beside the observations.
+_ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
+
+
+class TeamRolloutBuffer(DictRolloutBuffer):
+    """
+    SB3's rollout buffer for the observations of ``CentralizedValueWrapper``, through ``rollout_buffer_class``.
+
+    - **Memory**: the own observations of a team are stored once, ``(T, E, N, *shape)`` in their own dtype; ``team`` and
+      ``agent`` are rebuilt when a minibatch is drawn. SB3's buffer stores N + 1 observations per row. A row of HECOGrid
+      with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes of action, reward, value and so on,
+      where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. The large arrays are made once and reused by all
+      rollouts.
+    - **Minibatches** hold whole teams, agents in index order, so no team is encoded in two minibatches. ``batch_size``
+      counts rows and must be a multiple of N; the last minibatch may be smaller.
+    - **Advantages** are SB3's, computed by its code.
+    - Rows that are not whole teams in index order are refused when they are added.
+
+    The order of teams comes from NumPy's global generator, as in SB3, so seeded runs repeat.
+
+    :param buffer_size: T, steps per rollout
+    :param observation_space: Dict observation space of ``CentralizedValueWrapper``
+    :param action_space: one agent's action space
+    :param device: where minibatches go
+    :param gae_lambda: trade-off of bias and variance of the advantages, 1 for Monte-Carlo
+    :param gamma: discount factor
+    :param n_envs: B, rows
+    :raises ValueError: if the space is not that of teams or the rows are no whole teams
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space[Any],
+        device: th.device | str = "auto",
+        gae_lambda: float = 1,
+        gamma: float = 0.99,
+        n_envs: int = 1,
+    ) -> None:
+        self.team_spaces = TeamSpaces.from_observation_space(observation_space)
+        self.n_agents = self.team_spaces.n_agents
+        self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
+        self._agents = np.tile(np.arange(self.n_agents), self.n_games)
+        self._allocated = False
+        super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
+
+    def reset(self) -> None:
+        """Forget the rollout; the arrays stay, since touching fresh memory costs as much as the encoder."""
+        if not self._allocated:
+            # SB3 makes one array for each key of obs_shape, and stores those keys alone.
+            self.obs_shape = {OBS_KEY: self.obs_shape[OBS_KEY]}
+            super().reset()
+            self._allocated = True
+        self.generator_ready = False
+        BaseBuffer.reset(self)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the rollout takes."""
+        arrays = [self.observations[OBS_KEY], *(getattr(self, name) for name in _ROW_ARRAYS)]
+        return sum(array.nbytes for array in arrays)
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, Array],
+        action: Array,
+        reward: Array,
+        episode_start: Array,
+        value: th.Tensor,
+        log_prob: th.Tensor,
+    ) -> None:
+        """
+        Store one step of all games.
+
+        :param obs: Dict observation of B rows
+        :param action: (B, ...)
+        :param reward: (B,)
+        :param episode_start: (B,) whether an episode starts with this step
+        :param value: (B,) or (B, 1) predicted values
+        :param log_prob: (B,)
+        :raises ValueError: if the rows are not whole teams in index order
+        """
+        self._check_rows(obs)
+        super().add(obs, action, reward, episode_start, value, log_prob)
+
+    def _check_rows(self, obs: dict[str, Array]) -> None:
+        own, team, agents = (np.asarray(obs[key]) for key in (OBS_KEY, TEAM_KEY, AGENT_KEY))
+        self._check_shapes(own, team)
+        if not np.array_equal(agents.reshape(-1), self._agents):
+            raise ValueError(
+                f"expected rows game-major, then agent, with {AGENT_KEY!r} 0 to {self.n_agents - 1} in each team, got "
+                f"{agents.reshape(-1)[: 2 * self.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may "
+                "reorder rows"
+            )
+        # All rows of a team hold the same N observations. One row per team is compared at each step, another at the
+        # next: a full comparison would read N times as much memory and finds nothing that N steps of this do not.
+        seen_by = self.pos % self.n_agents
+        seen = team.reshape(self.n_games, self.n_agents, *team.shape[1:])[:, seen_by]
+        if not np.array_equal(seen, own.reshape(seen.shape)):
+            game = int(np.flatnonzero((seen != own.reshape(seen.shape)).reshape(self.n_games, -1).any(axis=1))[0])
+            raise ValueError(
+                f"expected {TEAM_KEY!r} to hold the {OBS_KEY!r} of the team's own rows, but they differ for agent "
+                f"{seen_by} of game {game}; change or normalise observations below CentralizedValueWrapper only"
+            )
+
+    def _check_shapes(self, own: Array, team: Array) -> None:
+        own_shape = (self.n_envs, *self.team_spaces.own_shape)
+        team_shape = (self.n_envs, self.n_agents, *self.team_spaces.own_shape)
+        dtype = self.observations[OBS_KEY].dtype
+        if own.shape != own_shape or team.shape != team_shape or not np.can_cast(own.dtype, dtype, "same_kind"):
+            raise ValueError(
+                f"expected {OBS_KEY!r} of shape {own_shape} and dtype {dtype} and {TEAM_KEY!r} of shape {team_shape}, "
+                f"got {own.shape} and {own.dtype}, and {team.shape}; fill the buffer from the environment that it was "
+                "made for, and change or normalise observations below CentralizedValueWrapper"
+            )
+
+    def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
+        """
+        Go through the rollout once, in an order of teams drawn anew.
+
+        :param batch_size: rows per minibatch, a multiple of N; None for all
+        :return: minibatches of whole teams: rows of one team are consecutive and in index order
+        :raises ValueError: if the buffer is not full or N does not divide ``batch_size``
+        """
+        if not self.full:
+            raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
+        teams_per_batch = self._teams_per_batch(batch_size)
+        # SB3 seeds NumPy's global generator, and no other, from the run's seed.
+        order = np.random.permutation(self.buffer_size * self.n_games)  # noqa: NPY002
+        for start in range(0, len(order), teams_per_batch):
+            yield self._get_samples(order[start : start + teams_per_batch])
+
+    def _teams_per_batch(self, batch_size: int | None) -> int:
+        if batch_size is None:
+            return self.buffer_size * self.n_games
+        if batch_size < 1 or batch_size % self.n_agents:
+            below = max(batch_size // self.n_agents, 0) * self.n_agents
+            choices = [size for size in (below, below + self.n_agents) if size > 0]
+            raise ValueError(
+                f"batch_size counts rows and must be a multiple of n_agents={self.n_agents}, because TeamRolloutBuffer "
+                f"gives whole teams, got {batch_size}; use batch_size={' or '.join(map(str, choices))}"
+            )
+        return batch_size // self.n_agents
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None
+    ) -> DictRolloutBufferSamples:
+        """
+        Rows of the given team steps.
+
+        :param batch_inds: (K,) each is ``step * E + game``
+        :param env: unused, as in SB3's buffers for rollouts
+        :return: K * N rows
+        """
+        return DictRolloutBufferSamples(
+            observations=self._rebuild(self._take(self.observations[OBS_KEY], batch_inds)),
+            actions=self._take(self.actions, batch_inds).float().flatten(end_dim=1),
+            old_values=self._take(self.values, batch_inds).flatten(),
+            old_log_prob=self._take(self.log_probs, batch_inds).flatten(),
+            advantages=self._take(self.advantages, batch_inds).flatten(),
+            returns=self._take(self.returns, batch_inds).flatten(),
+        )
+
+    def _take(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
+        """(T, B, ...) -> (K, N, ...); rows lie game-major, so each team step is one stretch of memory."""
+        by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
+        return self.to_torch(by_team[team_steps], copy=False)
+
+    def _rebuild(self, own: th.Tensor) -> TensorDict:
+        """
+        The Dict observation of all rows of some teams, in the shapes of SB3's buffer.
+
+        :param own: (K, N, *stored shape)
+        """
+        n_teams, n_agents = own.shape[:2]
+        shape = self.team_spaces.own_shape
+        team = own.reshape(n_teams, 1, n_agents, *shape).expand(n_teams, n_agents, n_agents, *shape)
+        return {
+            OBS_KEY: own.flatten(end_dim=1),
+            TEAM_KEY: team.reshape(n_teams * n_agents, n_agents, *shape),
+            AGENT_KEY: th.arange(n_agents, device=own.device).repeat(n_teams).unsqueeze(1),
+        }

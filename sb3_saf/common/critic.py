@@ -1,0 +1,136 @@
+"""
+Critics: value estimates for training. Letters: K distinct views, G distinct teams, N agents, d features.
+
+Views and teams come separately (``features`` and ``teams``), so that what depends on a single view is computed once
+per view.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Literal, cast
+
+import torch as th
+from torch import nn
+
+from sb3_saf.common.networks import AgentHeads, mlp
+
+#: One head for all agents, or one for each.
+Heads = Literal["shared", "per_agent"]
+
+
+class TeamCritic(nn.Module, ABC):
+    """Base of critics that read what the whole team sees."""
+
+    @abstractmethod
+    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        Value of every agent of every team.
+
+        :param features: (K, d) features of views
+        :param teams: (G, N) int64, which view each agent of a team has
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N)
+        """
+
+
+class OwnValueHead(nn.Module):
+    """
+    Value of an agent from its own features.
+
+    :param features_dim: d
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param heads: one head for all agents, or one for each
+    """
+
+    def __init__(
+        self, features_dim: int, n_agents: int, hidden: Sequence[int], activation_fn: type[nn.Module], heads: Heads
+    ):
+        super().__init__()
+        self.reads_agent = heads == "per_agent"
+
+        def make_head() -> nn.Sequential:
+            return mlp([features_dim, *hidden, 1], activation_fn)
+
+        self.head: nn.Module = AgentHeads(make_head, n_agents) if self.reads_agent else make_head()
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        Values of single agents.
+
+        :param features: (K, d)
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: (K,)
+        """
+        values: th.Tensor = self.head(features, agent) if self.reads_agent else self.head(features)
+        return values.squeeze(1)
+
+    def of_teams(self, features: th.Tensor) -> th.Tensor:
+        """
+        Values of whole teams.
+
+        :param features: (G, N, d)
+        :return: (G, N)
+        """
+        n_teams, n_agents, _ = features.shape
+        agent = th.arange(n_agents, device=features.device).repeat(n_teams) if self.reads_agent else None
+        values: th.Tensor = self(features.flatten(0, 1), agent)
+        return values.view(n_teams, n_agents)
+
+
+class JointValueHead(nn.Module):
+    """
+    Value of an agent from the features of its whole team.
+
+    One head for all agents is told whose value is asked by the agent's identity (one-hot); without it, all agents of
+    a team get the same value. With one head per agent the head is the identity.
+
+    :param features_dim: d
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param heads: one head for all agents, or one for each
+    :param agent_identity: whether a shared head reads the agent's identity
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        n_agents: int,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        heads: Heads,
+        agent_identity: bool,
+    ):
+        super().__init__()
+        self.per_agent = heads == "per_agent"
+        self.agent_identity = agent_identity and not self.per_agent
+        n_inputs = features_dim * n_agents + (n_agents if self.agent_identity else 0)
+        n_heads = n_agents if self.per_agent else 1
+        self.heads = nn.ModuleList(mlp([n_inputs, *hidden, 1], activation_fn) for _ in range(n_heads))
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        Values of whole teams.
+
+        :param features: (G, N, d)
+        :return: (G, N)
+        """
+        joint = features.flatten(1)
+        if self.agent_identity:
+            return self._with_identity(joint, features.shape[1])
+        values = th.cat([head(joint) for head in self.heads], dim=1)
+        return values.expand(-1, features.shape[1])
+
+    def _with_identity(self, joint: th.Tensor, n_agents: int) -> th.Tensor:
+        """(G, N) values of [joint features, one-hot agent]; the first layer reads the joint part once per team."""
+        first, *rest = cast(nn.Sequential, self.heads[0])
+        assert isinstance(first, nn.Linear)
+        weight_joint, weight_agent = first.weight[:, :-n_agents], first.weight[:, -n_agents:]
+        x = nn.functional.linear(joint, weight_joint, first.bias).unsqueeze(1) + weight_agent.t()
+        for layer in rest:
+            x = layer(x)
+        return x.squeeze(2)

@@ -1,0 +1,238 @@
+"""
+Encoders: features extractors for one agent's own observation. Letters: K views, C channels, H x W pixels, t pixels
+per tile.
+
+Each takes raw observations (uint8 pictures, tile codes, indices) as well as what SB3 makes of them before it calls a
+features extractor (floats in [0, 1], one-hot vectors), so each also serves plain SB3 policies. A *tile-code space* is
+any Box of whole numbers with an attribute ``atlas`` (n_codes, t, t, C) that holds the pixels of every code; its codes
+become pixels on the training device. Encoders of tiles and of the same pictures have the same weights and give the
+same features.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_saf.common.networks import HIDDEN_GAIN, Linear, mlp
+
+
+def is_tile_space(space: spaces.Space[Any]) -> bool:
+    """Whether the observations of a space are tile codes (see the module's docstring)."""
+    return isinstance(space, spaces.Box) and hasattr(space, "atlas")
+
+
+class PixelInput(nn.Module):
+    """
+    Pictures of any layout, or tile codes, as float pictures in [0, 1].
+
+    The result is a channels-first tensor whose memory is channels-last, which is what convolutions are fastest on.
+
+    :param observation_space: a Box of shape (C, H, W) or (H, W, C), or a tile-code space of shape (rows, columns)
+    """
+
+    atlas: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space[Any]):
+        super().__init__()
+        self.layout: Literal["codes", "channels_first", "channels_last"]
+        if is_tile_space(observation_space):
+            self.layout = "codes"
+            atlas = _checked_atlas(observation_space)
+            # Not part of the state dict: what codes look like belongs to the space, and weights fit pictures as well.
+            self.register_buffer("atlas", atlas.float() / 255.0, persistent=False)
+            _, tile, _, channels = atlas.shape
+            rows, columns = observation_space.shape or ()
+            self.shape = (channels, rows * tile, columns * tile)
+            return
+        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 3:
+            raise ValueError(
+                f"expected pictures, a Box of three axes, or tile codes with an atlas, got {observation_space}; "
+                "use MLPEncoder or a features_extractor_class of your own"
+            )
+        height, width, channels = shape = observation_space.shape
+        self.layout = "channels_last"
+        if int(np.argmin(shape)) == 0:  # as SB3 tells the two layouts apart
+            self.layout = "channels_first"
+            channels, height, width = shape
+        self.shape = (channels, height, width)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        Make pictures.
+
+        :param observations: (K, C, H, W), (K, H, W, C) or codes (K, rows, columns); whole numbers are taken for 0..255
+        :return: (K, C, H, W) float
+        """
+        if self.layout == "codes":
+            tiles = self.atlas[observations.long()]  # (K, rows, columns, t, t, C)
+            pictures = tiles.transpose(2, 3).reshape(-1, *self.shape[1:], self.shape[0])
+            return pictures.permute(0, 3, 1, 2)
+        pictures = observations if observations.is_floating_point() else observations.float() / 255.0
+        if self.layout == "channels_last":
+            pictures = pictures.permute(0, 3, 1, 2)
+        return pictures.contiguous(memory_format=th.channels_last)
+
+
+def _checked_atlas(space: Any) -> th.Tensor:
+    """(n_codes, t, t, C) uint8 pixels of every code."""
+    atlas = np.asarray(space.atlas)
+    square = atlas.ndim == 4 and atlas.shape[1] == atlas.shape[2]
+    if not square or atlas.dtype != np.uint8 or len(space.shape) != 2 or int(space.high.max()) >= len(atlas):
+        raise ValueError(
+            "expected tile codes of shape (rows, columns) with an atlas (n_codes, tile, tile, channels) of uint8 that "
+            f"has every code, got {space} with an atlas of shape {atlas.shape} and dtype {atlas.dtype}"
+        )
+    return th.tensor(atlas)
+
+
+class PaperCNN(BaseFeaturesExtractor):
+    """
+    The paper's encoder: convolutions 4x4/2 -> 32 and 3x3/2 -> 64, linear 512, linear ``features_dim``, ReLU between.
+
+    A 28 x 28 x 3 view gives 2,304 numbers after the convolutions, and the encoder has 1,233,056 parameters.
+
+    :param observation_space: pictures (either layout) or tile codes
+    :param features_dim: size of the features
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        super().__init__(observation_space, features_dim)
+        self.pixels = PixelInput(observation_space)
+        channels, height, width = self.pixels.shape
+        out_height, out_width = _after_convolutions(height), _after_convolutions(width)
+        if min(out_height, out_width) < 1:
+            raise ValueError(
+                f"PaperCNN needs pictures of at least 8 x 8 pixels, got {height} x {width}; use "
+                "features_extractor_class=sb3_saf.MLPEncoder or sb3_saf.LightEncoder, or larger pictures"
+            )
+        self.net = nn.Sequential(
+            nn.Conv2d(channels, 32, kernel_size=4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=3, stride=2),
+            nn.ReLU(),
+            nn.Flatten(),
+            Linear(64 * out_height * out_width, 512, gain=HIDDEN_GAIN),
+            nn.ReLU(),
+            Linear(512, features_dim, gain=HIDDEN_GAIN),
+        )
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) views to (K, features_dim)."""
+        features: th.Tensor = self.net(self.pixels(observations))
+        return features
+
+
+def _after_convolutions(size: int) -> int:
+    return ((size - 4) // 2 + 1 - 3) // 2 + 1 if size >= 4 else 0
+
+
+class LightEncoder(BaseFeaturesExtractor):
+    """
+    An encoder for small computers: one linear embedding for every tile, linear 128, ReLU, linear ``features_dim``.
+
+    Tile codes are embedded once per code and looked up. In pictures, tiles are cut out first.
+
+    :param observation_space: pictures (either layout) or tile codes
+    :param features_dim: size of the features
+    :param tile_size: t, pixels per tile of pictures; tile codes bring their own
+    :param embedding_dim: size of a tile's embedding
+    :param hidden: size of the hidden layer
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        features_dim: int = 64,
+        tile_size: int = 4,
+        embedding_dim: int = 16,
+        hidden: int = 128,
+    ):
+        super().__init__(observation_space, features_dim)
+        self.pixels = PixelInput(observation_space)
+        self.tile_size = self.pixels.atlas.shape[1] if self.pixels.layout == "codes" else tile_size
+        channels, height, width = self.pixels.shape
+        if height % self.tile_size or width % self.tile_size:
+            raise ValueError(
+                f"LightEncoder needs pictures of whole tiles, got {height} x {width} pixels with "
+                f"tile_size={tile_size}; "
+                'pass features_extractor_kwargs={"tile_size": ...}'
+            )
+        n_tiles = height * width // self.tile_size**2
+        self.embed = Linear(self.tile_size**2 * channels, embedding_dim, gain=HIDDEN_GAIN)
+        self.net = mlp([n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) views to (K, features_dim)."""
+        if self.pixels.layout == "codes":
+            by_code = self.embed(self.pixels.atlas.flatten(1))
+            tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
+        else:
+            tiles = self.embed(self._cut(self.pixels(observations)))
+        features: th.Tensor = self.net(tiles.flatten(1))
+        return features
+
+    def _cut(self, pictures: th.Tensor) -> th.Tensor:
+        """(K, tiles, t * t * C) pixels of each tile, in the order of an atlas: (K, C, H, W)."""
+        channels, height, width = self.pixels.shape
+        t = self.tile_size
+        tiles = pictures.reshape(-1, channels, height // t, t, width // t, t).permute(0, 2, 4, 3, 5, 1)
+        return tiles.reshape(len(pictures), -1, t * t * channels)
+
+
+class MLPEncoder(BaseFeaturesExtractor):
+    """
+    An encoder for vectors: linear 128, tanh, linear ``features_dim``. Whole-number spaces are read as one-hot vectors.
+
+    :param observation_space: Box (flattened), Discrete, MultiDiscrete or MultiBinary
+    :param features_dim: size of the features
+    :param hidden: size of the hidden layer
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64, hidden: int = 128):
+        super().__init__(observation_space, features_dim)
+        self.net = mlp(
+            [get_flattened_obs_dim(observation_space), hidden, features_dim], nn.Tanh, output_gain=HIDDEN_GAIN
+        )
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) observations, raw or made one-hot by SB3, to (K, features_dim)."""
+        if not observations.is_floating_point():
+            observations = _as_floats(observations, self._observation_space)
+        features: th.Tensor = self.net(observations.flatten(1))
+        return features
+
+
+def _as_floats(observations: th.Tensor, space: spaces.Space[Any]) -> th.Tensor:
+    result = preprocess_obs(observations, space, normalize_images=False)
+    assert isinstance(result, th.Tensor)
+    return result
+
+
+class ObservationEncoder(BaseFeaturesExtractor):
+    """
+    The default encoder, chosen by space: :class:`PaperCNN` for pictures (uint8, 0..255) and tile codes, else
+    :class:`MLPEncoder`.
+
+    :param observation_space: one agent's own observation space
+    :param features_dim: size of the features
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        super().__init__(observation_space, features_dim)
+        sees = is_tile_space(observation_space) or is_image_space(observation_space)
+        self.encoder: BaseFeaturesExtractor = (PaperCNN if sees else MLPEncoder)(observation_space, features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) observations to (K, features_dim)."""
+        features: th.Tensor = self.encoder(observations)
+        return features
+
+
+__all__ = ["LightEncoder", "MLPEncoder", "ObservationEncoder", "PaperCNN", "PixelInput", "is_tile_space"]

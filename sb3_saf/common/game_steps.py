@@ -1,0 +1,55 @@
+"""Game steps in the logs: SB3 counts rows, that is, every agent of every game."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, TypeVar
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_saf.common.teams import find_n_agents
+
+AlgorithmClass = TypeVar("AlgorithmClass", bound=type[BaseAlgorithm])
+
+GAME_STEPS_TAG = "time/game_steps"
+
+_MARK = "_records_game_steps"
+
+
+def game_steps(model: BaseAlgorithm) -> int | None:
+    """
+    Steps of games that a model was trained for: its ``num_timesteps`` (agents' steps) divided by N.
+
+    :param model: an algorithm with or without an environment
+    :return: None if its environment is not made of teams
+    """
+    venv = model.get_env()
+    n_agents = None if venv is None else find_n_agents(venv)
+    return None if n_agents is None else model.num_timesteps // n_agents
+
+
+def log_game_steps(algorithm_class: AlgorithmClass) -> AlgorithmClass:
+    """
+    Let an algorithm log ``time/game_steps`` beside ``time/total_timesteps`` whenever it trains on teams.
+
+    SB3 has no door for this: callbacks end before the logs are written, and must be passed to every ``learn``. So
+    ``dump_logs`` of the class is wrapped; models on other environments log what they always did. Calling it again, for
+    the class or a subclass that inherits the wrapped method, changes nothing.
+
+    :param algorithm_class: for instance PPO; its base classes are left alone
+    :return: the same class
+    """
+    original = algorithm_class.dump_logs
+    if getattr(original, _MARK, False):
+        return algorithm_class
+
+    @functools.wraps(original)
+    def dump_logs(self: BaseAlgorithm, *args: Any, **kwargs: Any) -> None:
+        steps = game_steps(self)
+        if steps is not None:
+            self.logger.record(GAME_STEPS_TAG, steps)
+        original(self, *args, **kwargs)
+
+    setattr(dump_logs, _MARK, True)
+    setattr(algorithm_class, "dump_logs", dump_logs)  # noqa: B010 (mypy refuses the plain assignment)
+    return algorithm_class

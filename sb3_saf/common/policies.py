@@ -1,0 +1,311 @@
+"""
+The policy class that SAF, MAPPO and IPPO share: SB3's ActorCriticPolicy for rows that carry their team's joint view.
+
+The actor reads ``obs`` (and ``agent``, with one head per agent); only the critic reads ``team``. Letters: B rows, N
+agents.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from functools import partial
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+
+from sb3_saf.common.actor import ActionHead, Actor
+from sb3_saf.common.critic import OwnValueHead, TeamCritic
+from sb3_saf.common.encoders import ObservationEncoder
+from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
+from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one
+from sb3_saf.common.teams import AGENT_KEY, OBS_KEY, TEAM_KEY, TEAM_KEYS, TeamSpaces
+from sb3_saf.common.views import OwnViews, ViewEncoder
+
+NetArch = list[int] | dict[str, list[int]]
+
+#: Arguments of SB3's base class that only gSDE reads; team policies refuse gSDE and do not save them.
+_SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
+
+
+class TeamActorCriticPolicy(ActorCriticPolicy):
+    """
+    Policy for PPO and A2C on rows of teams: one row is one agent in one game at one step.
+
+    A row's observation is that of ``CentralizedValueWrapper``: ``obs``, ``team`` and ``agent``. The actor reads
+    ``obs`` alone: what other agents see cannot change an action's probability by a bit. Each distinct observation of
+    a batch is encoded once, so extractors must treat views one by one (no batch normalisation).
+
+    Beside these arguments, a policy takes the fields of its ``parts_class`` by keyword.
+
+    :param observation_space: Dict of ``obs``, ``team`` and ``agent``
+    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param lr_schedule: learning rate schedule
+    :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
+    :param distinct: False encodes every row, which gives the same numbers slowly
+    :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
+    :param use_sde: refused; here because SB3's algorithms pass it
+    :param share_features_extractor: actor and critic always share the encoder; False is refused
+    :param features_extractor_class: encoder, built on the space of ``obs``
+    :param features_extractor_kwargs: its further arguments
+    :param kwargs: fields of ``parts_class``, and other arguments of SB3's ``ActorCriticPolicy``: activation_fn,
+        ortho_init, log_std_init, normalize_images, optimizer_class, optimizer_kwargs
+    """
+
+    #: The algorithm: which actor and critic to make.
+    parts_class: ClassVar[type[TeamParts]]
+
+    actor: Actor
+    value_net: OwnValueHead | TeamCritic  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        net_arch: NetArch | None = None,
+        *,
+        distinct: bool = True,
+        chunk_size: int | None = 512,
+        use_sde: bool = False,
+        share_features_extractor: bool = True,
+        features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
+        features_extractor_kwargs: Mapping[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        _refuse(use_sde=use_sde, share_features_extractor=share_features_extractor)
+        if chunk_size is not None:
+            check_at_least_one("chunk_size", chunk_size)
+        self.team_spaces = TeamSpaces.from_observation_space(observation_space)
+        self.parts = self.parts_class(**_taken(kwargs, {field.name for field in fields(self.parts_class)}))
+        self.chunk_size = chunk_size
+        self.distinct = distinct
+        self.views = ViewEncoder(self._encode, distinct)
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            [128, 128] if net_arch is None else net_arch,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # SB3 writes into it
+            **kwargs,
+        )
+
+    @classmethod
+    @abstractmethod
+    def paper_table_kwargs(cls) -> dict[str, Any]:
+        """Arguments with which the policy has as many parameters as in the paper's table."""
+
+    # --- construction -----------------------------------------------------------------------------------------------
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Make the encoder, for the observations of one agent."""
+        return self.features_extractor_class(self.team_spaces.own, **self.features_extractor_kwargs)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        # The critic comes last: policies of one seed that differ in the critic start with the same encoder and actor.
+        spec = self._network_spec()
+        self.actor = self.parts.actor(spec)
+        if self.ortho_init:
+            self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
+            orthogonal_init(self.actor)
+        # TRPO tells the critic's parameters by "value" in their name: everything below value_net has it.
+        self.value_net = self.parts.critic(spec)
+        if self.ortho_init:
+            orthogonal_init(self.value_net)
+        learning_rate = lr_schedule(1)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _network_spec(self) -> NetworkSpec:
+        actor_hidden, value_hidden = _hidden_sizes(self.net_arch)
+        return NetworkSpec(
+            self.features_dim,
+            self.team_spaces.n_agents,
+            self.action_space,
+            actor_hidden,
+            value_hidden,
+            self.activation_fn,
+            self.log_std_init,
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for name in _SDE_ARGUMENTS:
+            del data[name]
+        return data | asdict(self.parts) | {"distinct": self.distinct, "chunk_size": self.chunk_size}
+
+    @property
+    def log_std(self) -> th.Tensor:  # type: ignore[override]  # read-only, and one row per policy
+        """(policies, D) log standard deviations of Box actions; there is no such attribute for other actions."""
+        heads = [module for module in self.actor.modules() if isinstance(module, ActionHead)]
+        found: list[th.Tensor] = [head.log_std for head in heads if head.log_std is not None]
+        if not found:
+            raise AttributeError("only policies with Box actions have a log_std")
+        return th.stack(found)
+
+    # --- what SB3 calls ---------------------------------------------------------------------------------------------
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Act and estimate values.
+
+        :param obs: rows
+        :param deterministic: whether to take the most likely actions
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
+        """
+        own = self.views.own(self._own(obs))
+        distribution = self._distribution(obs, own)
+        actions = distribution.get_actions(deterministic=deterministic)
+        log_prob = distribution.log_prob(actions)
+        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, own), log_prob
+
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """
+        Evaluate given actions.
+
+        :param obs: rows
+        :param actions: (B, ...) actions
+        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
+        """
+        own = self.views.own(self._own(obs))
+        distribution = self._distribution(obs, own)
+        return self._values(obs, own), distribution.log_prob(actions), distribution.entropy()
+
+    def get_distribution(self, obs: PyTorchObs) -> Distribution:
+        """
+        Action distribution; ``team`` is not read and may be missing.
+
+        :param obs: rows, or own observations alone (B, ...)
+        """
+        return self._distribution(obs, self.views.own(self._own(obs)))
+
+    def predict_values(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        Estimate values.
+
+        :param obs: rows
+        :return: (B, 1)
+        """
+        return self._values(obs, None)
+
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor | None = None) -> th.Tensor:
+        """
+        Encode own observations.
+
+        :param obs: rows, or own observations alone
+        :param features_extractor: must be the policy's own, or None
+        :return: (B, d)
+        """
+        if features_extractor is not None and features_extractor is not self.features_extractor:
+            raise ValueError("a team policy encodes with its own features_extractor; call the other extractor directly")
+        own = self.views.own(self._own(obs))
+        return own.features[own.rows]
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        Make tensors of NumPy observations.
+
+        :param observation: rows, some of their entries, or own observations alone; a batch or a single one
+        :return: dict of tensors with a batch axis, and whether the observation was a batch
+        """
+        entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
+        unknown = [key for key in entries if key not in TEAM_KEYS]
+        if unknown:
+            raise ValueError(
+                f"expected observations with the keys {', '.join(map(repr, TEAM_KEYS))}, got {unknown[0]!r}"
+            )
+        arrays = {key: np.asarray(value) for key, value in entries.items()}
+        if AGENT_KEY in arrays:
+            arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
+        tensors, is_batch = super().obs_to_tensor(arrays)
+        assert isinstance(tensors, dict)
+        if len({len(tensor) for tensor in tensors.values()}) > 1:
+            lengths = ", ".join(f"{key!r} {len(tensor)}" for key, tensor in tensors.items())
+            raise ValueError(f"expected as many rows under each key of an observation, got {lengths}")
+        return tensors, is_batch
+
+    # --- reading rows -----------------------------------------------------------------------------------------------
+
+    def _own(self, obs: PyTorchObs) -> th.Tensor:
+        """(B, *shape) own observations."""
+        own = obs if isinstance(obs, th.Tensor) else _entry(obs, OBS_KEY, "the actor")
+        return own.reshape(-1, *self.team_spaces.own_shape)
+
+    def _team(self, obs: PyTorchObs) -> th.Tensor:
+        """(B, N, *shape) joint observations."""
+        return _entry(obs, TEAM_KEY, "the critic").reshape(-1, *self.team_spaces.team.shape)
+
+    def _agent(self, obs: PyTorchObs) -> th.Tensor:
+        """(B,) agents' indices; buffers give them as (B, 1), some as floats."""
+        return _entry(obs, AGENT_KEY, "a critic or head that depends on the agent").reshape(-1).long()
+
+    def _checked_agent(self, agent: np.ndarray) -> np.ndarray:
+        n_agents = self.team_spaces.n_agents
+        agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
+        if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
+            raise ValueError(f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}")
+        return agent
+
+    def _encode(self, observations: th.Tensor) -> th.Tensor:
+        """(K, d) features of own observations (K, *shape)."""
+        on_cpu = observations.device.type == "cpu"
+        parts = th.split(observations, self.chunk_size if self.chunk_size and on_cpu else max(1, len(observations)))
+        own_space, extractor = self.team_spaces.own, self.features_extractor
+        features = [extractor(preprocess_obs(part, own_space, self.normalize_images)) for part in parts]
+        return features[0] if len(features) == 1 else th.cat(features)
+
+    def _distribution(self, obs: PyTorchObs, own: OwnViews) -> Distribution:
+        agent = self._agent(obs) if self.actor.reads_agent else None
+        return self.actor.distribution(self.views.per_agent(self.actor, own, agent))
+
+    def _values(self, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
+        """(B, 1) values; ``own`` are the rows' own views if they were encoded before."""
+        critic = self.value_net
+        if isinstance(critic, TeamCritic):
+            views = self.views.teams(self._team(obs), own)
+            values: th.Tensor = critic(views.features, views.teams)[views.rows, self._agent(obs)]
+        else:
+            own = self.views.own(self._own(obs)) if own is None else own
+            values = self.views.per_agent(critic, own, self._agent(obs) if critic.reads_agent else None)
+        return values.unsqueeze(1)
+
+
+def _entry(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
+    if isinstance(obs, th.Tensor) or key not in obs:
+        raise ValueError(
+            f"expected the observation to have {key!r}, which {reader} reads, got "
+            f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs))}; pass whole rows of "
+            "sb3_saf.CentralizedValueWrapper"
+        )
+    return obs[key]
+
+
+def _refuse(use_sde: bool, share_features_extractor: bool) -> None:
+    if use_sde:
+        raise ValueError("team policies have no state-dependent exploration (gSDE): leave use_sde=False")
+    if not share_features_extractor:
+        raise ValueError(
+            "team policies share the features extractor between actor and critic: leave share_features_extractor=True"
+        )
+
+
+def _taken(kwargs: dict[str, Any], names: set[str]) -> dict[str, Any]:
+    """Take named entries out of ``kwargs``."""
+    return {name: kwargs.pop(name) for name in list(kwargs) if name in names}
+
+
+def _hidden_sizes(net_arch: NetArch) -> tuple[list[int], list[int]]:
+    """Hidden sizes of action heads and of value heads."""
+    if not isinstance(net_arch, dict):
+        return list(net_arch), list(net_arch)
+    if set(net_arch) != {"pi", "vf"}:
+        raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(net_arch)}")
+    return list(net_arch["pi"]), list(net_arch["vf"])

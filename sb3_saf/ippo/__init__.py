@@ -1,0 +1,1 @@
+"""IPPO: a local critic."""

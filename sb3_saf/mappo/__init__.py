@@ -1,0 +1,1 @@
+"""MAPPO: a joint critic."""

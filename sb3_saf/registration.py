@@ -1,0 +1,49 @@
+"""Makes the policies known to algorithms by name, as SB3 knows "MlpPolicy"."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Final
+
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_saf.common.game_steps import log_game_steps
+from sb3_saf.ippo.policies import IPPOPolicy
+from sb3_saf.mappo.policies import MAPPOPolicy
+from sb3_saf.saf.policies import SAFPolicy
+
+#: Which names each algorithm learns. SB3 keeps one dict per algorithm.
+POLICIES: Final[dict[type[BaseAlgorithm], dict[str, type[BasePolicy]]]] = {
+    algorithm: {"IPPOPolicy": IPPOPolicy, "MAPPOPolicy": MAPPOPolicy, "SAFPolicy": SAFPolicy}
+    for algorithm in (PPO, A2C)
+}
+
+
+def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:
+    """
+    Let an algorithm know a policy by name. A name that belongs to another policy stays with it, with a warning.
+
+    :param algorithm: class with ``policy_aliases``
+    :param name: what users type
+    :param policy: the policy class
+    """
+    known = algorithm.policy_aliases.setdefault(name, policy)
+    if (known.__module__, known.__qualname__) == (policy.__module__, policy.__qualname__):
+        algorithm.policy_aliases[name] = policy  # also after a reload of the module
+        return
+    warnings.warn(
+        f"{algorithm.__name__} already knows another policy by the name {name!r}, "
+        f"{known.__module__}.{known.__qualname__}; pass the class {policy.__module__}.{policy.__qualname__} instead "
+        "of its name",
+        stacklevel=2,
+    )
+
+
+def register_all() -> None:
+    """Register every policy, and log game steps beside SB3's rows; done when ``sb3_saf`` is imported."""
+    for algorithm, policies in POLICIES.items():
+        log_game_steps(algorithm)
+        for name, policy in policies.items():
+            register(algorithm, name, policy)

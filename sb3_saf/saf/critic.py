@@ -1,0 +1,81 @@
+"""SAF's critic: an agent's value from its own state and what it reads from the knowledge source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch as th
+from torch import nn
+
+from sb3_saf.common.critic import Heads, JointValueHead, OwnValueHead, TeamCritic
+from sb3_saf.common.networks import mlp
+from sb3_saf.saf.knowledge_source import KnowledgeSource
+
+#: What the value head reads: the agent's own s^SAF, or those of the whole team.
+CriticInput = Literal["own", "team"]
+
+
+class SAFCritic(TeamCritic):
+    """
+    V_i from s_i^SAF (arXiv 2210.03022, section 5):
+
+    m'_i = g_theta(z_i), s_i = g_omega(z_i), slots written from m', m_i read with s_i, s_i^SAF = g_phi([s_i, m_i]).
+
+    :param features_dim: size of z
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers of the value head
+    :param activation_fn: activation of all MLPs
+    :param heads: one value head for all agents, or one for each
+    :param critic_input: what the value head reads
+    :param agent_identity: whether a shared head on the whole team reads whose value is asked
+    :param n_slots: L
+    :param latent_dim: d, size of messages, states and slots
+    :param projection_hidden: sizes of the hidden layers of g_theta, g_omega and g_phi
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        n_agents: int,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        heads: Heads,
+        critic_input: CriticInput,
+        agent_identity: bool,
+        n_slots: int,
+        latent_dim: int,
+        projection_hidden: Sequence[int],
+    ):
+        super().__init__()
+        self.message_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        self.state_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        self.knowledge_source = KnowledgeSource(n_agents, latent_dim, n_slots)
+        self.combine_net = mlp([2 * latent_dim, *projection_hidden, latent_dim], activation_fn)
+        self.value_head: OwnValueHead | JointValueHead
+        if critic_input == "own":
+            self.value_head = OwnValueHead(latent_dim, n_agents, hidden, activation_fn, heads)
+        else:
+            self.value_head = JointValueHead(latent_dim, n_agents, hidden, activation_fn, heads, agent_identity)
+
+    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        s^SAF of every agent; see :meth:`forward` for the parameters.
+
+        :return: (G, N, d)
+        """
+        # g_theta and g_omega depend on one view only: once per view, then gathered.
+        messages, states = self.message_net(features)[teams], self.state_net(features)[teams]
+        read = self.knowledge_source(messages, states, active)
+        combined: th.Tensor = self.combine_net(th.cat([states, read], dim=2))
+        return combined
+
+    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamCritic`."""
+        states = self.states(features, teams, active)
+        if isinstance(self.value_head, OwnValueHead):
+            return self.value_head.of_teams(states)
+        if active is not None:
+            states = states * active.unsqueeze(2)
+        values: th.Tensor = self.value_head(states)
+        return values

@@ -1,0 +1,37 @@
+"""What every test starts from: one thread, no window, the same random numbers."""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+# Read by the libraries when they are imported, so set before any test module imports them (and torch is not
+# imported for tests of the game alone). One thread each: the networks are small, the tests run in several processes,
+# and sums come out in the same order everywhere.
+for variable, value in {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "MPLBACKEND": "Agg",
+    "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+    "SDL_AUDIODRIVER": "dummy",
+    "SDL_VIDEODRIVER": "dummy",
+}.items():
+    os.environ.setdefault(variable, value)
+
+# No deadline: the first example compiles the kernels. In CI the examples are the same in every run.
+settings.register_profile("sb3_saf", deadline=None, derandomize="CI" in os.environ)
+settings.load_profile("sb3_saf")
+
+
+@pytest.fixture(autouse=True)
+def _same_random_numbers() -> None:
+    """Seed the global generators, so that no test depends on the tests before it."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 - SB3's replay buffer and spaces draw from it
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(0)

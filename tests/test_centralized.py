@@ -1,0 +1,436 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.monitor import TeamMonitor
+from sb3_saf.common.teams import TeamSpaces, find_n_agents
+from tests.team_venv import VECTOR, Array, TeamVenv, see_where, still
+
+
+class AtlasSpace(spaces.Box):
+    """Codes that a policy turns into pixels."""
+
+    def __init__(self, shape: tuple[int, ...], n_codes: int) -> None:
+        super().__init__(0, n_codes - 1, shape, np.uint8)
+        self.atlas = np.zeros((n_codes, 4, 4, 3), dtype=np.uint8)
+
+
+def bytes_of(shape: tuple[int, ...]) -> Callable[[int, int, int, int], Array]:
+    """Bytes that differ for all games, agents, episodes, steps and places."""
+    size = int(np.prod(shape))
+
+    def see(game: int, agent: int, episode: int, step: int) -> Array:
+        return (
+            ((np.arange(size) * 7 + 31 * game + 17 * agent + 5 * episode + 3 * step) % 256)
+            .astype(np.uint8)
+            .reshape(shape)
+        )
+
+    return see
+
+
+def test_rows_of_two_games_with_three_agents() -> None:
+    env = CentralizedValueWrapper(TeamVenv(lengths=(3, 2), n_agents=3))
+    env.reset()
+    obs, rewards, dones, _ = env.step(still(env))
+    assert isinstance(obs, dict)
+    own = [[0, 0, 0, 1], [0, 1, 0, 1], [0, 2, 0, 1], [1, 0, 0, 1], [1, 1, 0, 1], [1, 2, 0, 1]]
+    assert obs["obs"].tolist() == own
+    assert obs["team"].tolist() == [own[:3], own[:3], own[:3], own[3:], own[3:], own[3:]]
+    assert obs["agent"].tolist() == [0, 1, 2, 0, 1, 2]
+    assert rewards.tolist() == [1, 11, 21, 101, 111, 121]
+    assert dones.tolist() == [False] * 6
+    assert env.step(still(env))[2].tolist() == [False] * 3 + [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("own_space", "see"),
+    [
+        (VECTOR, see_where),
+        (spaces.Box(-1, 1, (2, 2), np.float64), lambda e, i, k, t: np.full((2, 2), (e + i) / 10)),
+        (spaces.Discrete(9), lambda e, i, k, t: e + i),
+        (spaces.Discrete(9, start=3), lambda e, i, k, t: 3 + e + i),
+        (spaces.MultiDiscrete([9, 4]), lambda e, i, k, t: [e + i, t]),
+        (spaces.MultiBinary(3), lambda e, i, k, t: [e, i % 2, t % 2]),
+        (spaces.Box(0, 255, (9, 8, 3), np.uint8), bytes_of((9, 8, 3))),
+        (spaces.Box(0, 255, (3, 9, 8), np.uint8), bytes_of((3, 9, 8))),
+        # The views of three agents, (3, 2, 7) bytes, look like a channel-last picture to SB3, and so do (3, 7, 2).
+        (spaces.Box(0, 255, (2, 7), np.uint8), bytes_of((2, 7))),
+        (spaces.Box(0, 255, (7, 2), np.uint8), bytes_of((7, 2))),
+        (AtlasSpace((7, 7), 200), lambda e, i, k, t: bytes_of((7, 7))(e, i, k, t) % 200),
+    ],
+    ids=lambda value: None if callable(value) else str(value),
+)
+class TestEverySpace:
+    def test_rows_lie_in_the_space(self, own_space: spaces.Space[Any], see: Any) -> None:
+        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
+        env.reset()
+        for _ in range(4):
+            obs, _, dones, infos = env.step(still(env))
+            assert isinstance(obs, dict)
+            rows = [{key: part[row] for key, part in obs.items()} for row in range(6)]
+            rows += [infos[row]["terminal_observation"] for row in np.flatnonzero(dones)]
+            for row in rows:
+                assert isinstance(env.observation_space, spaces.Dict)
+                assert row.keys() == env.observation_space.spaces.keys()
+                for key, space in env.observation_space.spaces.items():
+                    assert space.contains(row[key]), key
+                    assert np.asarray(row[key]).dtype == space.dtype
+                np.testing.assert_array_equal(row["team"][row["agent"]], row["obs"])
+
+    def test_nothing_that_was_returned_changes_later(self, own_space: spaces.Space[Any], see: Any) -> None:
+        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
+        obs = env.reset()
+        before = {key: part.copy() for key, part in obs.items()}
+        step = env.step(still(env))
+        assert isinstance(step[0], dict)
+        step_before = {key: part.copy() for key, part in step[0].items()}
+        rewards, dones = step[1].copy(), step[2].copy()
+        env.step(still(env))
+        for key in before:
+            np.testing.assert_array_equal(before[key], obs[key])
+            np.testing.assert_array_equal(step_before[key], step[0][key])
+        np.testing.assert_array_equal(rewards, step[1])
+        np.testing.assert_array_equal(dones, step[2])
+
+    def test_sb3_takes_the_rows_as_they_are(self, own_space: spaces.Space[Any], see: Any) -> None:
+        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
+        assert PPO._wrap_env(env) is env
+
+    def test_parts_are_found_again(self, own_space: spaces.Space[Any], see: Any) -> None:
+        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
+        parts = TeamSpaces.from_observation_space(env.observation_space)
+        assert parts == env.team_spaces
+        assert parts.n_agents == 3
+        assert parts.own_shape == parts.own.shape
+
+
+def test_spaces_are_passed_on_as_the_same_objects() -> None:
+    for own in (VECTOR, AtlasSpace((7, 7), 200), AtlasSpace((7, 7, 3), 256), spaces.Discrete(4)):
+        env = CentralizedValueWrapper(TeamVenv(own_space=own))
+        assert isinstance(env.observation_space, spaces.Dict)
+        assert env.observation_space["obs"] is own
+        assert env.observation_space["team"].shape == (3, *(own.shape or ()))
+        assert env.observation_space["team"].dtype == own.dtype
+
+
+@pytest.mark.parametrize(
+    ("own", "low", "high"),
+    [
+        (spaces.Discrete(4, start=3), 3, 6),
+        (spaces.MultiDiscrete([2, 5], start=[1, -1]), [1, -1], [2, 3]),
+        (spaces.MultiBinary(2), [0, 0], [1, 1]),
+        (spaces.Box(np.array([-1, 0], np.float32), np.array([1, 9], np.float32)), [-1, 0], [1, 9]),
+    ],
+    ids=lambda value: None if callable(value) else str(value),
+)
+def test_bounds_of_a_team_are_those_of_its_agents(own: spaces.Space[Any], low: Any, high: Any) -> None:
+    team = TeamSpaces.of(own, 3).team
+    assert team.low.tolist() == [low] * 3
+    assert team.high.tolist() == [high] * 3
+
+
+def test_what_a_caller_writes_does_not_come_back() -> None:
+    env = CentralizedValueWrapper(TeamVenv())
+    expected = {key: part.copy() for key, part in env.reset().items()}
+    for part in env.reset().values():
+        part.fill(0)
+    for key, part in env.reset().items():
+        np.testing.assert_array_equal(part, expected[key])
+
+
+def test_images_are_transposed_once() -> None:
+    venv = TeamVenv(own_space=spaces.Box(0, 255, (9, 8, 3), np.uint8), see=bytes_of((9, 8, 3)))
+    env = CentralizedValueWrapper(venv)
+    obs = env.reset()
+    picture = bytes_of((9, 8, 3))(1, 2, 0, 0)
+    assert obs["obs"].shape == (6, 3, 9, 8)
+    assert obs["obs"][5, 2, 4, 7] == picture[4, 7, 2]
+    np.testing.assert_array_equal(obs["obs"][5], picture.transpose(2, 0, 1))
+    np.testing.assert_array_equal(obs["team"][3, 2], picture.transpose(2, 0, 1))
+    env.step(still(env))
+    *_, infos = env.step(still(env))
+    last = bytes_of((9, 8, 3))(1, 2, 0, 2).transpose(2, 0, 1)
+    np.testing.assert_array_equal(infos[5]["terminal_observation"]["obs"], last)
+    np.testing.assert_array_equal(infos[4]["terminal_observation"]["team"][2], last)
+    assert not is_vecenv_wrapped(PPO._wrap_env(env), VecTransposeImage)
+
+
+def test_images_that_sb3_would_transpose_twice() -> None:
+    # Width below channels: SB3's rule, asked again after the transposition, would transpose again.
+    venv = TeamVenv(own_space=spaces.Box(0, 255, (9, 3, 5), np.uint8), see=bytes_of((9, 3, 5)))
+    with pytest.warns(UserWarning, match="Treating image space as channels-last"):
+        env = CentralizedValueWrapper(venv)
+    np.testing.assert_array_equal(env.reset()["obs"][5], bytes_of((9, 3, 5))(1, 2, 0, 0).transpose(2, 0, 1))
+    assert PPO._wrap_env(env) is env
+
+
+def test_channel_first_images_stay() -> None:
+    venv = TeamVenv(own_space=spaces.Box(0, 255, (3, 9, 8), np.uint8), see=bytes_of((3, 9, 8)))
+    np.testing.assert_array_equal(CentralizedValueWrapper(venv).reset()["obs"][5], bytes_of((3, 9, 8))(1, 2, 0, 0))
+
+
+def test_codes_are_no_image_even_if_they_look_like_one() -> None:
+    see = bytes_of((9, 8, 3))
+    env = CentralizedValueWrapper(TeamVenv(own_space=AtlasSpace((9, 8, 3), 256), see=see))
+    np.testing.assert_array_equal(env.reset()["obs"][5], see(1, 2, 0, 0))
+    assert PPO._wrap_env(env) is env
+
+
+def test_terminal_observation_is_the_rows_own_dict() -> None:
+    venv = TeamVenv(lengths=(3, 2))
+    env = CentralizedValueWrapper(venv)
+    env.reset()
+    env.step(still(env))
+    obs, _, dones, infos = env.step(still(env))
+    assert dones.dtype == bool
+    last = [[1, 0, 0, 2], [1, 1, 0, 2], [1, 2, 0, 2]]
+    for agent in range(3):
+        row = infos[3 + agent]["terminal_observation"]
+        assert row["obs"].tolist() == last[agent]
+        assert row["team"].tolist() == last
+        assert row["agent"] == agent
+        assert "terminal_observation" not in infos[agent]
+    assert isinstance(obs, dict)
+    assert obs["obs"][3].tolist() == [1, 0, 1, 0], "the next episode has begun"
+    # The infos of the environment are its own.
+    assert venv.infos[3]["terminal_observation"].tolist() == last[0]
+    assert venv.infos[3]["TimeLimit.truncated"] is True
+
+
+def test_a_time_limit_is_a_true_end_unless_told_otherwise() -> None:
+    for time_limit, truncated in (("terminal", False), ("bootstrap", True)):
+        env = CentralizedValueWrapper(TeamVenv(), time_limit=time_limit)  # type: ignore[arg-type]
+        env.reset()
+        env.step(still(env))
+        *_, infos = env.step(still(env))
+        assert [info.get("TimeLimit.truncated") for info in infos] == [None] * 3 + [truncated] * 3
+    env = CentralizedValueWrapper(TeamVenv(truncate=False), time_limit="bootstrap")
+    env.reset()
+    env.step(still(env))
+    assert env.step(still(env))[3][3]["TimeLimit.truncated"] is False
+
+
+class SeeRollout(BaseCallback):
+    """Keep the rewards of the first rollout, and the values of the last observations before anything is learned."""
+
+    rewards: Array
+
+    def _on_rollout_end(self) -> None:
+        self.rewards = self.model.rollout_buffer.rewards.copy()  # type: ignore[attr-defined]
+        policy = self.model.policy
+        assert isinstance(policy, ActorCriticPolicy)
+        last: dict[str, Array] = {
+            "obs": np.array([[1, agent, 0, 2] for agent in range(3)], dtype=np.float32),
+            "team": np.array([[[1, agent, 0, 2] for agent in range(3)]] * 3, dtype=np.float32),
+            "agent": np.arange(3),
+        }
+        with th.no_grad():
+            self.values = policy.predict_values(policy.obs_to_tensor(last)[0])
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("time_limit", "gamma"), [("terminal", 0.0), ("bootstrap", 0.9)])
+def test_ppo_adds_the_value_of_the_rows_own_last_observation(time_limit: Any, gamma: float) -> None:
+    env = CentralizedValueWrapper(TeamVenv(lengths=(3, 2)), time_limit=time_limit)
+    model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=12, n_epochs=1, gamma=0.9, seed=0, device="cpu")
+    seen = SeeRollout()
+    model.learn(12, callback=seen)
+    expected = np.array([102, 112, 122]) + gamma * seen.values.numpy().flatten()
+    np.testing.assert_allclose(seen.rewards[1, 3:], expected, rtol=1e-6)
+    np.testing.assert_allclose(seen.rewards[1, :3], [2, 12, 22])
+
+
+def test_team_size_is_seen_through_further_wrappers() -> None:
+    env: VecEnv = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2, 4))))
+    for layer in (env, VecNormalize(env, norm_obs=False)):
+        assert find_n_agents(layer) == 3
+        assert (layer.n_agents, layer.n_games) == (3, 3)  # type: ignore[attr-defined]
+        assert layer.has_attr("n_agents")
+        assert layer.get_attr("n_agents", [0, 1]) == [3, 3]
+
+
+def test_team_size_that_only_the_wrapper_knows() -> None:
+    venv = TeamVenv(n_agents=3, tell_size=False)
+    env = CentralizedValueWrapper(venv, n_agents=2)
+    assert (env.n_agents, env.n_games) == (2, 3)
+    assert env.get_attr("n_agents") == [2] * 6
+    assert VecNormalize(env, norm_obs=False).get_attr("n_games") == [3] * 6
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: CentralizedValueWrapper(TeamVenv(tell_size=False)),
+            r"expected a VecEnv of flattened teams that states its team size in an attribute n_agents, got TeamVenv "
+            r"with 6 rows and no such attribute; build it with sb3_saf.make_team_env\(...\), or state the size: "
+            r"CentralizedValueWrapper\(venv, n_agents=N\)",
+        ),
+        (
+            lambda: CentralizedValueWrapper(TeamVenv(tell_size=False), n_agents=4),
+            r"expected rows of whole teams, a multiple of n_agents=4, got 6 rows \(1 teams and 2 rows over\); pass the "
+            r"right n_agents",
+        ),
+        (
+            lambda: CentralizedValueWrapper(TeamVenv(), n_agents=2),
+            "n_agents=2, but the VecEnv has teams of 3; leave n_agents out",
+        ),
+        (lambda: CentralizedValueWrapper(TeamVenv(), n_agents=0), "n_agents must be an integer of at least 1, got 0"),
+        (
+            lambda: CentralizedValueWrapper(TeamVenv(), n_agents=True),
+            "n_agents must be an integer of at least 1, got True",
+        ),
+        (
+            lambda: CentralizedValueWrapper(TeamVenv(), time_limit="truncate"),  # type: ignore[arg-type]
+            "time_limit must be 'terminal' or 'bootstrap', got 'truncate'",
+        ),
+        (
+            lambda: CentralizedValueWrapper(CentralizedValueWrapper(TeamVenv())),
+            r"expected a VecEnv of own observations, got one that already has the Dict observation of "
+            r"CentralizedValueWrapper; wrap it once \(sb3_saf.make_team_env has done so\)",
+        ),
+        (
+            lambda: TeamSpaces.of(spaces.Dict({"a": VECTOR}), 2),
+            r"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got Dict.*; "
+            r"flatten it first, for instance with supersuit.flatten_v0 or a wrapper of your own",
+        ),
+        (
+            lambda: TeamSpaces.from_observation_space(VECTOR),
+            r"expected the Dict observation space of CentralizedValueWrapper with the keys 'obs', 'team', 'agent'; got "
+            r"Box.*\. Build the environment with sb3_saf.make_team_env\(...\), or wrap a VecEnv of flattened teams: "
+            r"sb3_saf.CentralizedValueWrapper\(venv, n_agents=N\)",
+        ),
+        (
+            lambda: TeamSpaces.from_observation_space(
+                spaces.Dict({"obs": VECTOR, "team": spaces.Box(0, 1, (2, 4)), "agent": spaces.Discrete(3)})
+            ),
+            r"its 'team' must be a Box of shape \(3, 4\) and dtype float32, got Box",
+        ),
+        (
+            lambda: TeamSpaces.from_observation_space(
+                spaces.Dict({"obs": VECTOR, "team": spaces.Box(0, 1, (3, 4)), "agent": spaces.Discrete(3, start=1)})
+            ),
+            r"its 'agent' must be Discrete\(N\) from 0, got Discrete\(3, start=1\)",
+        ),
+    ],
+)
+def test_what_cannot_be_wrapped(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+class Broken(TeamVenv):
+    """Teams with a fault that a test puts in after a correct step."""
+
+    def __init__(self, fault: Callable[[Broken], None], **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.fault = fault
+
+    def step_wait(self) -> Any:
+        _, rewards, dones, infos = super().step_wait()
+        self.fault(self)
+        return self.obs, rewards, dones, infos
+
+
+def set_entry(name: str, index: Any, value: Any) -> Callable[[Broken], None]:
+    def fault(venv: Broken) -> None:
+        getattr(venv, name)[index] = value
+
+    return fault
+
+
+def no_last_view(venv: Broken) -> None:
+    if venv.dones[4]:
+        del venv.infos[4]["terminal_observation"]
+
+
+def bad_last_view(venv: Broken) -> None:
+    if venv.dones[4]:
+        venv.infos[4]["terminal_observation"] = np.array([1, 1, np.nan, 2], dtype=np.float32)
+
+
+def short_last_view(venv: Broken) -> None:
+    if venv.dones[4]:
+        venv.infos[4]["terminal_observation"] = np.zeros(3, dtype=np.float32)
+
+
+def fewer_rows(venv: Broken) -> None:
+    venv.obs = venv.obs[:5]
+
+
+def other_dtype(venv: Broken) -> None:
+    venv.obs = venv.obs.astype(np.complex64)
+
+
+def step_twice(env: VecEnv) -> None:
+    for _ in range(2):
+        env.step(still(env))
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (
+            set_entry("rewards", 4, np.nan),
+            "rewards must be finite, got nan at step 1 for agent 1 of game 1; repair the environment, learning from it "
+            "would ruin the model",
+        ),
+        (
+            set_entry("rewards", slice(2, 5), -np.inf),
+            r"rewards must be finite, got -inf at step 1 for agent 2 of game 0 \(and 2 more rows\)",
+        ),
+        (set_entry("obs", (5, 3), np.inf), "observations must be finite, got inf at step 1 for agent 2 of game 1"),
+        (
+            set_entry("dones", 1, 1),
+            r"expected one done flag for a whole team, got \[False, True, False\] for the agents of game 0; a team "
+            r"episode ends for all agents at once: keep agents that are out of the game as idle rows until then "
+            r"\(sb3_saf.make_team_env does so\), or check n_agents and the order of rows \(game-major, then agent\)",
+        ),
+        (
+            no_last_view,
+            r"expected infos\[row\]\['terminal_observation'\] for all 3 agents of game 1, whose episode ended at step "
+            r"2, got none for agents \[1\]; every row of a done team must carry its last observation",
+        ),
+        (bad_last_view, "terminal observations must be finite, got nan at step 2 for agent 1 of game 1;"),
+        (
+            short_last_view,
+            r"expected terminal observations of one shape for the agents of game 1, got \[\(3,\), \(4,\)\]",
+        ),
+        (
+            fewer_rows,
+            r"expected observations of shape \(6, 4\) and dtype float32 as in Box.*, got shape \(5, 4\) and dtype "
+            r"float32; make the environment return what its space promises",
+        ),
+        (other_dtype, r"expected observations of shape \(6, 4\) and dtype float32 .* and dtype complex64"),
+    ],
+)
+def test_silent_garbage_is_not_passed_on(fault: Callable[[Broken], None], message: str) -> None:
+    env = CentralizedValueWrapper(Broken(fault))
+    env.reset()
+    with pytest.raises(ValueError, match=message):
+        step_twice(env)
+
+
+def test_numbers_of_a_larger_kind_are_cast_to_the_space() -> None:
+    def wider(venv: Broken) -> None:
+        venv.obs = venv.obs.astype(np.float64)
+
+    env = CentralizedValueWrapper(Broken(wider))
+    env.reset()
+    obs = env.step(still(env))[0]
+    assert isinstance(obs, dict)
+    assert obs["obs"].dtype == obs["team"].dtype == np.float32

@@ -1,0 +1,197 @@
+"""Distinct rows are found exactly, and views are encoded once each with unchanged results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_saf.common import distinct
+from sb3_saf.common.distinct import Distinct, distinct_rows, every_row
+from sb3_saf.common.views import ViewEncoder
+
+Finder = Callable[[th.Tensor], Distinct]
+
+
+def on_cpu(x: th.Tensor) -> Distinct:
+    return distinct._distinct_on_cpu(distinct._bytes_of_rows(x))
+
+
+def on_device(x: th.Tensor) -> Distinct:
+    return distinct._distinct_on_device(distinct._bytes_of_rows(x))
+
+
+FINDERS = pytest.mark.parametrize("find", [on_cpu, on_device])
+
+
+def reference(x: th.Tensor) -> tuple[list[int], list[int]]:
+    """Distinct rows by a dict of their bytes."""
+    seen: dict[bytes, int] = {}
+    index: list[int] = []
+    inverse: list[int] = []
+    for row, value in enumerate(x):
+        key = value.contiguous().view(-1).view(th.uint8).numpy().tobytes()
+        if key not in seen:
+            seen[key] = len(index)
+            index.append(row)
+        inverse.append(seen[key])
+    return index, inverse
+
+
+def assert_matches_reference(x: th.Tensor, found: Distinct) -> None:
+    index, inverse = reference(x)
+    assert found.index.tolist() == index
+    assert found.inverse.tolist() == inverse
+    assert found.index.dtype == found.inverse.dtype == th.int64
+
+
+DTYPES = [th.uint8, th.int64, th.float32, th.float64, th.bool, th.bfloat16]
+
+
+@FINDERS
+@settings(max_examples=60, deadline=None)
+@given(
+    n_rows=st.integers(1, 60),
+    shape=st.sampled_from([(), (1,), (3,), (7, 7), (2, 4), (33,)]),
+    dtype=st.sampled_from(DTYPES),
+    n_values=st.integers(1, 30),
+    seed=st.integers(0, 2**31),
+)
+def test_agrees_with_a_dict_of_bytes(
+    find: Finder, n_rows: int, shape: tuple[int, ...], dtype: th.dtype, n_values: int, seed: int
+) -> None:
+    generator = th.Generator().manual_seed(seed)
+    pool = th.randint(0, 100, (n_values, *shape), generator=generator).to(dtype)
+    x = pool[th.randint(n_values, (n_rows,), generator=generator)]
+    assert_matches_reference(x, find(x))
+
+
+@FINDERS
+@pytest.mark.parametrize("position", range(0, 41, 5))
+def test_one_differing_byte_is_seen_wherever_it_is(find: Finder, position: int) -> None:
+    x = th.zeros(3, 41, dtype=th.uint8)
+    x[1, position] = 128
+    found = find(x)
+    assert found.index.tolist() == [0, 1]
+    assert found.inverse.tolist() == [0, 1, 0]
+
+
+@FINDERS
+def test_order_of_rows_does_not_matter(find: Finder) -> None:
+    x = th.randint(0, 2, (200, 4))
+    order = th.randperm(200)
+    shuffled, plain = find(x[order]), find(x)
+    assert len(shuffled.index) == len(plain.index)
+    assert th.equal(x[order][shuffled.index][shuffled.inverse], x[order])
+
+
+@FINDERS
+def test_edges(find: Finder) -> None:
+    assert [part.tolist() for part in find(th.zeros(0, 3))] == [[], []]
+    assert [part.tolist() for part in find(th.zeros(2, 0))] == [[0], [0, 0]]
+    assert find(th.tensor([[0.0], [-0.0], [0.0]])).inverse.tolist() == [0, 1, 0]
+    assert find(th.tensor([[float("nan")], [float("nan")]])).inverse.tolist() == [0, 0]
+    transposed = th.arange(12).view(3, 4).t() // 6
+    assert_matches_reference(transposed, find(transposed))
+    unaligned = th.randint(0, 2, (67,), dtype=th.uint8)[3:].view(8, 8)
+    assert_matches_reference(unaligned, find(unaligned))
+
+
+def test_exact_although_every_hash_collides(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = th.randint(0, 4, (60, 2))
+    monkeypatch.setattr(distinct, "_hash_row", lambda words, row: np.uint64(7))
+    monkeypatch.setattr(distinct, "_find_distinct", distinct._find_distinct.py_func)
+    assert_matches_reference(x, on_cpu(x))
+    monkeypatch.setattr(distinct, "_hash_words", lambda words: words.new_zeros(len(words)))
+    assert_matches_reference(x, on_device(x))
+
+
+def test_hashes_are_computed_in_parts_of_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = th.randint(0, 4, (60, 2))
+    monkeypatch.setattr(distinct, "_HASH_CHUNK_BYTES", 100)
+    assert_matches_reference(x, on_device(x))
+
+
+def test_input_is_left_alone_and_may_need_gradients() -> None:
+    x = th.randint(0, 2, (20, 3)).float().requires_grad_()
+    before = x.detach().clone()
+    found = distinct_rows(x)
+    x[found.index][found.inverse].sum().backward()
+    assert th.equal(x, before)
+    assert x.grad is not None and x.grad.sum() == 60
+
+
+def test_every_row_takes_each_row_for_a_distinct_one() -> None:
+    found = every_row(th.zeros(3, 2))
+    assert found.index.tolist() == found.inverse.tolist() == [0, 1, 2]
+
+
+class Counter:
+    """An encoder that notes what it was asked to encode."""
+
+    def __init__(self) -> None:
+        self.calls: list[th.Tensor] = []
+
+    def __call__(self, observations: th.Tensor) -> th.Tensor:
+        self.calls.append(observations)
+        return observations.float().flatten(1) * 2.0
+
+
+def a_b_teams() -> th.Tensor:
+    """Three rows of two teams with the views 1, 2 and 3, 1."""
+    return th.tensor([[[1], [2]], [[1], [2]], [[3], [1]]])
+
+
+def test_own_views_are_encoded_once_each() -> None:
+    counter = Counter()
+    own = ViewEncoder(counter).own(th.tensor([[1], [2], [1], [3]]))
+    assert [call.tolist() for call in counter.calls] == [[[1], [2], [3]]]
+    assert own.features[own.rows].tolist() == [[2.0], [4.0], [2.0], [6.0]]
+
+
+def test_teams_encode_only_what_is_not_known_yet() -> None:
+    counter = Counter()
+    encoder = ViewEncoder(counter)
+    own = encoder.own(th.tensor([[1], [1], [1]]))
+    views = encoder.teams(a_b_teams(), own)
+    assert [call.tolist() for call in counter.calls] == [[[1]], [[2], [3]]]
+    assert views.teams.tolist() == [[0, 1], [2, 0]]
+    assert views.rows.tolist() == [0, 0, 1]
+    assert th.equal(views.features[views.teams[views.rows]], 2.0 * a_b_teams())
+
+
+def test_teams_without_known_views_and_with_all_known() -> None:
+    counter = Counter()
+    encoder = ViewEncoder(counter)
+    encoder.teams(a_b_teams())
+    assert [call.tolist() for call in counter.calls] == [[[1], [2], [3]]]
+    encoder.teams(a_b_teams(), encoder.own(th.tensor([[3], [2], [1]])))
+    assert len(counter.calls) == 2
+
+
+def test_naive_encoder_encodes_every_row_and_every_member() -> None:
+    counter = Counter()
+    encoder = ViewEncoder(counter, distinct=False)
+    own = encoder.own(th.tensor([[1], [1], [1]]))
+    views = encoder.teams(a_b_teams(), own)
+    assert [len(call) for call in counter.calls] == [3, 6]
+    assert th.equal(views.features[views.teams[views.rows]], 2.0 * a_b_teams())
+
+
+def test_heads_are_applied_once_per_view_and_agent() -> None:
+    calls: list[list[float]] = []
+
+    def head(features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
+        values = features[:, 0] if agent is None else features[:, 0] + 100 * agent
+        calls.append(values.tolist())
+        return values
+
+    encoder = ViewEncoder(Counter())
+    own = encoder.own(th.tensor([[1], [1], [1], [3]]))
+    assert encoder.per_agent(head, own, None).tolist() == [2, 2, 2, 6]
+    assert encoder.per_agent(head, own, th.tensor([0, 1, 0, 0])).tolist() == [2, 102, 2, 6]
+    assert calls == [[2, 6], [2, 102, 6]]

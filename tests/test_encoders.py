@@ -1,0 +1,147 @@
+"""Encoders: sizes, layouts, and tiles that are the same as the pictures they stand for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_saf import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
+from sb3_saf.common.encoders import PixelInput
+from tests.toy_teams import PICTURE, CodeSpace, samples
+
+CHANNELS_LAST = spaces.Box(0, 255, (12, 12, 3), np.uint8)
+
+
+def painted(codes: th.Tensor, atlas: np.ndarray) -> th.Tensor:
+    """(K, C, H, W) pictures of tile codes, cell by cell."""
+    n_views, rows, columns = codes.shape
+    size = atlas.shape[1]
+    pictures = np.zeros((n_views, 3, rows * size, columns * size), dtype=np.uint8)
+    for view, row, column in np.ndindex(n_views, rows, columns):
+        tile = atlas[codes[view, row, column]]
+        cell = np.s_[view, :, row * size : (row + 1) * size, column * size : (column + 1) * size]
+        pictures[cell] = tile.transpose(2, 0, 1)
+    return th.tensor(pictures)
+
+
+@pytest.fixture
+def codes() -> th.Tensor:
+    return th.tensor(samples(CodeSpace(), 30))
+
+
+def test_paper_cnn_has_the_papers_size() -> None:
+    encoder = PaperCNN(spaces.Box(0, 255, (3, 28, 28), np.uint8))
+    assert sum(parameter.numel() for parameter in encoder.parameters()) == 1_233_056
+    assert encoder.net[5].in_features == 2304
+    assert encoder(th.zeros(2, 3, 28, 28, dtype=th.uint8)).shape == (2, 64)
+
+
+@pytest.mark.parametrize("shape", [(3, 8, 8), (1, 30, 17), (4, 64, 48), (28, 28, 3), (8, 9, 1)])
+def test_paper_cnn_infers_sizes(shape: tuple[int, ...]) -> None:
+    space = spaces.Box(0, 255, shape, np.uint8)
+    assert PaperCNN(space, features_dim=7)(th.tensor(samples(space, 3))).shape == (3, 7)
+
+
+@pytest.mark.parametrize("shape", [(3, 7, 7), (3, 28, 7), (5, 5, 3)])
+def test_too_small_pictures_are_refused(shape: tuple[int, ...]) -> None:
+    space = spaces.Box(0, 255, shape, np.uint8)
+    with pytest.raises(ValueError, match=r"PaperCNN needs pictures of at least 8 x 8 pixels, got \d+ x \d+; use"):
+        ObservationEncoder(space)
+
+
+def test_pixels_of_codes_are_the_atlas(codes: th.Tensor) -> None:
+    space = CodeSpace()
+    assert th.equal(PixelInput(space)(codes), painted(codes, space.atlas).float() / 255.0)
+
+
+@pytest.mark.parametrize("encoder_class", [PaperCNN, LightEncoder, ObservationEncoder])
+def test_tiles_and_pictures_have_the_same_weights_and_features(
+    encoder_class: type[BaseFeaturesExtractor], codes: th.Tensor
+) -> None:
+    of_tiles, of_pictures = encoder_class(CodeSpace()), encoder_class(PICTURE)
+    of_last = encoder_class(CHANNELS_LAST)
+    of_pictures.load_state_dict(of_tiles.state_dict())
+    of_last.load_state_dict(of_tiles.state_dict())
+    pictures = painted(codes, CodeSpace().atlas)
+    expected = of_tiles(codes)
+    th.testing.assert_close(of_pictures(pictures), expected, rtol=0, atol=1e-6)
+    th.testing.assert_close(of_last(pictures.permute(0, 2, 3, 1)), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("encoder_class", [PaperCNN, LightEncoder])
+def test_features_depend_on_every_cell(encoder_class: type[BaseFeaturesExtractor], codes: th.Tensor) -> None:
+    encoder = encoder_class(CodeSpace())
+    before = encoder(codes[:1])
+    for row, column in np.ndindex(3, 3):
+        changed = codes[:1].clone()
+        changed[0, row, column] = (changed[0, row, column] + 1) % 20
+        assert (encoder(changed) - before).abs().max() > 1e-6
+
+
+def test_light_encoder_embeds_each_tile_by_one_shared_layer() -> None:
+    encoder = LightEncoder(PICTURE)
+    assert sum(parameter.numel() for parameter in encoder.parameters()) == (48 * 16 + 16) + (144 * 128 + 128) + (
+        128 * 64 + 64
+    )
+    assert LightEncoder(PICTURE, tile_size=6).embed.in_features == 108
+    assert LightEncoder(CodeSpace(), tile_size=6).tile_size == 4
+    with pytest.raises(ValueError, match=r"whole tiles, got 12 x 12 pixels with tile_size=5; pass features_extractor"):
+        LightEncoder(PICTURE, tile_size=5)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        PICTURE,
+        CHANNELS_LAST,
+        CodeSpace(),
+        spaces.Box(-1, 1, (2, 3), np.float32),
+        spaces.Box(0, 9, (4,), np.int64),
+        spaces.Discrete(5),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(4),
+    ],
+)
+def test_raw_observations_and_what_sb3_makes_of_them_give_the_same(space: spaces.Space[Any]) -> None:
+    encoder = ObservationEncoder(space)
+    raw = th.tensor(samples(space, 6))
+    prepared = preprocess_obs(raw, space)
+    assert isinstance(prepared, th.Tensor) and prepared.is_floating_point()
+    assert encoder(raw).shape == (6, 64)
+    assert th.equal(encoder(raw), encoder(prepared))
+
+
+def test_vectors_go_through_a_small_tanh_network() -> None:
+    encoder = MLPEncoder(spaces.Discrete(3), features_dim=2, hidden=4)
+    first, _, last = encoder.net
+    assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+    one_hot = th.eye(3)
+    expected = th.tanh(one_hot @ first.weight.t() + first.bias) @ last.weight.t() + last.bias
+    th.testing.assert_close(encoder(th.tensor([0, 1, 2])), expected)
+
+
+def test_default_encoder_is_chosen_by_space() -> None:
+    assert isinstance(ObservationEncoder(PICTURE).encoder, PaperCNN)
+    assert isinstance(ObservationEncoder(CodeSpace()).encoder, PaperCNN)
+    for space in (spaces.Box(0, 30, (7, 7, 3), np.float32), spaces.Box(0, 255, (9,), np.uint8), spaces.Discrete(2)):
+        assert isinstance(ObservationEncoder(space).encoder, MLPEncoder)
+
+
+def test_an_atlas_is_no_weight() -> None:
+    assert not any("atlas" in name for name in PaperCNN(CodeSpace()).state_dict())
+
+
+def test_bad_spaces_are_refused() -> None:
+    small = CodeSpace()
+    small.atlas = small.atlas[:10]
+    with pytest.raises(ValueError, match=r"an atlas \(n_codes, tile, tile, channels\).*has every code, got"):
+        PaperCNN(small)
+    with pytest.raises(ValueError, match="expected pictures, a Box of three axes, or tile codes with an atlas, got"):
+        PaperCNN(spaces.Discrete(3))

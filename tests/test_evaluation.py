@@ -1,0 +1,364 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnRewardThreshold
+from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_saf.common.callbacks import TeamEvalCallback
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.evaluation import (
+    EvaluationResult,
+    RandomPolicy,
+    confidence_interval,
+    evaluate_policy,
+    evaluate_team,
+    student_t_quantile,
+)
+from sb3_saf.common.monitor import TeamMonitor
+from tests.team_venv import Array, TeamVenv
+
+
+def teams(**kwargs: Any) -> CentralizedValueWrapper:
+    return CentralizedValueWrapper(TeamMonitor(TeamVenv(**kwargs)))
+
+
+def constant(*per_game: float) -> Any:
+    """Each agent of game e gets ``per_game[e]`` per step."""
+    return lambda game, agent, step: per_game[game]
+
+
+class StillPolicy:
+    """Does nothing, and remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.starts: list[Array | None] = []
+        self.states: list[Any] = []
+        self.deterministic: set[bool] = set()
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        self.starts.append(None if episode_start is None else episode_start.copy())
+        self.states.append(state)
+        self.deterministic.add(deterministic)
+        n_rows = len(observation["agent"]) if isinstance(observation, dict) else len(observation)
+        return np.zeros(n_rows, dtype=int), (np.full(1, len(self.states)),)
+
+
+class TestEvaluatePolicy:
+    def test_team_returns_and_game_steps(self) -> None:
+        env = teams(lengths=(3, 2), n_agents=3, reward=constant(1, 10))
+        returns, lengths = evaluate_policy(StillPolicy(), env, 4, return_episode_rewards=True)
+        assert returns == [60, 9, 60, 9]
+        assert lengths == [2, 3, 2, 3]
+        assert evaluate_policy(StillPolicy(), env, 4) == (34.5, 25.5)
+        assert evaluate_team(StillPolicy(), env, 4) == EvaluationResult([60, 9, 60, 9], [2, 3, 2, 3])
+
+    def test_sb3_alone_counts_agents(self) -> None:
+        """The failing baseline: with 3 agents, 2 "episodes" are two agents of one game."""
+        env = teams(lengths=(3, 2), n_agents=3, reward=constant(1, 10))
+        returns, _ = evaluate_rows(StillPolicy(), env, 2, return_episode_rewards=True, warn=False)
+        assert returns == [20, 20]
+
+    def test_short_episodes_are_not_favoured(self) -> None:
+        # Taking the first four to end would take three or four of the short game, and mean 3 x (1 to 3.25).
+        env = teams(lengths=(10, 1), reward=constant(1, 1))
+        returns, lengths = evaluate_policy(StillPolicy(), env, 4, return_episode_rewards=True)
+        assert sorted(returns) == [3, 3, 30, 30]
+        assert sorted(lengths) == [1, 1, 10, 10]
+
+    @pytest.mark.parametrize(
+        ("n_episodes", "per_game"), [(1, [0, 0, 1]), (2, [0, 1, 1]), (3, [1, 1, 1]), (7, [2, 2, 3])]
+    )
+    def test_episodes_are_divided_as_evenly_as_possible(self, n_episodes: int, per_game: list[int]) -> None:
+        env = teams(lengths=(2, 2, 2), n_agents=2, reward=constant(1, 10, 100))
+        result = evaluate_team(StillPolicy(), env, n_episodes)
+        assert [result.returns.count(value) for value in (4, 40, 400)] == per_game
+
+    def test_rewards_are_those_before_normalisation(self) -> None:
+        env = VecNormalize(teams(lengths=(3, 2), reward=constant(1, 10)), norm_obs=False, training=False)
+        env.ret_rms.var = np.array(25.0)
+        assert sorted(evaluate_team(StillPolicy(), env, 2).returns) == [9, 60]
+
+    def test_without_a_monitor_the_outermost_rewards_count(self) -> None:
+        env = VecNormalize(
+            CentralizedValueWrapper(TeamVenv(lengths=(3, 2), reward=constant(1, 10))), norm_obs=False, training=False
+        )
+        env.ret_rms.var = np.array(25.0)
+        with pytest.warns(
+            UserWarning, match="The environment has no TeamMonitor: returns and lengths are counted as the"
+        ):
+            result = evaluate_team(StillPolicy(), env, 2)
+        assert sorted(result.returns) == pytest.approx([9 / 5, 60 / 5], rel=1e-5)
+        assert evaluate_team(StillPolicy(), env, 2, warn=False).lengths == [2, 3]
+
+    def test_many_small_rewards_beside_a_large_one(self) -> None:
+        env = CentralizedValueWrapper(
+            TeamVenv(lengths=(101,), n_agents=2, reward=lambda game, agent, step: 2.0**24 if step + agent == 1 else 1.0)
+        )
+        assert evaluate_team(StillPolicy(), env, 1, warn=False).returns == [2.0**24 + 201]
+
+    def test_recurrent_policies_are_told_the_starts_of_their_rows(self) -> None:
+        policy = StillPolicy()
+        evaluate_team(policy, teams(lengths=(3, 2), n_agents=3), 4, deterministic=False)
+        assert [start.tolist() for start in policy.starts[:4] if start is not None] == [
+            [True] * 6,
+            [False] * 6,
+            [False] * 3 + [True] * 3,
+            [True] * 3 + [False] * 3,
+        ]
+        assert [state if state is None else int(state[0][0]) for state in policy.states[:3]] == [None, 1, 2]
+        assert policy.deterministic == {False}
+
+    def test_callback_sees_each_game_after_each_step(self) -> None:
+        seen: list[tuple[int, float, bool]] = []
+
+        def callback(local: dict[str, Any], _: dict[str, Any]) -> None:
+            seen.append((local["i"], float(local["reward"]), bool(local["done"])))
+
+        evaluate_policy(StillPolicy(), teams(lengths=(2, 2), reward=constant(1, 10)), 2, callback=callback)
+        assert seen == [(0, 3, False), (1, 30, False), (0, 3, True), (1, 30, True)]
+
+    def test_flat_rows_work_too(self) -> None:
+        env = TeamMonitor(TeamVenv(lengths=(3, 2), reward=constant(1, 10)))
+        assert evaluate_policy(RandomPolicy(env.action_space, seed=0), env, 2) == (34.5, 25.5)
+
+    def test_threshold(self) -> None:
+        env = teams(lengths=(2, 2), reward=constant(1, 1))
+        assert evaluate_policy(StillPolicy(), env, 2, reward_threshold=5.9) == (6, 0)
+        with pytest.raises(ValueError, match=r"expected a mean team return above 6, got 6.00 \[6.00, 6.00\]"):
+            evaluate_policy(StillPolicy(), env, 2, reward_threshold=6)
+
+    def test_single_agents_are_refused(self) -> None:
+        message = (
+            r"expected a VecEnv of teams \(with an attribute n_agents\), got DummyVecEnv; build it with "
+            r"sb3_saf.make_team_env\(...\), or use stable_baselines3.common.evaluation.evaluate_policy for single "
+            r"agents"
+        )
+        env = DummyVecEnv([lambda: gym.make("CartPole-v1")])
+        with pytest.raises(ValueError, match=message):
+            evaluate_policy(StillPolicy(), env, 2)
+        with pytest.raises(ValueError, match="got str; build it"):
+            evaluate_policy(StillPolicy(), "TeamTogether", 2)  # type: ignore[call-overload]
+
+    @pytest.mark.parametrize("n_episodes", [0, -1, 2.5, True])
+    def test_number_of_episodes(self, n_episodes: Any) -> None:
+        with pytest.raises(ValueError, match=f"n_eval_episodes must be an integer of at least 1, got {n_episodes}"):
+            evaluate_policy(StillPolicy(), teams(), n_episodes)
+
+
+class TestIntervals:
+    @pytest.mark.parametrize(
+        ("degrees", "confidence", "t"),
+        [
+            # Tables of Student's distribution, two-sided.
+            (1, 0.95, 12.70620),
+            (2, 0.95, 4.302653),
+            (3, 0.95, 3.182446),
+            (4, 0.95, 2.776445),
+            (5, 0.99, 4.032143),
+            (9, 0.95, 2.262157),
+            (10, 0.90, 1.812461),
+            (29, 0.95, 2.045230),
+            (63, 0.95, 1.998341),
+            (1000, 0.95, 1.962339),
+            (100_001, 0.95, 1.959988),
+        ],
+    )
+    def test_quantiles_are_those_of_the_tables(self, degrees: int, confidence: float, t: float) -> None:
+        assert student_t_quantile(degrees, confidence) == pytest.approx(t, rel=2e-6)
+
+    def test_interval_by_hand(self) -> None:
+        # mean 3, sample standard deviation sqrt(2.5), 4 degrees of freedom: 3 -+ 2.776445 * sqrt(2.5 / 5).
+        assert confidence_interval([1, 2, 3, 4, 5]) == pytest.approx((1.036757, 4.963243), rel=1e-6)
+        assert EvaluationResult([1, 2, 3, 4, 5], [1] * 5).interval() == pytest.approx((1.036757, 4.963243), rel=1e-6)
+        assert (
+            str(EvaluationResult([1, 2, 3, 4, 5], [1] * 5)) == "3.00 [1.04, 4.96] (95 %, Student's t, 5 team episodes)"
+        )
+
+    def test_it_covers_the_mean_as_often_as_it_says(self) -> None:
+        rng = np.random.default_rng(0)
+        intervals = [confidence_interval(rng.normal(7, 3, size=5), 0.8) for _ in range(2000)]
+        covered = np.mean([low <= 7 <= high for low, high in intervals])
+        assert covered == pytest.approx(0.8, abs=3 * math.sqrt(0.8 * 0.2 / 2000))
+
+    def test_one_value_says_nothing_about_its_spread(self) -> None:
+        assert confidence_interval([3]) == (-math.inf, math.inf)
+
+    def test_what_has_no_interval(self) -> None:
+        with pytest.raises(ValueError, match="an interval needs at least one value, got none"):
+            confidence_interval([])
+        with pytest.raises(ValueError, match="confidence must be above 0 and below 1, got 95"):
+            confidence_interval([1, 2], 95)
+
+
+class TestRandomPolicy:
+    @pytest.mark.parametrize(
+        "space",
+        [
+            spaces.Discrete(7),
+            spaces.Discrete(3, start=2),
+            spaces.MultiDiscrete([2, 5]),
+            spaces.MultiBinary(3),
+            spaces.Box(-2, 3, (2,), np.float32),
+            spaces.Box(0, 4, (2, 2), np.uint8),
+        ],
+        ids=str,
+    )
+    def test_actions_are_uniform_over_the_space(self, space: spaces.Space[Any]) -> None:
+        actions, state = RandomPolicy(space, seed=0).predict(np.zeros((20_000, 3)))
+        assert state is None
+        assert actions.shape == (20_000, *(space.shape or ()))
+        assert all(space.contains(action if space.shape else np.int64(action)) for action in actions[:200])
+        other = RandomPolicy(space, seed=0).predict({"obs": np.zeros((20_000, 3)), "agent": np.zeros(20_000)})[0]
+        np.testing.assert_array_equal(actions, other)
+        assert not np.array_equal(actions, RandomPolicy(space, seed=1).predict(np.zeros((20_000, 3)))[0])
+        columns = actions.reshape(20_000, -1).astype(float)
+        for column, (low, high) in zip(columns.T, _ends(space), strict=True):
+            n_bins = int(high - low) if space.dtype == np.float32 else int(high - low) + 1
+            counts, _ = np.histogram(column, n_bins, (low, high))
+            np.testing.assert_allclose(counts, 20_000 / n_bins, rtol=0.06)
+
+    def test_draws_go_on(self) -> None:
+        policy = RandomPolicy(spaces.Discrete(1000), seed=0)
+        assert not np.array_equal(policy.predict(np.zeros((5, 1)))[0], policy.predict(np.zeros((5, 1)))[0])
+
+    def test_spaces_without_a_uniform_distribution(self) -> None:
+        with pytest.raises(ValueError, match="a uniform policy needs a bounded action space, got Box"):
+            RandomPolicy(spaces.Box(-np.inf, np.inf, (2,)))
+        with pytest.raises(
+            ValueError, match="the action space must be Discrete, MultiDiscrete, MultiBinary or Box, got Tex"
+        ):
+            RandomPolicy(spaces.Text(3))
+
+
+def _ends(space: Any) -> list[tuple[float, float]]:
+    if isinstance(space, spaces.Discrete):
+        return [(space.start, space.start + space.n - 1)]
+    if isinstance(space, spaces.MultiDiscrete):
+        return [(0, n - 1) for n in space.nvec]
+    if isinstance(space, spaces.MultiBinary):
+        return [(0, 1)] * 3
+    return list(zip(space.low.reshape(-1), space.high.reshape(-1), strict=True))
+
+
+class TestTeamEvalCallback:
+    def learn(
+        self, callback: TeamEvalCallback, n_game_steps: int, folder: Path, n_games: int = 2, normalise: bool = False
+    ) -> PPO:
+        env: Any = teams(lengths=(3, 2, 4)[:n_games])
+        if normalise:
+            env = VecNormalize(env, norm_obs=False)
+        n_rows = 2 * env.num_envs
+        model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=n_rows, n_epochs=1, device="cpu", seed=0)
+        model.set_logger(configure(str(folder), ["csv"]))
+        model.learn(n_game_steps * 3, callback=callback)
+        model.logger.close()
+        return model
+
+    def test_it_evaluates_every_so_many_game_steps(self, tmp_path: Path) -> None:
+        # Three games a step: the multiples of 8 are passed at 9, 18 (16), 24, 33 (32).
+        eval_env = teams(lengths=(3, 2), reward=constant(1, 10))
+        callback = TeamEvalCallback(eval_env, n_eval_episodes=4, eval_freq=8, log_path=str(tmp_path), verbose=0)
+        self.learn(callback, 36, tmp_path, n_games=3)
+        saved = np.load(tmp_path / "evaluations.npz")
+        assert sorted(saved) == ["ep_lengths", "game_steps", "results", "successes", "timesteps"]
+        assert saved["game_steps"].tolist() == [9, 18, 24, 33]
+        assert saved["timesteps"].tolist() == [27, 54, 72, 99]
+        assert saved["results"].tolist() == [[60, 9, 60, 9]] * 4
+        assert saved["ep_lengths"].tolist() == [[2, 3, 2, 3]] * 4
+        assert saved["successes"].tolist() == [[False, False, True, True]] * 4
+
+    def test_it_logs_returns_against_game_steps(self, tmp_path: Path) -> None:
+        eval_env = teams(lengths=(3, 2), reward=constant(1, 10))
+        self.learn(TeamEvalCallback(eval_env, n_eval_episodes=4, eval_freq=4, verbose=0), 8, tmp_path)
+        log = _logged(tmp_path / "progress.csv", "eval/game_steps")
+        assert [float(row["eval/game_steps"]) for row in log] == [4, 8]
+        assert [float(row["time/game_steps"]) for row in log] == [4, 8]
+        assert [float(row["time/total_timesteps"]) for row in log] == [12, 24]
+        assert [float(row["eval/mean_reward"]) for row in log] == [34.5, 34.5]
+        assert [float(row["eval/mean_ep_length"]) for row in log] == [2.5, 2.5]
+        assert [float(row["eval/success_rate"]) for row in log] == [0.5, 0.5]
+
+    def test_the_best_model_is_kept_and_callbacks_are_called(self, tmp_path: Path) -> None:
+        rewards = iter([1.0, 3.0, 2.0, 4.0])
+        now = [0.0]
+
+        class Turn(TeamMonitor):
+            def reset(self) -> Any:
+                now[0] = next(rewards)
+                return super().reset()
+
+        eval_env = CentralizedValueWrapper(Turn(TeamVenv(lengths=(1,), reward=lambda game, agent, step: now[0])))
+        best, after = Count(), Count()
+        callback = TeamEvalCallback(
+            eval_env, best, after, n_eval_episodes=1, eval_freq=2, best_model_save_path=str(tmp_path), verbose=0
+        )
+        self.learn(callback, 8, tmp_path)
+        assert (best.n_calls, after.n_calls) == (3, 4)
+        assert (callback.best_mean_reward, callback.last_mean_reward) == (12, 12)
+        assert PPO.load(tmp_path / "best_model").num_timesteps == 24
+        assert best.model is after.model is callback.model
+
+    def test_callbacks_can_stop_the_training(self, tmp_path: Path) -> None:
+        eval_env = teams(lengths=(1,), reward=constant(1))
+        stop = StopTrainingOnRewardThreshold(reward_threshold=2.5, verbose=0)
+        model = self.learn(TeamEvalCallback(eval_env, stop, n_eval_episodes=1, eval_freq=4, verbose=0), 40, tmp_path)
+        assert model.num_timesteps == 4 * 3
+
+    def test_statistics_of_normalisation_are_those_of_training(self, tmp_path: Path) -> None:
+        eval_env = VecNormalize(teams(), norm_obs=False, training=False)
+        model = self.learn(TeamEvalCallback(eval_env, eval_freq=8, verbose=0), 8, tmp_path, normalise=True)
+        training = model.get_vec_normalize_env()
+        assert training is not None
+        assert eval_env.ret_rms.count == training.ret_rms.count > 1
+        assert eval_env.ret_rms.var == training.ret_rms.var
+
+    def test_training_on_goes_on_counting(self, tmp_path: Path) -> None:
+        callback = TeamEvalCallback(teams(), n_eval_episodes=2, eval_freq=6, log_path=str(tmp_path), verbose=0)
+        model = self.learn(callback, 8, tmp_path)
+        model.set_logger(configure(str(tmp_path), []))
+        model.learn(8 * 3, callback=callback, reset_num_timesteps=False)
+        assert callback.evaluations_game_steps == [6, 12]
+
+    def test_no_evaluation_on_request(self, tmp_path: Path) -> None:
+        callback = TeamEvalCallback(teams(), eval_freq=0, verbose=0)
+        self.learn(callback, 8, tmp_path)
+        assert callback.last_mean_reward == -np.inf
+
+    def test_it_says_what_it_finds(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        eval_env = teams(lengths=(3, 2), reward=constant(1, 10))
+        self.learn(TeamEvalCallback(eval_env, n_eval_episodes=2, eval_freq=8), 8, tmp_path)
+        assert capsys.readouterr().out == (
+            "Evaluation after 8 game steps: team return 34.50 [-289.51, 358.51] (95 %, Student's t, 2 team episodes), "
+            "2.50 steps per episode\nSuccess rate: 0.00 %\nNew best mean team return\n"
+        )
+
+    def test_environments_without_teams_are_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match="expected a VecEnv of flattened teams that states its team size"):
+            TeamEvalCallback(TeamVenv(tell_size=False))
+        model = PPO("MlpPolicy", TeamVenv(tell_size=False), n_steps=2, batch_size=12, device="cpu")
+        with pytest.raises(ValueError, match="expected a VecEnv of flattened teams that states its team size"):
+            model.learn(12, callback=TeamEvalCallback(teams()))
+
+
+class Count(BaseCallback):
+    def _on_step(self) -> bool:
+        return True
+
+
+def _logged(path: Path, column: str) -> list[dict[str, str]]:
+    import csv
+
+    with path.open() as file:
+        return [row for row in csv.DictReader(file) if row.get(column)]

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+
+from hecogrid_envs.supersuit_bridge import SuperSuitVecEnv
+from hecogrid_envs.vec_env import NativeVecEnv
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.env import make_team_env
+from sb3_saf.common.evaluation import RandomPolicy, evaluate_team
+from sb3_saf.common.monitor import TeamMonitor
+from tests.team_venv import Array, TeamVenv
+from tests.toy_envs import CounterEnv
+
+SMALL: dict[str, Any] = {"n_agents": 3, "grid_size": 10, "n_treasures": 12, "max_cycles": 6, "view_size": 5}
+
+
+def episode(env: CentralizedValueWrapper, n_steps: int = 13) -> list[Array]:
+    """All numbers of some steps with fixed actions."""
+    rng = np.random.default_rng(0)
+    obs = env.reset()
+    numbers = [*obs.values()]
+    for _ in range(n_steps):
+        obs, rewards, dones, infos = env.step(rng.integers(0, 4, size=env.num_envs))  # type: ignore[assignment]
+        last = [info["terminal_observation"]["team"] for info in infos if "terminal_observation" in info]
+        numbers += [*obs.values(), rewards, dones, np.array(last)]
+    env.close()
+    return numbers
+
+
+def assert_equal(one: list[Array], other: list[Array]) -> None:
+    assert len(one) == len(other)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b, strict=True)
+
+
+def test_a_task_and_its_ids_are_the_same_environment() -> None:
+    plain = episode(make_team_env("TeamSupport", n_envs=2, seed=3, **SMALL))
+    for name in ("TeamSupport-v0", "hecogrid/TeamSupport-v0", "hecogrid/TeamSupport"):
+        assert_equal(plain, episode(make_team_env(name, n_envs=2, seed=3, **SMALL)))
+    assert sum(int(rewards.sum()) for rewards in plain[6::6]) > 0, "an episode without events would show nothing"
+
+
+def test_both_backends_give_the_same_numbers() -> None:
+    native = make_team_env("KeyForTreasure", n_envs=3, seed=3, n_keys=5, **SMALL)
+    supersuit = make_team_env("KeyForTreasure", n_envs=3, seed=3, n_keys=5, backend="supersuit", **SMALL)
+    assert isinstance(native.unwrapped, NativeVecEnv)
+    assert isinstance(supersuit.unwrapped, SuperSuitVecEnv)
+    assert native.observation_space == supersuit.observation_space
+    assert_equal(episode(native), episode(supersuit))
+
+
+def test_seeds() -> None:
+    def first(seed: int | None) -> Array:
+        return make_team_env("TeamTogether", n_envs=2, seed=seed, **SMALL).reset()["obs"]
+
+    np.testing.assert_array_equal(first(1), first(1))
+    assert not np.array_equal(first(1), first(2))
+    assert not np.array_equal(first(None), first(None))
+    assert not np.array_equal(first(1)[:3], first(1)[3:]), "games of one run differ"
+
+
+def test_hecogrid_gives_tiles_that_draw_the_pixels_of_rgb() -> None:
+    tiles = make_team_env("TeamTogether", n_envs=2, seed=0, **SMALL)
+    rgb = make_team_env("TeamTogether", n_envs=2, seed=0, observation="rgb", **SMALL)
+    own = tiles.team_spaces.own
+    assert isinstance(own, spaces.Box)
+    assert own.shape == (5, 5)
+    assert rgb.team_spaces.own == spaces.Box(0, 255, (3, 20, 20), np.uint8)
+    pictures = own.pixels(tiles.reset()["team"])  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(np.moveaxis(pictures, -1, -3), rgb.reset()["team"])
+
+
+def test_the_chain() -> None:
+    env = make_team_env("TeamTogether", n_envs=2, time_limit="bootstrap", **SMALL)
+    assert isinstance(env, CentralizedValueWrapper)
+    assert isinstance(env.venv, TeamMonitor)
+    assert env.venv.venv is env.unwrapped
+    assert (env.n_agents, env.n_games, env.num_envs, env.time_limit) == (3, 2, 6, "bootstrap")
+    assert make_team_env("TeamTogether", **SMALL).time_limit == "terminal"
+    assert make_team_env("TeamTogether", **SMALL).n_games == 1
+
+
+def test_stock_ppo_trains_on_it_and_logs_team_returns(tmp_path: Path) -> None:
+    env = make_team_env("TeamTogether", n_envs=4, seed=0, monitor_dir=str(tmp_path / "run"), **SMALL)
+    model = PPO("MultiInputPolicy", env, n_steps=12, batch_size=72, n_epochs=1, device="cpu", seed=0).learn(12 * 12)
+    assert model.ep_info_buffer is not None
+    assert [entry["l"] for entry in model.ep_info_buffer] == [6] * 8
+    collected = sum(entry["r"] for entry in model.ep_info_buffer)
+    assert collected == model.rollout_buffer.rewards.sum() > 0
+    env.close()
+    lines = (tmp_path / "run" / "monitor.csv").read_text().splitlines()
+    assert [float(row["r"]) for row in csv.DictReader(lines[1:])] == [entry["r"] for entry in model.ep_info_buffer]
+
+
+def test_a_factory_with_parameters() -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0, n_agents=3, max_cycles=2)
+    assert isinstance(env.unwrapped, SuperSuitVecEnv)
+    env.reset()
+    obs, rewards, dones, _ = env.step(np.arange(6) % 3)
+    assert isinstance(obs, dict)
+    assert obs["team"][4, :, :2].tolist() == [[1, 0], [1, 1], [1, 2]]
+    assert rewards.tolist() == [10, 12, 14] * 2
+    assert not dones.any()
+    *_, dones, infos = env.step(np.zeros(6, dtype=int))
+    assert dones.all()
+    assert infos[5]["terminal_observation"]["team"][:, :2].tolist() == [[2, 0], [2, 1], [2, 2]]
+    assert [info.get("episode", {}).get("r") for info in infos] == [36 + 63, None, None, 36 + 63, None, None]
+    assert [info["TimeLimit.truncated"] for info in infos] == [False] * 6
+
+
+def test_an_environment_is_copied() -> None:
+    own = CounterEnv(n_agents=2)
+    env = make_team_env(own, n_envs=3, seed=0)
+    draws = env.reset()["obs"][:, 2]
+    assert len(set(draws.tolist())) == 6, "copies play different games"
+    assert own.episode == 0
+    env.close()
+    assert not own.closed
+
+
+def test_agents_that_die_stay_as_idle_rows_until_the_team_is_done() -> None:
+    env = make_team_env(CounterEnv(n_agents=2, max_cycles=3, deaths={0: 1}), seed=0, time_limit="bootstrap")
+    env.reset()
+    dones, truncated = [], []
+    for _ in range(3):
+        _, _, done, infos = env.step(np.ones(2, dtype=int))
+        dones.append(done.tolist())
+        truncated.append([info.get("TimeLimit.truncated", False) for info in infos])
+    assert dones == [[False, False], [False, False], [True, True]]
+    assert truncated[2] == [False, True]
+    last = infos[1]["terminal_observation"]
+    assert last["team"][0].tolist() == [0, 0, 0]
+    assert last["team"][1, :2].tolist() == [3, 1]
+    assert infos[0]["episode"]["r"] == (11 + 12) + 22 + 32
+
+
+def test_worker_processes_give_the_same_numbers() -> None:
+    one = episode(make_team_env(CounterEnv, n_envs=3, seed=1), n_steps=7)
+    two = episode(make_team_env(CounterEnv, n_envs=3, seed=1, n_cpus=2), n_steps=7)
+    assert_equal(one, two)
+    tasks = [make_team_env("TeamTogether", 2, 1, "supersuit", n_cpus=n_cpus, **SMALL) for n_cpus in (1, 2)]
+    assert_equal(episode(tasks[0], n_steps=7), episode(tasks[1], n_steps=7))
+
+
+def test_random_policy_is_evaluated_on_it() -> None:
+    env = make_team_env("TeamTogether", n_envs=3, seed=0, **SMALL)
+    result = evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7)
+    assert result.lengths == [6] * 7
+    assert 0 < result.mean < 36
+
+
+class Walk(gym.Env[Array, int]):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: make_team_env("TeamTogether", n_envs=0), "n_envs must be an integer of at least 1, got 0"),
+        (lambda: make_team_env("TeamTogether", n_envs=2.0), "n_envs must be an integer of at least 1, got 2.0"),  # type: ignore[arg-type]
+        (lambda: make_team_env("TeamTogether", n_envs=True), "n_envs must be an integer of at least 1, got True"),
+        (lambda: make_team_env(CounterEnv, n_cpus=0), "n_cpus must be an integer of at least 1, got 0"),
+        (
+            lambda: make_team_env("TeamTogether", n_envs=2, n_cpus=2),
+            r"n_cpus=2 divides games among SuperSuit's processes, but backend='native' steps all games at once; leave "
+            r"n_cpus out \(native has n_threads\) or use backend='supersuit'",
+        ),
+        (
+            lambda: make_team_env("TeamTogether", backend="gpu"),  # type: ignore[arg-type]
+            "backend must be 'native', 'supersuit' or None, got 'gpu'",
+        ),
+        (
+            lambda: make_team_env(CounterEnv, backend="native"),
+            "backend='native' is the compiled core of HECOGrid, got it with CounterEnv; leave backend out or use "
+            "backend='supersuit'",
+        ),
+        (
+            lambda: make_team_env("TeamTogether", time_limit="never", **SMALL),  # type: ignore[arg-type]
+            "time_limit must be 'terminal' or 'bootstrap', got 'never'",
+        ),
+        (
+            lambda: make_team_env("TeamTogeter"),
+            r"unknown task 'TeamTogeter' \(did you mean 'TeamTogether'\?\); the tasks are .*\. For any other "
+            r"environment pass a PettingZoo ParallelEnv or a factory that returns one, for instance "
+            r"simple_spread_v3.parallel_env",
+        ),
+        (lambda: make_team_env("TeamTogether-v1"), "unknown task 'TeamTogether-v1'"),
+        (
+            lambda: make_team_env("TeamTogether", n_agent=5),
+            r"unknown parameter 'n_agent' \(did you mean 'n_agents'\?\)",
+        ),
+        (
+            lambda: make_team_env(CounterEnv(), n_agents=3),
+            r"parameters \['n_agents'\] go to a factory, got them with CounterEnv; give them to the environment "
+            r"when you make it, or pass its factory \(such as simple_spread_v3.parallel_env\) instead",
+        ),
+        (
+            lambda: make_team_env(TeamVenv()),
+            r"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv TeamVenv; wrap it yourself: "
+            r"sb3_saf.CentralizedValueWrapper\(sb3_saf.TeamMonitor\(venv\)\)",
+        ),
+        (lambda: make_team_env(Walk), "expected a PettingZoo ParallelEnv or a function that makes one, got"),
+        (lambda: make_team_env(3), "expected a PettingZoo ParallelEnv or a function that makes one, got"),
+    ],
+)
+def test_wrong_calls(make: Callable[[], VecEnv], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_learning_does_not_import_the_game() -> None:
+    code = "import sys, sb3_saf.common.env; sys.exit('hecogrid_envs' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,156 @@
+"""The two flattened forms: native and SuperSuit give the same numbers, row for row, bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import VecMonitor
+
+import hecogrid_envs
+from hecogrid_envs import TASK_NAMES, game_seeds, make_vec_env
+
+SMALL: dict[str, Any] = {
+    "n_agents": 3,
+    "grid_size": 9,
+    "coordination": 2,
+    "heterogeneity": 2,
+    "n_treasures": 12,
+    "n_keys": 5,
+    "max_cycles": 7,
+}
+#: Crowded, so that treasures are collected within a few steps of random play.
+CROWDED: dict[str, Any] = {**SMALL, "coordination": 1, "n_treasures": 20, "n_keys": 15, "clutter_density": 0.0}
+#: Mostly forward and pickup in zone 0.
+ACTION_WEIGHTS = [0.1, 0.1, 0.4, 0.25, 0.05, 0.05, 0.05]
+
+
+def history(venv: Any, n_steps: int = 20) -> list[Any]:
+    rng = np.random.default_rng(0)
+    frames: list[Any] = [venv.reset(), venv.reset_infos]
+    for _ in range(n_steps):
+        observations, rewards, dones, infos = venv.step(rng.choice(7, size=venv.num_envs, p=ACTION_WEIGHTS))
+        frames.append((observations.copy(), rewards.copy(), dones.copy(), infos, list(venv.reset_infos)))
+    venv.close()
+    return frames
+
+
+def assert_same_frames(one: list[Any], other: list[Any]) -> None:
+    np.testing.assert_equal(one, other)
+    for a, b in zip(one[2:], other[2:], strict=True):
+        assert [x.dtype for x in a[:3]] == [x.dtype for x in b[:3]]
+
+
+@pytest.mark.parametrize("n_cpus", [1, 2])
+@pytest.mark.parametrize("rules", ["paper", "released"])
+@pytest.mark.parametrize("observation", ["rgb", "tiles"])
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_both_backends_give_the_same_numbers(task: str, observation: str, rules: str, n_cpus: int) -> None:
+    params = {**CROWDED, "max_cycles": 20, "rules": rules, "observation": observation}
+    native = history(make_vec_env(task, n_envs=4, seed=11, **params), 50)
+    supersuit = history(make_vec_env(task, n_envs=4, seed=11, backend="supersuit", n_cpus=n_cpus, **params), 50)
+    assert_same_frames(native, supersuit)
+    assert sum(frame[1].sum() for frame in native[2:]) > 0, "some treasure must be collected for this to mean anything"
+
+
+@pytest.mark.parametrize("backend", ["native", "supersuit"])
+def test_rows_are_the_games_of_parallel_env(backend: Any) -> None:
+    """Row e * N + i is agent i of the game that ``parallel_env`` plays from the e-th game seed."""
+    venv: Any = make_vec_env("TeamSupport", n_envs=3, seed=5, backend=backend, **SMALL)
+    frames = history(venv, n_steps=6)
+    rng = np.random.default_rng(0)
+    actions = [rng.choice(7, size=9, p=ACTION_WEIGHTS).reshape(3, 3) for _ in range(6)]
+    for game, seed in enumerate(game_seeds(5, 3)):
+        env = hecogrid_envs.parallel_env("TeamSupport", **SMALL)
+        first, _ = env.reset(seed=seed)
+        rows = slice(game * 3, game * 3 + 3)
+        np.testing.assert_array_equal(list(first.values()), frames[0][rows])
+        for row, frame in zip(actions, frames[2:], strict=True):
+            result = env.step(dict(zip(env.agents, row[game].tolist(), strict=True)))
+            np.testing.assert_array_equal(list(result.observations.values()), frame[0][rows])
+            np.testing.assert_array_equal(np.array(list(result.rewards.values()), dtype=np.float32), frame[1][rows])
+
+
+@pytest.mark.parametrize("backend", ["native", "supersuit"])
+def test_seeds(backend: Any) -> None:
+    def first(seed: int | None, **kwargs: Any) -> Any:
+        return make_vec_env("TeamSupport", n_envs=6, seed=seed, backend=backend, **SMALL, **kwargs).reset()
+
+    np.testing.assert_array_equal(first(1), first(1))
+    per_game = first(1).reshape(6, -1)
+    assert len({game.tobytes() for game in per_game}) == 6, "games of one environment must differ"
+    assert not {game.tobytes() for game in per_game} & {game.tobytes() for game in first(2).reshape(6, -1)}
+    assert not np.array_equal(first(None), first(None))
+    venv: Any = make_vec_env("TeamSupport", n_envs=6, seed=1, backend=backend, **SMALL)
+    assert not np.array_equal(venv.reset(), venv.reset()), "a second reset goes on with the games' own randomness"
+    assert venv.seed(1) == [seed for seed in game_seeds(1, 6) for _ in range(3)]
+    np.testing.assert_array_equal(venv.reset(), first(1))
+
+
+@pytest.mark.parametrize("backend", ["native", "supersuit"])
+def test_the_time_limit_is_marked_and_its_observation_kept(backend: Any) -> None:
+    venv: Any = make_vec_env("TeamSupport", n_envs=2, seed=0, backend=backend, **SMALL)
+    twin = [hecogrid_envs.parallel_env("TeamSupport", **SMALL) for _ in range(2)]
+    venv.reset()
+    for env, seed in zip(twin, game_seeds(0, 2), strict=True):
+        env.reset(seed=seed)
+    for step in range(7):
+        _, _, dones, infos = venv.step(np.full(6, 2))
+        last = [env.step(dict.fromkeys(env.agents, 2)).observations for env in twin]
+        assert dones.dtype == bool
+        assert dones.tolist() == [step == 6] * 6
+        assert [info.get("TimeLimit.truncated", False) for info in infos] == [step == 6] * 6
+    expected = [view for game in last for view in game.values()]
+    np.testing.assert_array_equal([info["terminal_observation"] for info in infos], expected)
+    assert len({id(info) for info in infos}) == 6
+
+
+@pytest.mark.parametrize("backend", ["native", "supersuit"])
+def test_states_reach_single_games(backend: Any) -> None:
+    level = hecogrid_envs.parallel_env("TeamSupport", **SMALL)
+    level.reset(seed=99)
+    state = level.get_state()
+    venv: Any = make_vec_env("TeamSupport", n_envs=3, seed=0, backend=backend, **SMALL)
+    venv.set_options([{"state": state} if row // 3 == 1 else {} for row in range(9)])
+    observations = venv.reset()
+    np.testing.assert_equal(venv.env_method("get_state", indices=3)[0], state)
+    np.testing.assert_array_equal(observations[3:6], list(level.observations().values()))
+    assert not np.array_equal(observations[:3], observations[3:6])
+    again = venv.reset()
+    assert not np.array_equal(again[3:6], observations[3:6]), "options hold for one reset"
+
+
+@pytest.mark.parametrize("backend", ["native", "supersuit"])
+def test_attributes_and_rendering_per_row(backend: Any) -> None:
+    venv: Any = make_vec_env("TeamSupport", n_envs=2, seed=0, backend=backend, render_mode="rgb_array", **SMALL)
+    venv.reset()
+    assert (venv.n_games, venv.n_agents, venv.num_envs) == (2, 3, 6)
+    assert venv.get_attr("task") == ["TeamSupport"] * 6
+    assert venv.get_attr("n_steps", indices=[0, 5]) == [0, 0]
+    assert venv.has_attr("params")
+    assert not venv.has_attr("no_such_thing")
+    assert venv.render_mode == "rgb_array"
+    venv.set_attr("nickname", "b", indices=[3])
+    assert venv.get_attr("nickname", indices=[4]) == ["b"]
+    pictures = venv.get_images()
+    assert len(pictures) == 6
+    assert all(isinstance(picture, np.ndarray) and picture.ndim == 3 for picture in pictures)
+    assert np.array_equal(pictures[0], pictures[2])
+    assert not np.array_equal(pictures[0], pictures[3])
+    height, width, _ = pictures[0].shape
+    tiled = venv.render().shape
+    assert tiled[0] * tiled[1] == 2 * height * width, "each game is drawn once"
+    assert venv.env_is_wrapped(VecMonitor) == [False] * 6
+    venv.close()
+
+
+def test_steps_do_not_overwrite_earlier_observations() -> None:
+    venv: Any = make_vec_env("TeamSupport", n_envs=2, seed=0, **SMALL)
+    first = venv.reset()
+    kept = first.copy()
+    second = venv.step(np.full(6, 1))[0]
+    kept_second = second.copy()
+    venv.step(np.full(6, 1))
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(second, kept_second)

@@ -1,0 +1,236 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+import sb3_saf
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.evaluation import RandomPolicy
+from sb3_saf.common.game_steps import game_steps, log_game_steps
+from sb3_saf.common.monitor import TeamMonitor
+from tests.team_venv import TeamVenv, still
+
+#: Team return of an episode of game e that lasts n steps: agents 0, 1, 2 get 100 e + 10 i + step.
+RETURN_OF_GAME_0 = 3 * 30 + 3 * (1 + 2 + 3)
+RETURN_OF_GAME_1 = 2 * 330 + 3 * (1 + 2)
+
+
+def play(env: Any, n_steps: int) -> list[list[dict[str, Any]]]:
+    env.reset()
+    return [env.step(still(env))[3] for _ in range(n_steps)]
+
+
+def test_each_team_episode_is_counted_once_with_the_return_of_the_team() -> None:
+    env = TeamMonitor(TeamVenv(lengths=(3, 2), n_agents=3))
+    infos = play(env, 6)
+    episodes = {
+        (step, row): (info["episode"]["r"], info["episode"]["l"])
+        for step, rows in enumerate(infos, start=1)
+        for row, info in enumerate(rows)
+        if "episode" in info
+    }
+    assert episodes == {
+        (2, 3): (RETURN_OF_GAME_1, 2),
+        (3, 0): (RETURN_OF_GAME_0, 3),
+        (4, 3): (RETURN_OF_GAME_1, 2),
+        (6, 0): (RETURN_OF_GAME_0, 3),
+        (6, 3): (RETURN_OF_GAME_1, 2),
+    }
+    assert env.episode_count == 5
+    times = [rows[3]["episode"]["t"] for rows in (infos[1], infos[3], infos[5])]
+    assert 0 <= times[0] <= times[1] <= times[2] < 60
+
+
+def test_an_unfinished_episode_is_forgotten_at_reset() -> None:
+    env = TeamMonitor(TeamVenv(lengths=(3, 3)))
+    play(env, 2)
+    infos = play(env, 3)
+    assert infos[2][0]["episode"]["r"] == RETURN_OF_GAME_0
+    assert infos[2][0]["episode"]["l"] == 3
+
+
+def test_infos_of_the_environment_are_left_alone() -> None:
+    venv = TeamVenv(lengths=(2,))
+    play(TeamMonitor(venv), 2)
+    assert venv.dones.all()
+    assert "episode" not in venv.infos[0]
+
+
+def test_small_rewards_beside_large_ones_are_not_lost() -> None:
+    # float32 cannot tell 2**24 from 2**24 + 1.
+    venv = TeamVenv(lengths=(101,), n_agents=2, reward=lambda game, agent, step: 2.0**24 if step + agent == 1 else 1.0)
+    infos = play(TeamMonitor(venv), 101)
+    assert infos[100][0]["episode"]["r"] == 2.0**24 + 201
+
+
+def test_monitor_file_is_one_that_sb3_reads(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    env = TeamMonitor(TeamVenv(lengths=(3, 2)), str(tmp_path), info_keywords=("episode_number",))
+    play(env, 6)
+    env.close()
+    results = load_results(str(tmp_path))
+    assert results["r"].tolist() == [
+        RETURN_OF_GAME_1,
+        RETURN_OF_GAME_0,
+        RETURN_OF_GAME_1,
+        RETURN_OF_GAME_0,
+        RETURN_OF_GAME_1,
+    ]
+    assert results["l"].tolist() == [2, 3, 2, 3, 2]
+    assert results["episode_number"].tolist() == [0, 0, 1, 1, 2]
+
+
+def test_monitor_file_line_by_line(tmp_path: Path) -> None:
+    env = TeamMonitor(TeamVenv(lengths=(2,)), str(tmp_path / "run"))
+    play(env, 2)
+    env.close()
+    lines = (tmp_path / "run.monitor.csv").read_text().splitlines()
+    assert json.loads(lines[0][1:])["t_start"] == env.t_start
+    assert lines[1] == "r,l,t"
+    assert lines[2].startswith("69.0,2,")
+    assert len(lines) == 3
+    assert env.venv.closed  # type: ignore[attr-defined]
+
+
+def test_missing_info_keyword_is_named() -> None:
+    env = TeamMonitor(TeamVenv(lengths=(2,)), info_keywords=("score", "episode_number"))
+    with pytest.raises(
+        ValueError,
+        match=r"expected the info_keywords \['score', 'episode_number'\] in the last info of agent 0, got .* in game "
+        r"0; leave out \['score'\] or let the environment give them",
+    ):
+        play(env, 2)
+
+
+def test_nan_reward_stops_the_run() -> None:
+    venv = TeamVenv(
+        lengths=(9, 9), reward=lambda game, agent, step: np.nan if (game, agent, step) == (1, 2, 4) else 1.0
+    )
+    with pytest.raises(ValueError, match="rewards must be finite, got nan at step 4 for agent 2 of game 1"):
+        play(TeamMonitor(venv), 5)
+
+
+def test_done_must_hold_for_the_whole_team() -> None:
+    venv = TeamVenv(lengths=(9, 9))
+    env = TeamMonitor(venv)
+    env.reset()
+    env.step_async(still(env))
+    step = venv.step_wait()
+    step[2][4] = 1
+    venv.step_wait = lambda: step  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match=r"got \[False, True, False\] for the agents of game 1"):
+        env.step_wait()
+
+
+def test_team_size_can_be_told() -> None:
+    venv = TeamVenv(lengths=(2, 2), n_agents=3, tell_size=False)
+    assert TeamMonitor(venv, n_agents=2).n_games == 3
+    with pytest.raises(ValueError, match="expected a VecEnv of flattened teams that states its team size"):
+        TeamMonitor(venv)
+
+
+def test_sb3_logs_team_episodes() -> None:
+    env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
+    model = PPO("MultiInputPolicy", env, n_steps=6, batch_size=36, n_epochs=1, device="cpu").learn(36)
+    assert model.ep_info_buffer is not None
+    returns = [episode["r"] for episode in model.ep_info_buffer]
+    assert returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1]
+
+
+def test_sb3_alone_counts_every_agent_as_an_episode() -> None:
+    """The failing baseline: 5 team episodes are logged as 15."""
+    model = PPO("MlpPolicy", VecMonitor(TeamVenv(lengths=(3, 2))), n_steps=6, batch_size=36, n_epochs=1, device="cpu")
+    model.learn(36)
+    assert model.ep_info_buffer is not None
+    assert len(model.ep_info_buffer) == 15
+
+
+def test_sb3s_own_evaluation_returns_though_it_counts_agents() -> None:
+    """What its users get who have not read on: a warning, and agents for episodes, but no endless loop."""
+    env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(2, 2))))
+    with pytest.warns(UserWarning, match="Evaluation environment is not wrapped with a ``Monitor`` wrapper"):
+        returns, lengths = evaluate_rows(RandomPolicy(env.action_space, 0), env, 6, return_episode_rewards=True)
+    assert isinstance(returns, list)
+    assert sorted(returns) == [3, 23, 43, 203, 223, 243]
+    assert lengths == [2] * 6
+
+
+def algorithm(base: type[BaseAlgorithm], parent: Any = OnPolicyAlgorithm) -> Any:
+    """A class of its own with SB3's own ``dump_logs``, so that no other test sees it changed, nor it what they did."""
+    return type(f"{base.__name__}OfATest", (base,), {"dump_logs": parent.dump_logs})
+
+
+def logged(model: BaseAlgorithm, folder: Path, n_steps: int) -> list[dict[str, str]]:
+    model.set_logger(configure(str(folder), ["csv"]))
+    model.learn(n_steps, log_interval=1)
+    model.logger.close()
+    with open(folder / "progress.csv") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize(("base", "settings"), [(PPO, {"batch_size": 24, "n_epochs": 1}), (A2C, {})])
+def test_game_steps_are_logged_beside_rows(
+    base: type[OnPolicyAlgorithm], settings: dict[str, Any], tmp_path: Path
+) -> None:
+    env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
+    learner = log_game_steps(algorithm(base))
+    model = learner("MultiInputPolicy", VecNormalize(env, norm_obs=False), n_steps=4, device="cpu", **settings)
+    rows = logged(model, tmp_path, 48)
+    assert [int(row["time/total_timesteps"]) for row in rows] == [24, 48]
+    assert [int(row["time/game_steps"]) for row in rows] == [8, 16]
+    assert game_steps(model) == 16
+
+
+@pytest.mark.parametrize("plain", [PPO, A2C])
+def test_importing_the_package_is_enough(plain: Any, tmp_path: Path) -> None:
+    """As typed by users: ``import sb3_saf``, a stock algorithm, no callback."""
+    env = sb3_saf.CentralizedValueWrapper(sb3_saf.TeamMonitor(TeamVenv(lengths=(3, 2))))
+    settings = {"batch_size": 24, "n_epochs": 1} if plain is PPO else {}
+    rows = logged(plain("MultiInputPolicy", env, n_steps=4, device="cpu", **settings), tmp_path, 24)
+    assert int(rows[0]["time/game_steps"]) == 8
+
+
+def test_environments_without_teams_log_what_they_did(tmp_path: Path) -> None:
+    venv = TeamVenv(lengths=(3, 2), tell_size=False)
+    learner = log_game_steps(algorithm(PPO))
+    model = learner("MlpPolicy", VecMonitor(venv), n_steps=4, batch_size=24, n_epochs=1, device="cpu")
+    rows = logged(model, tmp_path, 24)
+    assert int(rows[0]["time/total_timesteps"]) == 24
+    assert "time/game_steps" not in rows[0]
+    assert game_steps(model) is None
+
+
+def test_logging_game_steps_again_changes_nothing() -> None:
+    learner = algorithm(PPO)
+    untouched = learner.dump_logs
+    assert log_game_steps(learner) is learner
+    once = learner.dump_logs
+    assert once is not untouched
+    log_game_steps(learner)
+    heir: Any = type("Heir", (learner,), {})
+    log_game_steps(heir)
+    assert learner.dump_logs is heir.dump_logs is once
+    assert OnPolicyAlgorithm.dump_logs is untouched, "base classes are left alone"
+    assert once.__doc__ == untouched.__doc__
+
+
+def test_other_signatures_of_dump_logs_work_too(tmp_path: Path) -> None:
+    learner = log_game_steps(algorithm(DQN, OffPolicyAlgorithm))
+    env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2), action_space=spaces.Discrete(2))))
+    model = learner("MultiInputPolicy", env, learning_starts=100, buffer_size=100, device="cpu")
+    last = logged(model, tmp_path, 60)[-1]
+    assert int(last["time/game_steps"]) * 3 == int(last["time/total_timesteps"]) > 0

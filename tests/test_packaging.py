@@ -1,0 +1,170 @@
+"""The files around the code: what is installed, with which versions, and what a first command finds."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import importlib
+import re
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("hecogrid_envs", "sb3_saf")
+#: Files that decide where software comes from.
+INSTALL_FILES = ("setup.cfg", "pyproject.toml", "constraints.txt", "Makefile", ".ci/run")
+
+
+def _requirements(lines: str) -> list[Requirement]:
+    stripped = (line.partition("#")[0].strip() for line in lines.splitlines())
+    return [Requirement(line) for line in stripped if line]
+
+
+def _setup_cfg() -> configparser.ConfigParser:
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg", encoding="utf-8")
+    return config
+
+
+def _declared() -> list[tuple[str, Requirement]]:
+    config = _setup_cfg()
+    groups = {"install_requires": config["options"]["install_requires"], **config["options.extras_require"]}
+    return [(group, requirement) for group, lines in groups.items() for requirement in _requirements(lines)]
+
+
+def _pins() -> list[Requirement]:
+    return _requirements((ROOT / "constraints.txt").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(("group", "requirement"), _declared(), ids=lambda value: str(value))
+def test_every_declared_dependency_is_pinned_inside_its_range(group: str, requirement: Requirement) -> None:
+    pins = [pin for pin in _pins() if canonicalize_name(pin.name) == canonicalize_name(requirement.name)]
+    assert pins, f"{requirement.name} ({group}) is missing in constraints.txt"
+    for pin in pins:
+        (specifier,) = pin.specifier
+        assert specifier.version in requirement.specifier
+
+
+def _third_party_imports() -> set[str]:
+    """Top-level modules that our packages import anywhere, neither Python's nor ours."""
+    names: set[str] = set()
+    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module.partition(".")[0])
+    return names - set(sys.stdlib_module_names) - set(PACKAGES)
+
+
+def test_every_import_is_declared() -> None:
+    declared = {canonicalize_name(requirement.name) for _, requirement in _declared()}
+    distributions = metadata.packages_distributions()
+    undeclared = {
+        module
+        for module in _third_party_imports()
+        if declared.isdisjoint(map(canonicalize_name, distributions.get(module, [module])))
+    }
+    assert undeclared == set()
+
+
+def test_constraints_are_exact_and_name_each_version_once_per_python() -> None:
+    pins = _pins()
+    assert all(re.fullmatch(r"==[\w.]+", str(pin.specifier)) and not pin.url for pin in pins)
+    for python in ("3.10", "3.11", "3.12", "3.13"):
+        environment = {"python_version": python}
+        names = [canonicalize_name(pin.name) for pin in pins if not pin.marker or pin.marker.evaluate(environment)]
+        assert sorted(names) == sorted(set(names))
+
+
+def test_torch_is_the_pinned_release() -> None:
+    assert "torch==2.13.0" in [str(pin) for pin in _pins()]
+
+
+def test_installed_versions_are_the_pinned_ones() -> None:
+    applicable = [pin for pin in _pins() if not pin.marker or pin.marker.evaluate()]
+    for pin in applicable:
+        try:
+            installed = metadata.version(pin.name)
+        except metadata.PackageNotFoundError:
+            continue  # of an extra that is not installed here
+        if pin.name != "pip":  # may be newer: it installs, it is not used
+            assert installed in pin.specifier, f"{pin.name} {installed} is installed, constraints.txt says {pin}"
+
+
+def test_version_is_written_once() -> None:
+    version = _setup_cfg()["metadata"]["version"]
+    assert metadata.version("sb3-saf") == version
+    for package in PACKAGES:
+        assert getattr(importlib.import_module(package), "__version__", version) == version
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_are_typed_and_complete(package: str) -> None:
+    """``find:`` leaves out folders without ``__init__.py``, which an editable installation would not notice."""
+    assert (ROOT / package / "py.typed").is_file()
+    folders = {path.parent for path in (ROOT / package).rglob("*.py")}
+    assert [str(folder) for folder in folders if not (folder / "__init__.py").is_file()] == []
+
+
+@pytest.mark.parametrize("folder", ["zoo_configs", "notebooks", "benchmarks", "tests"])
+def test_other_folders_stay_in_the_repository(folder: str) -> None:
+    assert (ROOT / folder).is_dir()
+    assert f"{folder}*" not in _setup_cfg()["options.packages.find"]["include"].split()
+
+
+def _modules_after(statement: str) -> set[str]:
+    """Top-level modules that a fresh interpreter holds after ``statement``."""
+    code = f"{statement}\nimport sys\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return set(result.stdout.split())
+
+
+def test_the_game_needs_neither_torch_nor_stable_baselines() -> None:
+    modules = _modules_after("import hecogrid_envs")
+    assert "hecogrid_envs" in modules
+    assert modules.isdisjoint({"torch", "stable_baselines3", "sb3_contrib", "sb3_saf", "tensorboard", "pygame"})
+
+
+def test_the_learning_does_not_need_the_game() -> None:
+    modules = _modules_after("import sb3_saf")
+    assert "stable_baselines3" in modules
+    assert modules.isdisjoint({"hecogrid_envs", "matplotlib", "pygame", "rl_zoo3", "ray"})
+
+
+def _make_commands(text: str) -> list[str]:
+    """Targets of the ``make`` calls in a page's code, in order."""
+    code = re.findall(r"```.*?```|`[^`\n]+`", text, flags=re.DOTALL)
+    return [target for piece in code for target in re.findall(r"\bmake ([\w-]+)", piece)]
+
+
+@pytest.mark.skipif(not (ROOT / "README.md").is_file(), reason="README.md is not written yet")
+def test_readme_begins_with_the_two_commands() -> None:
+    assert _make_commands((ROOT / "README.md").read_text(encoding="utf-8"))[:2] == ["train", "test"]
+
+
+@pytest.mark.parametrize("page", sorted(path.name for path in ROOT.glob("*.md")))
+def test_make_targets_named_in_pages_exist(page: str) -> None:
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert set(_make_commands((ROOT / page).read_text(encoding="utf-8"))) <= set(targets)
+
+
+@pytest.mark.parametrize("name", INSTALL_FILES)
+def test_no_hosts_indexes_or_machine_paths(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    found = re.findall(
+        r"\w+://\S+|--(?:extra-)?index-url|--find-links|--trusted-host|/(?:home|root|opt|tmp|work)/", text
+    )
+    assert found == []
+
+
+def test_ci_runs_the_check_target() -> None:
+    script = ROOT / ".ci" / "run"
+    assert script.stat().st_mode & 0o111
+    assert script.read_text(encoding="utf-8").splitlines()[-1] == "exec make check"

@@ -1,0 +1,187 @@
+"""One game as a PettingZoo environment: conformance, seeds, spaces, states."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from gymnasium.utils.env_checker import check_reset_return_type, check_space_limit
+from pettingzoo.test import (
+    api_test,
+    max_cycles_test,
+    parallel_api_test,
+    parallel_seed_test,
+    render_test,
+    seed_test,
+    state_test,
+)
+
+import hecogrid_envs
+from hecogrid_envs import TASK_NAMES, TASKS, HECOGridEnv, HECOGridParams
+from hecogrid_envs.registry import register_with_pettingzoo
+
+SMALL: dict[str, Any] = {"n_agents": 4, "grid_size": 9, "n_treasures": 12, "n_keys": 5, "max_cycles": 20}
+VARIANTS = [
+    pytest.param({**SMALL, "rules": rules, "observation": observation}, id=f"{rules}-{observation}")
+    for rules in ("paper", "released")
+    for observation in ("rgb", "tiles")
+]
+
+pytestmark = pytest.mark.parametrize("task", TASK_NAMES)
+
+
+def random_actions(env: HECOGridEnv, rng: np.random.Generator) -> dict[str, int]:
+    return {agent: int(rng.integers(7)) for agent in env.agents}
+
+
+def global_generator() -> list[int]:
+    state: Any = np.random.get_state()  # noqa: NPY002 - to see that nobody uses it
+    return list(state[1])
+
+
+def test_pettingzoo_conformance(task: str) -> None:
+    def make(**params: Any) -> HECOGridEnv:
+        return hecogrid_envs.parallel_env(task, **SMALL, **params)
+
+    parallel_api_test(make(), num_cycles=50)
+    parallel_seed_test(make)
+    api_test(hecogrid_envs.env(task, **SMALL), num_cycles=50)
+    seed_test(lambda: hecogrid_envs.env(task, **SMALL), num_cycles=50)
+    state_test(hecogrid_envs.env(task, **SMALL), make())
+
+
+def test_max_cycles(task: str) -> None:
+    max_cycles_test(importlib.import_module(TASKS[task].__module__))  # type: ignore[index]
+
+
+def test_renders_in_every_mode(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    render_test(
+        lambda render_mode: hecogrid_envs.env(task, render_mode=render_mode, **SMALL),
+        custom_tests={"ansi": lambda text: isinstance(text, str) and "#" in text},
+    )
+
+
+def test_made_by_name(task: str) -> None:
+    register_with_pettingzoo()  # a second time is silent
+    env = pettingzoo.make("parallel", f"hecogrid/{task}-v0", n_agents=3)
+    assert isinstance(env, TASKS[task])  # type: ignore[index]
+    assert len(env.possible_agents) == 3
+    aec = pettingzoo.make("aec", f"hecogrid/{task}-v0", n_agents=2, max_cycles=7)
+    aec.reset(seed=0)
+    assert aec.unwrapped.params == HECOGridParams(n_agents=2, max_cycles=7)
+
+
+@pytest.mark.parametrize("params", VARIANTS)
+def test_full_episodes_stay_in_their_spaces(task: str, params: dict[str, Any]) -> None:
+    env = hecogrid_envs.parallel_env(task, **params)
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        observations, infos = env.reset(seed=0 if episode == 0 else None)
+        assert set(observations) == set(infos) == set(env.possible_agents)
+        steps = 0
+        while env.agents:
+            result = env.step(random_actions(env, rng))
+            steps += 1
+            assert env.state_space.contains(env.state())
+            for agent, observation in result.observations.items():
+                assert env.observation_space(agent).contains(observation)
+            assert len(set(result.rewards.values())) == 1
+            assert not any(result.terminations.values())
+            assert set(result.truncations.values()) == {steps == params["max_cycles"]}
+        assert steps == params["max_cycles"]
+
+
+@pytest.mark.parametrize("params", VARIANTS)
+def test_one_seed_gives_one_sequence_of_episodes(task: str, params: dict[str, Any]) -> None:
+    def history(env: HECOGridEnv) -> list[Any]:
+        rng = np.random.default_rng(1)
+        frames: list[Any] = []
+        for episode in range(2):
+            frames.append(env.reset(seed=7 if episode == 0 else None)[0])
+            while env.agents:
+                result = env.step(random_actions(env, rng))
+                frames.append((result.observations, result.rewards))
+        return frames
+
+    env = hecogrid_envs.parallel_env(task, **params)
+    first, again, other = history(env), history(env), history(hecogrid_envs.parallel_env(task, **params))
+    np.testing.assert_equal(first, again)
+    np.testing.assert_equal(first, other)
+    levels = {env.reset(seed=seed)[0]["agent_0"].tobytes() for seed in range(20)}
+    assert len(levels) > 15, "seeds must matter"
+
+
+def test_global_generators_are_left_alone(task: str) -> None:
+    before = global_generator()
+    env = hecogrid_envs.parallel_env(task, **SMALL)
+    env.reset()
+    env.step(dict.fromkeys(env.agents, 0))
+    assert global_generator() == before
+
+
+def test_unseeded_games_differ(task: str) -> None:
+    levels = {hecogrid_envs.parallel_env(task).reset()[0]["agent_0"].tobytes() for _ in range(8)}
+    assert len(levels) > 1
+
+
+@pytest.mark.parametrize("params", VARIANTS)
+def test_a_stored_state_replays(task: str, params: dict[str, Any]) -> None:
+    env = hecogrid_envs.parallel_env(task, **{**params, "agent_order": "index"})
+    env.reset(seed=3)
+    level = env.get_state()
+    actions = np.random.default_rng(2).integers(0, 7, size=(10, 4))
+
+    def replay() -> list[Any]:
+        frames: list[Any] = [env.reset(options={"state": level})[0]]
+        for row in actions:
+            result = env.step(dict(zip(env.agents, row.tolist(), strict=True)))
+            frames.append((result.observations, result.rewards, env.get_state()))
+        return frames
+
+    np.testing.assert_equal(replay(), replay())
+    env.set_state(level)
+    np.testing.assert_equal(env.get_state(), level)
+    np.testing.assert_equal(env.observations(), replay()[0])
+
+
+def test_state_is_a_copy(task: str) -> None:
+    env = hecogrid_envs.parallel_env(task, **SMALL)
+    env.reset(seed=0)
+    state = env.get_state()
+    state["agent_pos"][:] = 1
+    state["walls"][:] = True
+    assert not np.array_equal(env.get_state()["walls"], state["walls"])
+
+
+def test_gymnasium_checks(task: str) -> None:
+    env = hecogrid_envs.parallel_env(task, **SMALL)
+    for agent in env.possible_agents:
+        check_space_limit(env.observation_space(agent), "observation")
+        assert isinstance(env.action_space(agent), gymnasium.spaces.Discrete)
+
+    class OneAgent(gymnasium.Env[Any, Any]):
+        observation_space = env.observation_space("agent_0")
+
+        def reset(
+            self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        ) -> tuple[Any, dict[str, Any]]:
+            observations, infos = env.reset(seed=seed, options=options)
+            return observations["agent_0"], infos["agent_0"]
+
+    check_reset_return_type(OneAgent())
+
+
+def test_documentation_page(task: str) -> None:
+    page = TASKS[task].__doc__  # type: ignore[index]
+    assert page is not None
+    for heading in ("Description", "Actions", "Observation", "State", "Reward and end", "Arguments", "Version history"):
+        assert f"## {heading}" in page
+    code = page.split("```python\n")[1].split("```")[0]
+    scope: dict[str, Any] = {}
+    exec(code, scope)  # the example on the page runs
+    assert scope["observations"]["agent_0"].shape == (28, 28, 3)

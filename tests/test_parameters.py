@@ -1,0 +1,55 @@
+"""The paper's parameter table, to the last weight."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy
+from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.parameters import count, paper_policy, parameter_table
+from sb3_saf.saf.critic import SAFCritic
+from sb3_saf.saf.policy_pool import PolicyPool
+
+ACTOR, OWN_CRITIC, JOINT_CRITIC, CNN = 25_735, 24_961, 98_689, 1_233_056
+
+
+@pytest.mark.parametrize(
+    ("policy_class", "expected"),
+    [
+        (IPPOPolicy, CNN + 10 * (ACTOR + OWN_CRITIC)),
+        (MAPPOPolicy, CNN + 10 * (ACTOR + JOINT_CRITIC)),
+        (SAFPolicy, CNN + 4 * ACTOR + 10 * JOINT_CRITIC + 233_600),
+    ],
+)
+def test_parts_add_up_to_the_whole(policy_class: type[TeamActorCriticPolicy], expected: int) -> None:
+    assert count(paper_policy(policy_class)) == expected
+
+
+def test_the_table_has_the_published_numbers() -> None:
+    counted = {row.name: row.counted for row in parameter_table()}
+    assert counted == {"CNN": 1_233_056, "IPPO": 1_740_016, "MAPPO": 2_477_296, "SAF": 2_556_486}
+
+
+def test_safs_projections_and_knowledge_source() -> None:
+    policy = paper_policy(SAFPolicy)
+    critic, pool = policy.value_net, policy.actor
+    assert isinstance(critic, SAFCritic) and isinstance(pool, PolicyPool)
+    assert count(critic.message_net) == count(critic.state_net) == count(pool.query_net) == 33_088
+    assert count(critic.combine_net) == 41_280
+    assert count(critic.knowledge_source) == 76_096 + 16_704
+    assert pool.signature_keys.numel() == 256
+    assert count(pool.policies) == 4 * ACTOR
+
+
+def test_the_command_prints_the_table_and_the_account_of_the_difference() -> None:
+    command = [sys.executable, "-m", "sb3_saf.parameters"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    lines = [line.split() for line in printed.splitlines()]
+    assert lines[2][:4] == ["IPPO", "1,740,016", "1,740,016", "0"]
+    assert lines[3][:4] == ["MAPPO", "2,477,296", "2,477,296", "0"]
+    assert lines[4][:4] == ["SAF", "2,556,486", "2,698,342", "-141,856"]
+    assert lines[-1][0] == "2,556,486"
+    assert lines[-1][-1] == "2,698,342"

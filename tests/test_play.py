@@ -1,0 +1,412 @@
+"""Playing: keys become the right action integers, and the program runs in a terminal, from a pipe and in a window."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hecogrid_envs import parallel_env, play
+from hecogrid_envs.params import HECOGridParams, TaskName
+from hecogrid_envs.play import Playable, Session, line_keys, make_session, play_text, play_window, terminal_keys
+from hecogrid_envs.text import parse_level
+from hecogrid_envs.window import HumanWindow, _import_pygame
+
+#: Zone 0 is columns 0 to 4, zone 1 columns 5 to 9.
+LEVEL = """
+    ##########
+    #>.$.v...#
+    #........#
+    #..^.....#
+    #........#
+    #........#
+    #........#
+    #........#
+    #........#
+    ##########
+"""
+ZONE_1 = list(permutations(range(7)))[500]
+
+
+class StillGame:
+    """Nothing moves; it remembers what it was asked to do."""
+
+    task: TaskName = "TeamSupport"
+
+    def __init__(self) -> None:
+        self.params = HECOGridParams(n_agents=3, grid_size=10, n_treasures=1, n_keys=0, heterogeneity=2, max_cycles=3)
+        self.possible_agents = ["agent_0", "agent_1", "agent_2"]
+        self.n_steps = 0
+        self.collected = 0
+        self.actions: list[list[int]] = []
+        self.seeds: list[int | None] = []
+        self.pay = 0.0
+        self.closed = False
+
+    def observations(self) -> dict[str, Any]:
+        return {agent: np.ones((7, 7), dtype=np.uint8) for agent in self.possible_agents}
+
+    def reset(self, seed: int | None = None) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        self.seeds.append(seed)
+        self.n_steps = 0
+        return self.observations(), {}
+
+    def step(self, actions: dict[str, Any]) -> tuple[Mapping[str, Any], ...]:
+        self.actions.append([actions[agent] for agent in self.possible_agents])
+        self.n_steps += 1
+        everyone = self.possible_agents
+        over = dict.fromkeys(everyone, self.n_steps >= self.params.max_cycles)
+        return self.observations(), dict.fromkeys(everyone, self.pay), dict.fromkeys(everyone, False), over, {}
+
+    def get_state(self) -> Mapping[str, Any]:
+        return parse_level(LEVEL)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def game() -> StillGame:
+    return StillGame()
+
+
+def real_game(**params: Any) -> Playable:
+    world = {"n_agents": 3, "grid_size": 10, "n_treasures": 1, "n_keys": 0, "clutter_density": 0.0} | params
+    return parallel_env("TeamSupport", observation="tiles", agent_order="index", **world)
+
+
+def real_session(**params: Any) -> Session:
+    """A session on the level above."""
+    env: Any = real_game(**params)
+    session = Session(env, seed=0)
+    env.set_state(parse_level(LEVEL))
+    return session
+
+
+# --- keys and actions
+
+
+@pytest.mark.parametrize(("key", "command"), [("left", 0), ("right", 1), ("up", 2), ("p", 3), ("d", 4), ("space", 6)])
+def test_keys_are_translated_for_the_zone(game: StillGame, key: str, command: int) -> None:
+    session = Session(game)
+    session.press(key)
+    assert game.actions[-1][0] == command
+    # The second agent (reading order) stands in zone 1.
+    session.press("tab")
+    session.press(key)
+    assert game.actions[-1][1] == ZONE_1[command]
+
+
+def test_raw_keys_are_not_translated(game: StillGame) -> None:
+    session = Session(game, raw=True)
+    session.press("tab")
+    session.press("p")
+    assert game.actions[-1][1] == 3
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize("action", range(7))
+def test_numbers_are_never_translated(game: StillGame, action: int, raw: bool) -> None:
+    session = Session(game, raw=raw)
+    session.press("tab")
+    session.press(str(action))
+    assert game.actions[-1][1] == action
+
+
+def test_the_others_do_nothing(game: StillGame) -> None:
+    Session(game).press("up")
+    assert game.actions == [[2, ZONE_1[6], 6]]
+
+
+def test_the_others_can_wander(game: StillGame) -> None:
+    session = Session(game, seed=0, others="random")
+    for _ in range(100):
+        session.over = False
+        session.press("up")
+    actions = np.array(game.actions)
+    assert (actions[:, 0] == 2).all()
+    assert set(actions[:, 1]) == set(actions[:, 2]) == set(range(7))
+
+
+def test_tab_selects_round_and_round(game: StillGame) -> None:
+    session = Session(game)
+    selected = []
+    for _ in range(4):
+        session.press("tab")
+        selected.append(session.selected)
+    assert selected == [1, 2, 0, 1]
+    assert game.actions == []
+
+
+@pytest.mark.parametrize("key", ["q", "escape", "quit"])
+def test_leaving(game: StillGame, key: str) -> None:
+    assert Session(game).press(key) is False
+    assert Session(game).press("tab") is True
+
+
+def test_new_games_continue_the_seed(game: StillGame) -> None:
+    session = Session(game, seed=5)
+    session.press("r")
+    assert game.seeds == [5, None]
+
+
+def test_an_ended_game_waits_for_a_new_one(game: StillGame) -> None:
+    session = Session(game)
+    for _ in range(5):
+        session.press("up")
+    assert len(game.actions) == 3
+    assert session.over
+    assert session.status.endswith("the game is over; r starts a new one, q quits")
+    session.press("r")
+    session.press("up")
+    assert len(game.actions) == 4
+
+
+def test_status(game: StillGame) -> None:
+    session = Session(game)
+    session.press("tab")
+    assert session.status == "agent 1 (zone 1, facing south): selected"
+    game.pay = 1 / 3
+    session.press("up")
+    assert session.status == f"agent 1 (zone 1, facing south): up: action {ZONE_1[2]} = forward; 1 collected!"
+    session.press("x")
+    assert session.status.endswith("key 'x' does nothing; h lists the keys")
+    session.press("h")
+    assert session.status.endswith(play.KEYS_HELP)
+
+
+# --- the real game
+
+
+def test_walking_to_a_treasure() -> None:
+    session = real_session()
+    for key in ("up", "up"):
+        session.press(key)
+    assert session.env.get_state()["agent_pos"][0].tolist() == [3, 1]
+    assert session.env.collected == 1
+    assert session.status == "agent 0 (zone 0, facing east): up: action 2 = forward; 1 collected!"
+
+
+def test_forward_walks_in_every_zone_unless_raw() -> None:
+    session = real_session(heterogeneity=2)
+    session.press("tab")
+    session.press("up")
+    assert session.env.get_state()["agent_pos"][1].tolist() == [5, 2]
+    session.raw = True
+    session.press("up")
+    assert session.env.get_state()["agent_pos"][1].tolist() == [5, 2]
+
+
+def test_text_shows_the_game() -> None:
+    session = real_session(heterogeneity=2)
+    lines = session.text(colour=False).splitlines()
+    assert lines[:4] == ["step 0  collected 0", "0000011111", "##########", "#>.$.v...#"]
+    assert lines[-1] == "agent 0 (zone 0, facing east): new game; h lists the keys"
+    assert real_session().text(colour=False).splitlines()[1] == "##########"
+
+
+def test_picture_marks_the_selected_agent_and_its_view() -> None:
+    pytest.importorskip("PIL")
+    session = real_session()
+    session.press("space")
+    first = session.picture(12)
+    session.press("tab")
+    assert first.shape[1] == 120
+    assert not np.array_equal(first, session.picture(12))
+    session._views[:] = False
+    session.selected = 0
+    assert not np.array_equal(first, session.picture(12))
+
+
+# --- in a terminal
+
+
+def test_lines_of_keys() -> None:
+    assert list(line_keys(io.StringIO("up UP left\n\n  p\nq"))) == ["up", "up", "left", "p", "q"]
+
+
+def test_playing_from_a_pipe() -> None:
+    out = io.StringIO()
+    play_text(real_session(), io.StringIO("up up\nq up\n"), out)
+    pages = [line for line in out.getvalue().splitlines() if line.startswith("step")]
+    assert pages == ["step 0  collected 0", "step 1  collected 0", "step 2  collected 1"]
+    assert "\x1b" not in out.getvalue()
+
+
+def test_single_keys() -> None:
+    reader, writer = os.pipe()
+    os.write(writer, b"\x1b[A\x1b[D\x1bOCpD \t3\x04")
+    os.close(writer)
+    try:
+        keys = ["up", "left", "right", "p", "d", "space", "tab", "3", "quit"]
+        assert list(terminal_keys(reader)) == keys
+    finally:
+        os.close(reader)
+
+
+def test_escape_alone_is_a_key() -> None:
+    reader, writer = os.pipe()
+    try:
+        os.write(writer, b"\x1b")
+        assert next(terminal_keys(reader)) == "escape"
+    finally:
+        os.close(reader)
+        os.close(writer)
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """The player's end and the program's end of a terminal."""
+    pty = pytest.importorskip("pty", reason="no terminals of this kind on Windows")
+    player, program = pty.openpty()
+    yield player, program
+    os.close(player)
+    os.close(program)
+
+
+def test_playing_key_by_key_in_a_terminal(terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    import termios
+
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    player, program = terminal
+    before = termios.tcgetattr(program)
+    # No newline anywhere: keys count as they are pressed.
+    keys = iter([b"\x1b[A", b"\x1b[A", b"q"])
+
+    class Screen(io.StringIO):
+        """The player presses a key whenever a new page is there."""
+
+        def flush(self) -> None:
+            os.write(player, next(keys))
+
+    session = real_session()
+    with open(program, closefd=False) as stdin:
+        play_text(session, stdin, Screen())
+    assert session.env.collected == 1
+    assert termios.tcgetattr(program) == before
+
+
+# --- in a window
+
+
+def test_playing_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("PIL")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    try:
+        pygame = _import_pygame()
+    except ImportError:
+        pytest.skip("pygame is not installed")
+    session = real_session()
+    shown = []
+    keys = iter([pygame.K_UP, pygame.K_UP, pygame.K_q])
+
+    def press_next(window: Any, picture: Any, show: Any = HumanWindow.show) -> None:
+        show(window, picture)
+        shown.append(picture)
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=next(keys)))
+
+    monkeypatch.setattr(HumanWindow, "show", press_next)
+    said: list[str] = []
+    play_window(session, tile_size=12, echo=said.append)
+    assert session.env.collected == 1
+    assert len(shown) == 3
+    assert not np.array_equal(shown[0], shown[2])
+    assert said[0] == play.KEYS_HELP
+    assert said[-1].endswith("1 collected!")
+    assert not pygame.display.get_init()
+
+
+# --- the command line
+
+
+def test_every_parameter_is_an_option() -> None:
+    words = (
+        "TeamTogether --n-agents 4 --grid-size 12 --coordination 2 --heterogeneity 3 --n-treasures 9 --n-keys 1 "
+        "--clutter-density 0.2 --view-size 5 --view-offset 2 --support-radius 3 --max-cycles 20 --rules released "
+        "--agent-order index --seed 3 --raw --others random --text"
+    )
+    session, options = make_session(words.split())
+    assert session.env.task == "TeamTogether"
+    assert session.env.params == HECOGridParams(
+        n_agents=4,
+        grid_size=12,
+        coordination=2,
+        heterogeneity=3,
+        n_treasures=9,
+        n_keys=1,
+        clutter_density=0.2,
+        view_size=5,
+        view_offset=2,
+        support_radius=3,
+        max_cycles=20,
+        rules="released",
+        agent_order="index",
+        observation="tiles",
+    )
+    assert (session.raw, session.others, options.text) == (True, "random", True)
+
+
+def test_defaults_are_those_of_the_world() -> None:
+    session, options = make_session([])
+    assert session.env.params == HECOGridParams(observation="tiles")
+    assert (session.env.task, session.raw, session.others, options.text) == ("TeamSupport", False, "wait", False)
+
+
+WRONG = [
+    (["TeamSuport"], "unknown task 'TeamSuport' (did you mean 'TeamSupport'?)"),
+    (["--coordination", "11"], "coordination must be an integer from 1 to 10"),
+    (["--grid-size", "big"], "argument --grid-size: invalid int value: 'big'"),
+    (["--rules", "mine"], "argument --rules: invalid choice: 'mine'"),
+    (["--grid-size", "8"], "n_treasures must be an integer from 0 to 36"),
+    (["--seed", "-1"], "non-negative"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG)
+def test_mistakes_end_with_a_message(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        make_session(words)
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_help_lists_keys_and_parameters(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        make_session(["--help"])
+    page = capsys.readouterr().out
+    assert play.KEYS_HELP.strip() in page
+    assert "--heterogeneity" in page
+    assert "number of zones" in page
+
+
+def test_the_program_as_typed() -> None:
+    small = ["--n-agents", "2", "--grid-size", "8", "--n-treasures", "3", "--n-keys", "0"]
+    done = subprocess.run(
+        [sys.executable, "-m", "hecogrid_envs.play", "TeamSupport", "--text", "--seed", "1", *small],
+        input="up space\nr\nq\n",
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parent.parent,
+    )
+    steps = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("step")]
+    assert steps == ["0", "1", "2", "0"]
+    assert done.stderr == ""
+
+
+def test_no_window_points_to_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(play, "play_window", refuse)
+    with pytest.raises(SystemExit) as stop:
+        play.main(["--n-agents", "2"])
+    assert stop.value.code == "no display\n(or play in the terminal: add --text)"

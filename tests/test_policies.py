@@ -1,0 +1,699 @@
+"""SAFPolicy, MAPPOPolicy and IPPOPolicy inside stock SB3."""
+
+from __future__ import annotations
+
+import copy
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import CategoricalDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
+from sb3_saf.common.networks import Linear
+from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.common.teams import TeamSpaces
+from sb3_saf.mappo.critic import JointCritic
+from sb3_saf.mappo.policies import MAPPOParts
+from sb3_saf.registration import register
+from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, take, team_rows, to_numpy
+
+POLICIES: list[type[TeamActorCriticPolicy]] = [IPPOPolicy, MAPPOPolicy, SAFPolicy]
+NAMES = ["IPPOPolicy", "MAPPOPolicy", "SAFPolicy"]
+ACTIONS: dict[str, spaces.Space[Any]] = {
+    "discrete": spaces.Discrete(3),
+    "multi-discrete": spaces.MultiDiscrete([3, 2]),
+    "multi-binary": spaces.MultiBinary(2),
+    "box": spaces.Box(-1.0, 1.0, (2,), np.float32),
+}
+#: Every way to set up a policy that changes what is computed.
+VARIANTS: list[tuple[type[TeamActorCriticPolicy], dict[str, Any]]] = [
+    (IPPOPolicy, {}),
+    (IPPOPolicy, {"heads": "per_agent"}),
+    (MAPPOPolicy, {}),
+    (MAPPOPolicy, {"agent_identity": False}),
+    (MAPPOPolicy, {"heads": "per_agent"}),
+    (SAFPolicy, {}),
+    (SAFPolicy, {"heads": "per_agent"}),
+    (SAFPolicy, {"critic_input": "team"}),
+    (SAFPolicy, {"critic_input": "team", "heads": "per_agent"}),
+    (SAFPolicy, {"selection": "gumbel"}),
+    (SAFPolicy, {"n_policies": 1}),
+    (SAFPolicy, {"n_policies": 1, "heads": "per_agent"}),
+    (SAFPolicy, {"knowledge_source": False}),
+]
+SMALL = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
+SMALL_SAF = {"latent_dim": 8, "projection_arch": (10,)}
+
+
+def constant(_: float) -> float:
+    return 1e-3
+
+
+def make_policy(
+    policy_class: type[TeamActorCriticPolicy],
+    own: spaces.Space[Any] = VECTOR,
+    action_space: spaces.Space[Any] = ACTIONS["discrete"],
+    seed: int = 0,
+    noise: float = 0.3,
+    **kwargs: Any,
+) -> TeamActorCriticPolicy:
+    """A small policy for three agents, with noise on the actor's small first weights so that every part matters."""
+    th.manual_seed(seed)
+    sizes: dict[str, Any] = SMALL | (SMALL_SAF if policy_class is SAFPolicy else {})
+    space = TeamSpaces.of(own, 3).to_dict_space()
+    policy = policy_class(space, action_space, constant, **(sizes | kwargs))
+    with th.no_grad():
+        for parameter in policy.actor.parameters():
+            parameter.add_(noise * th.randn_like(parameter))
+    return policy
+
+
+def make_model(policy: str = "SAFPolicy", venv: ToyTeams | None = None, seed: int = 0, **kwargs: Any) -> PPO:
+    sizes = SMALL | (SMALL_SAF if policy == "SAFPolicy" else {}) | kwargs.pop("policy_kwargs", {})
+    settings: dict[str, Any] = {"n_steps": 10, "batch_size": 40, "n_epochs": 2, "device": "cpu"}
+    return PPO(policy, venv or ToyTeams(), seed=seed, policy_kwargs=sizes, **(settings | kwargs))
+
+
+def probabilities(policy: TeamActorCriticPolicy, obs: Any) -> th.Tensor:
+    distribution = policy.get_distribution(obs)
+    assert isinstance(distribution, CategoricalDistribution)
+    return distribution.distribution.probs
+
+
+def equal_weights(one: th.nn.Module, other: th.nn.Module) -> bool:
+    first, second = one.state_dict(), other.state_dict()
+    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
+
+
+# --- registration -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_names_are_registered(algorithm: type[PPO] | type[A2C]) -> None:
+    aliases = algorithm.policy_aliases
+    assert [aliases[name] for name in NAMES] == POLICIES
+    assert issubclass(aliases["MlpPolicy"], ActorCriticPolicy)
+
+
+def test_names_that_belong_to_others_are_left_alone() -> None:
+    class Algorithm(PPO):
+        policy_aliases = {"SAFPolicy": ActorCriticPolicy}
+
+    with pytest.warns(UserWarning, match=r"Algorithm already knows another policy by the name 'SAFPolicy', .*pass the"):
+        register(Algorithm, "SAFPolicy", SAFPolicy)
+    assert Algorithm.policy_aliases["SAFPolicy"] is ActorCriticPolicy
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register(Algorithm, "Mine", SAFPolicy)
+        register(Algorithm, "Mine", SAFPolicy)
+
+
+# --- the actor reads its own observation only -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("own", [VECTOR, PICTURE, CodeSpace()], ids=["vector", "picture", "codes"])
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_no_other_agents_observation_changes_an_action_by_a_bit(
+    policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], own: spaces.Space[Any]
+) -> None:
+    policy = make_policy(policy_class, own, chunk_size=4, **kwargs)
+    obs = team_rows(own)
+    other = team_rows(own, n_views=12, seed=1)["team"]
+    all_actions = [th.full((12,), action) for action in range(3)]
+    for rows in (range(12), [7]):
+        one = take(obs, list(rows))
+        two = one | {"team": other[list(rows)]}
+        outcomes = []
+        for variant in (one, two):
+            th.manual_seed(3)
+            log_probs = []
+            for action in all_actions:
+                # The same draw of a policy for each, under "gumbel".
+                th.manual_seed(3)
+                log_probs.append(policy.evaluate_actions(variant, action[list(rows)])[1])
+            th.manual_seed(3)
+            actions, _, log_prob = policy(variant)
+            outcomes.append([*log_probs, actions, log_prob])
+        assert all(th.equal(a, b) for a, b in zip(*outcomes, strict=True))
+        if kwargs.get("selection") != "gumbel":
+            assert th.equal(probabilities(policy, one), probabilities(policy, two))
+            stacked = th.stack(outcomes[0][:3], dim=1).exp()
+            th.testing.assert_close(stacked, probabilities(policy, one), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("policy_class", [MAPPOPolicy, SAFPolicy])
+def test_the_team_reaches_values_but_not_actions(policy_class: type[TeamActorCriticPolicy]) -> None:
+    policy, obs = make_policy(policy_class), take(team_rows(VECTOR, n_views=50), [7])
+    obs["team"].requires_grad_()
+    values, log_prob, entropy = policy.evaluate_actions(obs, th.zeros(1, dtype=th.int64))
+    assert entropy is not None
+    to_actions = th.autograd.grad((log_prob + entropy).sum(), obs["team"], allow_unused=True, retain_graph=True)[0]
+    assert to_actions is None
+    assert th.autograd.grad(values.sum(), obs["team"])[0].abs().max() > 0
+
+
+def test_ippos_values_do_not_read_the_team() -> None:
+    policy, obs = make_policy(IPPOPolicy), team_rows(VECTOR)
+    del obs["team"]
+    assert policy.predict_values(obs).shape == (12, 1)
+
+
+# --- encoding distinct views once -------------------------------------------------------------------------------------
+
+
+def loss_and_gradients(
+    policy: TeamActorCriticPolicy, obs: dict[str, th.Tensor]
+) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    th.manual_seed(5)
+    actions = th.randint(3, (len(obs["obs"]),))
+    values, log_prob, entropy = policy.evaluate_actions(obs, actions)
+    weights = th.randn(3, len(actions))
+    assert entropy is not None
+    loss = (weights[0] * values[:, 0] + weights[1] * log_prob + weights[2] * entropy).mean()
+    policy.zero_grad()
+    loss.backward()
+    gradients = {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+    return loss.detach(), gradients
+
+
+@pytest.mark.parametrize("own", [VECTOR, CodeSpace()], ids=["vector", "codes"])
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_naive_encoding_gives_the_same_loss_and_gradients(
+    policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], own: spaces.Space[Any]
+) -> None:
+    policy = make_policy(policy_class, own, chunk_size=3, **kwargs)
+    naive = make_policy(policy_class, own, chunk_size=None, distinct=False, **kwargs)
+    naive.load_state_dict(policy.state_dict())
+    obs = team_rows(own, n_games=10)
+    for rows in (th.arange(30), th.randperm(30)[:17], th.tensor([4])):
+        loss, gradients = loss_and_gradients(policy, take(obs, rows))
+        expected_loss, expected = loss_and_gradients(naive, take(obs, rows))
+        th.testing.assert_close(loss, expected_loss, rtol=1e-5, atol=1e-6)
+        assert gradients.keys() == expected.keys()
+        for name, gradient in gradients.items():
+            scale = expected[name].abs().max().clamp_min(1.0)
+            assert (gradient - expected[name]).abs().max() <= 1e-5 * scale, name
+
+
+def test_each_distinct_view_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = make_policy(SAFPolicy, chunk_size=4)
+    encoded: list[tuple[float, ...]] = []
+    forward = policy.features_extractor.forward
+
+    def counting(observations: th.Tensor) -> th.Tensor:
+        encoded.extend(map(tuple, observations.tolist()))
+        assert len(observations) <= 4
+        return forward(observations)
+
+    monkeypatch.setattr(policy.features_extractor, "forward", counting)
+    obs = team_rows(VECTOR, n_games=20, n_views=9)
+    policy(obs)
+    assert len(encoded) == len(set(encoded)) == 9
+    encoded.clear()
+    policy(take(obs, [0, 1]))
+    assert len(encoded) == len(set(encoded)) <= 3
+
+
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_rows_do_not_depend_on_their_neighbours(
+    policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any]
+) -> None:
+    policy, obs = make_policy(policy_class, **kwargs), team_rows(VECTOR)
+    values = policy.predict_values(obs)
+    assert values.shape == (12, 1)
+    order = th.randperm(12)
+    th.testing.assert_close(policy.predict_values(take(obs, order)), values[order], rtol=0, atol=1e-6)
+    for row in range(12):
+        th.testing.assert_close(policy.predict_values(take(obs, [row])), values[[row]], rtol=0, atol=1e-6)
+    th.testing.assert_close(policy(obs)[1], values, rtol=0, atol=1e-6)
+    th.testing.assert_close(policy.evaluate_actions(obs, th.zeros(12).long())[0], values, rtol=0, atol=1e-6)
+
+
+# --- what the algorithms are ------------------------------------------------------------------------------------------
+
+
+def test_mappos_critic_reads_all_views_and_whose_value_is_asked() -> None:
+    policy, obs = make_policy(MAPPOPolicy), team_rows(VECTOR)
+    head = policy.value_net.value_head.heads[0]  # type: ignore[union-attr, index]
+    z = policy.features_extractor(obs["team"].flatten(0, 1)).view(12, -1)
+    joint = th.cat([z, th.eye(3)[obs["agent"]]], dim=1)
+    th.testing.assert_close(policy.predict_values(obs), head(joint), rtol=0, atol=1e-6)  # type: ignore[operator]
+
+
+def test_mappo_without_identity_values_teammates_alike() -> None:
+    obs = team_rows(VECTOR)
+    same = make_policy(MAPPOPolicy, agent_identity=False).predict_values(obs).view(4, 3)
+    assert th.equal(same, same[:, :1].expand(-1, 3))
+    differ = make_policy(MAPPOPolicy).predict_values(obs).view(4, 3)
+    assert (differ - differ[:, :1]).abs()[:, 1:].min() > 1e-6
+
+
+@pytest.mark.parametrize("policy_class", POLICIES)
+def test_per_agent_heads_are_each_agents_own(policy_class: type[TeamActorCriticPolicy]) -> None:
+    policy = make_policy(policy_class, heads="per_agent")
+    obs = team_rows(VECTOR)
+    values, before = policy.predict_values(obs), policy.evaluate_actions(obs, th.zeros(12).long())[1]
+    with th.no_grad():
+        for name, parameter in policy.named_parameters():
+            if "heads.1." in name:
+                parameter.add_(0.5 * th.randn_like(parameter))
+    after, of_agent = policy.predict_values(obs), obs["agent"] == 1
+    assert th.equal(after[~of_agent], values[~of_agent])
+    assert (after[of_agent] != values[of_agent]).all()
+    changed = policy.evaluate_actions(obs, th.zeros(12).long())[1] != before
+    # SAF's pool is shared by all agents.
+    assert changed.tolist() == ([False] * 12 if policy_class is SAFPolicy else of_agent.tolist())
+
+
+@pytest.mark.parametrize("heads", ["shared", "per_agent"])
+def test_saf_without_pool_and_knowledge_source_is_mappo(heads: str) -> None:
+    saf = make_policy(SAFPolicy, n_policies=1, knowledge_source=False, heads=heads)
+    mappo = make_policy(MAPPOPolicy, heads=heads)
+    mappo.load_state_dict(saf.state_dict())
+    obs, actions = team_rows(VECTOR), th.zeros(12).long()
+    for one, other in zip(saf.evaluate_actions(obs, actions), mappo.evaluate_actions(obs, actions), strict=True):
+        assert one is not None and other is not None
+        assert th.equal(one, other)
+
+
+def test_ippo_and_mappo_differ_in_the_critic_only_and_start_alike() -> None:
+    ippo, mappo = make_policy(IPPOPolicy, noise=0.0), make_policy(MAPPOPolicy, noise=0.0)
+    assert equal_weights(ippo.actor, mappo.actor)
+    assert equal_weights(ippo.features_extractor, mappo.features_extractor)
+    shapes = [[p.shape for name, p in policy.named_parameters() if "value" not in name] for policy in (ippo, mappo)]
+    assert shapes[0] == shapes[1]
+
+
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_critics_parameters_are_those_with_value_in_their_name(
+    policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any]
+) -> None:
+    policy, obs = make_policy(policy_class, **kwargs), team_rows(VECTOR, n_games=30)
+    th.manual_seed(0)
+    policy.evaluate_actions(obs, th.zeros(90).long())[1].sum().backward()
+    for name, parameter in policy.named_parameters():
+        assert (parameter.grad is None) == ("value" in name), name
+
+
+# --- spaces and arguments ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
+@pytest.mark.parametrize("kwargs", [{}, {"selection": "gumbel"}, {"n_policies": 1}])
+def test_action_spaces(action_space: spaces.Space[Any], kwargs: dict[str, Any]) -> None:
+    policy, obs = make_policy(SAFPolicy, action_space=action_space, **kwargs), team_rows(VECTOR)
+    for deterministic in (False, True):
+        actions, _, log_prob = policy(obs, deterministic=deterministic)
+        assert actions.shape == (12, *(action_space.shape or ()))
+        assert log_prob.shape == (12,) and log_prob.isfinite().all()
+    predicted, _ = policy.predict(to_numpy(obs))
+    assert all(action_space.contains(np.asarray(action, dtype=action_space.dtype)) for action in predicted)
+    has_log_std = isinstance(action_space, spaces.Box)
+    assert hasattr(policy, "log_std") == has_log_std
+
+
+OWN_SPACES = [VECTOR, PICTURE, CodeSpace(), spaces.Discrete(6), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)]
+
+
+@pytest.mark.parametrize("own", OWN_SPACES)
+@pytest.mark.parametrize("agent_dtype", [th.int64, th.float32])
+def test_rows_as_buffers_hand_them_over(own: spaces.Space[Any], agent_dtype: th.dtype) -> None:
+    policy, obs = make_policy(SAFPolicy, own), team_rows(own)
+    stored = obs | {"agent": obs["agent"].to(agent_dtype).unsqueeze(1)}
+    if isinstance(own, spaces.Discrete):
+        stored["obs"] = stored["obs"].unsqueeze(1)
+    actions = th.zeros(12).long()
+    for one, other in zip(policy.evaluate_actions(obs, actions), policy.evaluate_actions(stored, actions), strict=True):
+        assert one is not None and other is not None
+        assert th.equal(one, other)
+
+
+def test_light_encoder_on_codes_and_on_pictures_gives_the_same_policy() -> None:
+    codes = team_rows(CodeSpace())
+    atlas = th.tensor(CodeSpace().atlas)
+    pictures = {
+        key: atlas[value.long()].transpose(-4, -3).flatten(-5, -4).flatten(-3, -2).movedim(-1, -3)
+        for key, value in codes.items()
+        if key != "agent"
+    } | {"agent": codes["agent"]}
+    assert pictures["team"].shape == (12, 3, 3, 12, 12)
+    for encoder in (LightEncoder, PaperCNN):
+        of_codes = make_policy(SAFPolicy, CodeSpace(), features_extractor_class=encoder)
+        of_pictures = make_policy(SAFPolicy, PICTURE, features_extractor_class=encoder)
+        of_pictures.load_state_dict(of_codes.state_dict())
+        actions = th.zeros(12).long()
+        for one, other in zip(
+            of_codes.evaluate_actions(codes, actions), of_pictures.evaluate_actions(pictures, actions), strict=True
+        ):
+            assert one is not None and other is not None
+            th.testing.assert_close(one, other, rtol=0, atol=1e-5)
+
+
+def test_any_features_extractor_gets_the_own_space_and_what_sb3_prepares() -> None:
+    own = spaces.Box(0, 255, (3, 36, 36), np.uint8)
+    policy, obs = make_policy(MAPPOPolicy, own, features_extractor_class=NatureCNN), team_rows(own)
+    expected = policy.features_extractor(obs["obs"].float() / 255.0)
+    th.testing.assert_close(policy.extract_features(obs), expected, rtol=0, atol=1e-5)
+    raw = make_policy(MAPPOPolicy, own, features_extractor_class=NatureCNN, normalize_images=False)
+    raw.load_state_dict(policy.state_dict())
+    th.testing.assert_close(raw.extract_features(obs), raw.features_extractor(obs["obs"].float()), rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="encodes with its own features_extractor"):
+        policy.extract_features(obs, raw.features_extractor)
+
+
+def test_net_arch_for_actor_and_critic() -> None:
+    policy = make_policy(IPPOPolicy, net_arch={"pi": [5], "vf": [6, 7]})
+    sizes = [tuple(p.shape) for name, p in policy.named_parameters() if name.endswith("weight") and "head" in name]
+    assert sizes == [(5, 12), (3, 5), (6, 12), (7, 6), (1, 7)]
+    with pytest.raises(ValueError, match="net_arch must be a list or have the keys 'pi' and 'vf', got the keys"):
+        make_policy(IPPOPolicy, net_arch={"pi": [5]})
+
+
+def test_default_heads_are_the_papers() -> None:
+    policy = SAFPolicy(TeamSpaces.of(VECTOR, 3).to_dict_space(), spaces.Discrete(7), constant)
+    shapes = {name: tuple(p.shape) for name, p in policy.named_parameters()}
+    assert shapes["actor.policies.0.net.0.weight"] == (128, 64)
+    assert shapes["actor.policies.3.net.4.weight"] == (7, 128)
+    assert shapes["value_net.value_head.head.4.weight"] == (1, 128)
+    assert isinstance(policy.get_submodule("actor.policies.0.net.1"), th.nn.Tanh)
+
+
+def test_orthogonal_initialisation_and_gains() -> None:
+    th.manual_seed(0)
+    policy = SAFPolicy(TeamSpaces.of(PICTURE, 3).to_dict_space(), spaces.Discrete(4), constant)
+    gains = {
+        "features_extractor.encoder.net.0": 2**0.5,
+        "features_extractor.encoder.net.5": 2**0.5,
+        "actor.policies.2.net.0": 2**0.5,
+        "actor.policies.2.net.4": 0.01,
+        "actor.query_net.2": 2**0.5,
+        "value_net.value_head.head.2": 2**0.5,
+        "value_net.value_head.head.4": 1.0,
+        "value_net.knowledge_source.read_attention.key": 1.0,
+    }
+    for name, gain in gains.items():
+        weight = policy.get_parameter(f"{name}.weight").detach().flatten(1)
+        th.testing.assert_close(th.linalg.svdvals(weight), th.full((min(weight.shape),), gain), rtol=1e-3, atol=1e-6)
+    assert all(
+        (layer.bias == 0).all() for layer in policy.modules() if isinstance(layer, Linear) and layer.bias is not None
+    )
+    plain = SAFPolicy(TeamSpaces.of(VECTOR, 3).to_dict_space(), spaces.Discrete(4), constant, ortho_init=False)
+    assert (plain.get_parameter("actor.policies.0.net.0.bias") != 0).any()
+
+
+BAD_ARGUMENTS: list[tuple[dict[str, Any], str]] = [
+    ({"heads": "own"}, r"heads must be one of 'shared', 'per_agent', got 'own'"),
+    ({"selection": "max"}, r"selection must be one of 'mixture', 'gumbel', got 'max'"),
+    ({"critic_input": "all"}, r"critic_input must be one of 'own', 'team', got 'all'"),
+    ({"n_policies": 0}, r"n_policies must be a whole number of at least 1, got 0"),
+    ({"n_slots": 2.5}, r"n_slots must be a whole number of at least 1, got 2.5"),
+    ({"latent_dim": True}, r"latent_dim must be a whole number of at least 1, got True"),
+    ({"chunk_size": -1}, r"chunk_size must be a whole number of at least 1, got -1"),
+    ({"use_sde": True}, r"team policies have no state-dependent exploration \(gSDE\): leave use_sde=False"),
+    ({"share_features_extractor": False}, r"share the features extractor .*: leave share_features_extractor=True"),
+]
+
+
+@pytest.mark.parametrize(("kwargs", "message"), BAD_ARGUMENTS)
+def test_bad_arguments(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_policy(SAFPolicy, **kwargs)
+
+
+def test_unknown_arguments_are_refused() -> None:
+    with pytest.raises(TypeError, match="n_polices"):
+        make_policy(SAFPolicy, n_polices=3)
+    with pytest.raises(TypeError, match="n_policies"):
+        make_policy(MAPPOPolicy, n_policies=3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_unwrapped_environment_is_refused_with_what_to_do(name: str) -> None:
+    with pytest.raises(ValueError, match=r"make_team_env.*CentralizedValueWrapper") as error:
+        PPO(name, "CartPole-v1", device="cpu")
+    assert "got Box" in str(error.value)
+
+
+def test_dict_observations_of_an_agent_are_refused() -> None:
+    own = spaces.Dict({"a": VECTOR})
+    space = spaces.Dict({"obs": own, "team": spaces.Box(0, 1, (3, 5)), "agent": spaces.Discrete(3)})
+    with pytest.raises(ValueError, match="flatten"):
+        SAFPolicy(space, spaces.Discrete(2), constant)
+
+
+# --- predict ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy_class", POLICIES)
+def test_predict_takes_whole_rows_and_plain_own_observations(policy_class: type[TeamActorCriticPolicy]) -> None:
+    policy, obs = make_policy(policy_class, noise=1.0), to_numpy(team_rows(VECTOR, n_views=12))
+    actions, _ = policy.predict(obs, deterministic=True)
+    plain, _ = policy.predict(obs["obs"], deterministic=True)
+    assert actions.shape == (12,)
+    assert len(set(actions.tolist())) > 1
+    np.testing.assert_array_equal(plain, actions)
+    for row in range(12):
+        single = {key: value[row] for key, value in obs.items()}
+        for given in (single, obs["obs"][row], {"obs": obs["obs"][row]}):
+            action, state = policy.predict(given, deterministic=True)
+            assert action.shape == () and action == actions[row] and state is None
+
+
+def test_predict_takes_pictures_of_either_layout() -> None:
+    policy, obs = make_policy(SAFPolicy, PICTURE), to_numpy(team_rows(PICTURE, n_views=12))
+    actions, _ = policy.predict(obs["obs"], deterministic=True)
+    channels_last = obs["obs"].transpose(0, 2, 3, 1)
+    np.testing.assert_array_equal(policy.predict(channels_last, deterministic=True)[0], actions)
+    assert policy.predict(channels_last[3], deterministic=True)[0] == actions[3]
+
+
+def test_predict_needs_the_agent_with_heads_per_agent() -> None:
+    policy, obs = make_policy(MAPPOPolicy, heads="per_agent"), to_numpy(team_rows(VECTOR))
+    with pytest.raises(ValueError, match=r"expected the observation to have 'agent', which .* reads, got 'obs'"):
+        policy.predict(obs["obs"])
+    expected, _ = policy.predict(obs, deterministic=True)
+    own = {key: obs[key] for key in ("obs", "agent")}
+    np.testing.assert_array_equal(policy.predict(own, deterministic=True)[0], expected)
+    action, _ = policy.predict({"obs": obs["obs"][2], "agent": 2}, deterministic=True)  # type: ignore[dict-item]
+    assert action == expected[2]
+
+
+def test_malformed_observations_are_refused() -> None:
+    policy, obs = make_policy(MAPPOPolicy), to_numpy(team_rows(VECTOR))
+    with pytest.raises(ValueError, match=r"expected observations with the keys 'obs', 'team', 'agent', got 'other'"):
+        policy.predict(obs | {"other": obs["obs"]})
+    with pytest.raises(ValueError, match=r"'agent' must be in 0..2, got"):
+        policy.predict(obs | {"agent": obs["agent"] + 1})
+    with pytest.raises(ValueError, match=r"as many rows under each key of an observation, got 'obs' 12, 'agent' 1"):
+        policy.predict({"obs": obs["obs"], "agent": np.array(1)})
+    with pytest.raises(ValueError, match=r"Unexpected observation shape"):
+        policy.predict(obs["obs"][:, :3])
+    with pytest.raises(ValueError, match=r"to have 'team', which the critic reads, got 'obs'"):
+        policy.predict_values({"obs": th.tensor(obs["obs"])})
+    with pytest.raises(ValueError, match=r"to have 'team', which the critic reads, got an array"):
+        policy.predict_values(th.tensor(obs["obs"]))
+    with pytest.raises(ValueError, match=r"to have 'obs', which the actor reads, got 'team'"):
+        policy.predict({"team": obs["team"]})
+
+
+# --- in PPO -----------------------------------------------------------------------------------------------------------
+
+
+class FirstRatios(BaseCallback):
+    """Collects PPO's probability ratios of each first epoch, as PPO computes them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ratios: list[th.Tensor] = []
+
+    def _on_training_start(self) -> None:
+        assert isinstance(self.model, PPO)
+        buffer, policy = self.model.rollout_buffer, self.model.policy
+        get, evaluate, old = buffer.get, policy.evaluate_actions, []
+
+        def get_and_note(batch_size: int | None = None) -> Any:
+            for samples in get(batch_size):
+                old.append(samples.old_log_prob)
+                yield samples
+
+        def evaluate_and_note(*args: Any) -> Any:
+            results = evaluate(*args)
+            self.ratios.append((results[1].detach() - old[-1]).exp())
+            return results
+
+        buffer.get, policy.evaluate_actions = get_and_note, evaluate_and_note  # type: ignore[method-assign, assignment]
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def first_epochs_ratios(batch_size: int, **kwargs: Any) -> th.Tensor:
+    model = make_model(batch_size=batch_size, n_epochs=1, learning_rate=0.0, **kwargs)
+    callback = FirstRatios()
+    model.learn(240, callback=callback)
+    return th.cat(callback.ratios)
+
+
+@pytest.mark.parametrize("batch_size", [120, 24])
+@pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
+def test_the_ratio_is_one_before_the_weights_change(action_space: spaces.Space[Any], batch_size: int) -> None:
+    ratios = first_epochs_ratios(batch_size, venv=ToyTeams(action_space=action_space))
+    assert len(ratios) == 240
+    assert (ratios - 1).abs().max() < 1e-6 * (1 if not isinstance(action_space, spaces.Box) else 5)
+
+
+def test_with_gumbel_it_is_not() -> None:
+    # Policies drawn anew are compared with those that acted. (They start alike: make them differ.)
+    ratios = first_epochs_ratios(120, policy_kwargs={"selection": "gumbel", "ortho_init": False})
+    assert (ratios - 1).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
+def test_ppo_learns_with_every_policy_and_action_space(name: str, action_space: spaces.Space[Any]) -> None:
+    model = make_model(name, ToyTeams(action_space=action_space))
+    before = copy.deepcopy(model.policy)
+    model.learn(240)
+    assert model.num_timesteps == 240
+    assert not equal_weights(before, model.policy)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize("own", [PICTURE, CodeSpace(), spaces.Discrete(4)], ids=["picture", "codes", "discrete"])
+def test_ppo_learns_from_every_observation_space(own: spaces.Space[Any]) -> None:
+    make_model(venv=ToyTeams(own), batch_size=120, n_epochs=1).learn(120)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a2c_learns(name: str) -> None:
+    model = A2C(name, ToyTeams(), policy_kwargs=SMALL, device="cpu", seed=0)
+    model.learn(180)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"selection": "gumbel"}])
+def test_two_runs_of_one_seed_end_alike(kwargs: dict[str, Any]) -> None:
+    one, other, third = (make_model(seed=seed, policy_kwargs=kwargs).learn(240) for seed in (1, 1, 2))
+    assert equal_weights(one.policy, other.policy)
+    assert not equal_weights(one.policy, third.policy)
+
+
+def test_ppo_improves() -> None:
+    # Reward: first number of the view times the action, minus a tenth of the action. Best action by the view's sign.
+    venv = ToyTeams(n_views=6, n_games=8)
+    model = make_model(venv=venv, learning_rate=3e-3, batch_size=240, n_epochs=8, gamma=0.0)
+    views = venv._views
+    best = np.where(views[:, 0] > 0.1, 2, 0)
+    model.learn(20 * 240)
+    np.testing.assert_array_equal(model.predict(views, deterministic=True)[0], best)
+
+
+@pytest.mark.parametrize("name", [*NAMES, "gumbel"])
+@pytest.mark.parametrize("action_space", [ACTIONS["discrete"], ACTIONS["box"]], ids=["discrete", "box"])
+def test_no_weight_is_dead(name: str, action_space: spaces.Space[Any]) -> None:
+    kwargs = {"selection": "gumbel"} if name == "gumbel" else {}
+    model = make_model(
+        "SAFPolicy" if name == "gumbel" else name,
+        ToyTeams(action_space=action_space),
+        policy_kwargs=kwargs,
+        batch_size=120,
+        n_epochs=1,
+    )
+    model.learn(120)
+    for parameter_name, parameter in model.policy.named_parameters():
+        assert parameter.grad is not None, parameter_name
+        assert parameter.grad.flatten(1 if parameter.dim() > 1 else 0).abs().sum(dim=-1).min() > 0, parameter_name
+
+
+# --- saving -----------------------------------------------------------------------------------------------------------
+
+
+def test_model_saves_loads_and_continues(tmp_path: Path) -> None:
+    kwargs = {"n_policies": 3, "selection": "mixture", "critic_input": "team", "chunk_size": 7}
+    model = make_model(policy_kwargs=kwargs).learn(120)
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model", env=ToyTeams(), device="cpu")
+    assert isinstance(loaded.policy, SAFPolicy)
+    assert loaded.policy.parts == model.policy.parts
+    assert loaded.policy.chunk_size == 7
+    assert equal_weights(model.policy, loaded.policy)
+    obs = to_numpy(team_rows(VECTOR))
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    loaded.learn(120, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 240
+    assert not equal_weights(model.policy, loaded.policy)
+
+
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_policy_saves_and_loads(
+    policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], tmp_path: Path
+) -> None:
+    policy = make_policy(policy_class, CodeSpace(), distinct=False, chunk_size=5, **kwargs)
+    policy.save(str(tmp_path / "policy"))
+    loaded = policy_class.load(str(tmp_path / "policy"), device="cpu")
+    assert equal_weights(policy, loaded)
+    assert (loaded.parts, loaded.distinct, loaded.chunk_size) == (policy.parts, False, 5)
+    obs = team_rows(CodeSpace())
+    assert th.equal(loaded.predict_values(obs), policy.predict_values(obs))
+
+
+def test_weights_alone_load_without_unpickling() -> None:
+    policy, other, file = make_policy(SAFPolicy), make_policy(SAFPolicy, seed=1), io.BytesIO()
+    th.save(policy.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(th.load(file, weights_only=True))
+    assert equal_weights(policy, other)
+
+
+def test_actor_and_encoder_run_without_the_critic() -> None:
+    policy, obs = make_policy(SAFPolicy), team_rows(VECTOR)
+    other = make_policy(SAFPolicy, seed=1)
+    kept = {name: value for name, value in policy.state_dict().items() if not name.startswith("value_net")}
+    missing = other.load_state_dict(kept, strict=False).missing_keys
+    assert missing and all(name.startswith("value_net.") for name in missing)
+    parameters = other.actor(other.features_extractor(obs["obs"]))
+    found = other.actor.distribution(parameters)
+    assert isinstance(found, CategoricalDistribution)
+    th.testing.assert_close(found.distribution.probs, probabilities(policy, obs), rtol=0, atol=1e-6)
+
+
+def test_policies_can_be_copied() -> None:
+    policy = make_policy(SAFPolicy)
+    clone = copy.deepcopy(policy)
+    obs = team_rows(VECTOR)
+    with th.no_grad():
+        for parameter in clone.parameters():
+            parameter.zero_()
+    assert (clone.predict_values(obs) == 0).all()
+    assert (policy.predict_values(obs) != 0).all()
+
+
+def test_parts_can_be_replaced() -> None:
+    class DoubledCritic(JointCritic):
+        def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+            return 2.0 * super().forward(features, teams, active)
+
+    class DoubledParts(MAPPOParts):
+        def critic(self, spec: Any) -> DoubledCritic:
+            sizes = (spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn)
+            return DoubledCritic(*sizes, self.heads, self.agent_identity)
+
+    class DoubledPolicy(MAPPOPolicy):
+        parts_class = DoubledParts
+
+        def __init__(self, observation_space: Any, action_space: Any, lr_schedule: Schedule, **kwargs: Any):
+            super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+
+    doubled, plain = make_policy(DoubledPolicy), make_policy(MAPPOPolicy)
+    obs = team_rows(VECTOR)
+    assert th.equal(doubled.predict_values(obs), 2.0 * plain.predict_values(obs))

@@ -1,0 +1,115 @@
+"""The kernels agree with the plain-Python reference world, step by step, on random configurations of both rule sets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE
+from hecogrid_envs.tiles import TileSpace, observation_space
+from tests.reference_world import ReferenceWorld
+
+STATE_ENTRIES = ("walls", "treasures", "keys", "agent_pos", "agent_dir", "agent_has_key")
+
+
+@st.composite
+def configurations(draw: st.DrawFn, max_tile: int = 14) -> dict[str, Any]:
+    """Parameters that fit on their map, small and crowded so that agents meet."""
+    size = draw(st.integers(4, 10))
+    cells = (size - 2) ** 2
+    n_agents = draw(st.integers(1, 7))
+    view_size = draw(st.sampled_from([1, 3, 5, 7, 9, 11, 17]))
+    clutter = draw(st.sampled_from([0.0, 0.1, 0.3]))
+    room = cells - int(clutter * cells) - 1
+    n_keys = draw(st.integers(0, min(4, room)))
+    return {
+        "n_agents": n_agents,
+        "grid_size": size,
+        "coordination": draw(st.integers(1, min(3, n_agents))),
+        "heterogeneity": draw(st.integers(1, size - 2)),
+        "n_treasures": draw(st.integers(0, min(12, room - n_keys))),
+        "n_keys": n_keys,
+        "clutter_density": clutter,
+        "view_size": view_size,
+        "view_tile_size": draw(st.integers(1, max_tile)),
+        "view_offset": draw(st.integers(0, min(3, view_size - 1))),
+        "support_radius": draw(st.integers(0, 4)),
+        "rules": draw(st.sampled_from(["paper", "released"])),
+        "agent_order": draw(st.sampled_from(["random", "index"])),
+    }
+
+
+def assert_same_state(batch: GameBatch, world: ReferenceWorld) -> None:
+    state, expected = batch.get_state(), world.get_state()
+    for name in STATE_ENTRIES:
+        np.testing.assert_array_equal(state[name], expected[name], err_msg=name)  # type: ignore[literal-required]
+
+
+def assert_same_views(batch: GameBatch, world: ReferenceWorld) -> None:
+    observed = batch.observe()[0]
+    for agent in range(world.n_agents):
+        np.testing.assert_array_equal(observed[agent], world.observe(agent), err_msg=f"view of agent {agent}")
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(1, 12))
+def test_kernels_agree_with_the_reference(task: str, params: dict[str, Any], seed: int, n_steps: int) -> None:
+    batch = GameBatch(task, HECOGridParams(**params))
+    batch.reset(seeds=[seed])
+    world = ReferenceWorld(task, **params)
+    world.set_state(batch.get_state())
+    assert_same_views(batch, world)
+    # Mostly forward and pickup in zone 0, so that treasures and keys change hands.
+    rng = np.random.default_rng(seed)
+    for _ in range(n_steps):
+        actions = rng.choice(7, size=(1, params["n_agents"]), p=[0.1, 0.1, 0.4, 0.2, 0.1, 0.05, 0.05])
+        batch.step(actions)
+        rewards = world.step(actions[0].tolist(), batch.order[0].tolist())
+        assert rewards == [batch.rewards[0]] * params["n_agents"]
+        assert_same_state(batch, world)
+        assert_same_views(batch, world)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    params=configurations(max_tile=MAX_CODED_TILE_SIZE), seed=st.integers(0, 2**32), task=st.sampled_from(TASK_NAMES)
+)
+def test_tiles_draw_the_rgb_observation(params: dict[str, Any], seed: int, task: str) -> None:
+    rgb = GameBatch(task, HECOGridParams(**params, observation="rgb"))
+    tiles = GameBatch(task, HECOGridParams(**params, observation="tiles"))
+    space = observation_space(tiles.task, tiles.params)
+    assert isinstance(space, TileSpace)
+    rng = np.random.default_rng(seed)
+    for batch in (rgb, tiles):
+        batch.reset(seeds=[seed])
+    for _ in range(5):
+        codes = tiles.observe()[0]
+        assert all(space.contains(view) for view in codes)
+        np.testing.assert_array_equal(space.pixels(codes), rgb.observe()[0])
+        actions = rng.integers(0, 7, size=(1, params["n_agents"]))
+        rgb.step(actions)
+        tiles.step(actions)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(params=configurations(), seed=st.integers(0, 2**32))
+def test_fields_of_view_are_the_reference_visibility(params: dict[str, Any], seed: int) -> None:
+    batch = GameBatch("TeamSupport", HECOGridParams(**params))
+    batch.reset(seeds=[seed])
+    world = ReferenceWorld("TeamSupport", **params)
+    world.set_state(batch.get_state())
+    fields = batch.fields_of_view()
+    size = params["grid_size"]
+    for agent in range(params["n_agents"]):
+        expected = np.zeros((size, size), dtype=bool)
+        for column, row in np.argwhere(world.visible(agent)):
+            x, y = world.view_cell(agent, int(column), int(row))
+            if 0 <= x < size and 0 <= y < size:
+                expected[x, y] = True
+        np.testing.assert_array_equal(fields[agent], expected)

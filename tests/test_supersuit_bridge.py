@@ -1,0 +1,1192 @@
+"""The SuperSuit route: what the stock stack does wrong, and that the bridge does it right."""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import supersuit
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from pettingzoo.test import parallel_api_test
+from pettingzoo.utils import parallel_to_aec
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormalize
+
+from hecogrid_envs import supersuit_stack
+from hecogrid_envs.seeding import game_seeds
+from hecogrid_envs.supersuit_bridge import SuperSuitVecEnv, supersuit_vec_env
+from tests import toy_envs
+from tests.toy_envs import (
+    BareEnv,
+    CounterEnv,
+    DictEnv,
+    EagerEnv,
+    FaultyEnv,
+    ImageEnv,
+    LateEnv,
+    LockedFactory,
+    OddError,
+    OuterWrapper,
+    ReusingEnv,
+    TracingEnv,
+    UnequalEnv,
+    UnpicklableEnv,
+)
+
+Bridge = Callable[..., SuperSuitVecEnv]
+one_and_two_cpus = pytest.mark.parametrize("n_cpus", [1, 2])
+
+
+def stock(env: ParallelEnv[Any, Any, Any], n_games: int, n_cpus: int = 1) -> Any:
+    """SuperSuit's route to Stable-Baselines3, as its documentation has it."""
+    flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    return supersuit.concat_vec_envs_v1(flat, n_games, num_cpus=n_cpus, base_class="stable_baselines3")
+
+
+def close_stock(venv: Any) -> None:
+    """End the workers by SuperSuit's internal word; its own close is not understood by them."""
+    for pipe in getattr(venv.venv, "pipes", []):
+        pipe.send("terminate")
+    venv.venv.close()
+
+
+@pytest.fixture
+def bridge() -> Iterator[Bridge]:
+    """Make bridges that are closed after the test."""
+    made: list[SuperSuitVecEnv] = []
+
+    def make(*args: Any, **kwargs: Any) -> SuperSuitVecEnv:
+        made.append(supersuit_vec_env(*args, **kwargs))
+        return made[-1]
+
+    yield make
+    for venv in made:
+        venv.close()
+
+
+def zeros(venv: Any) -> npt.NDArray[Any]:
+    """Actions 0 for all rows."""
+    space = venv.action_space
+    return np.zeros((venv.num_envs, *space.shape), space.dtype)
+
+
+def draws(observations: Any) -> npt.NDArray[Any]:
+    """What the games' generators gave, per row."""
+    return np.asarray(observations)[:, 2]
+
+
+# ---- the order of rows
+
+
+@one_and_two_cpus
+def test_rows_are_game_major_then_agent(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: CounterEnv(3), n_games=2, seed=5, n_cpus=n_cpus)
+    assert (venv.num_envs, venv.n_games, venv.n_agents) == (6, 2, 3)
+    observations = venv.reset()
+    assert isinstance(observations, np.ndarray)
+    assert observations[:, 1].tolist() == [0, 1, 2, 0, 1, 2]
+    observations, rewards, _, _ = venv.step(np.array([0, 1, 2, 3, 0, 0]))
+    assert rewards.tolist() == [10 + 0 + 0, 10 + 1 + 1, 10 + 2 + 2, 10 + 0 + 3, 10 + 1 + 0, 10 + 2 + 0]
+    assert venv.get_attr("last_actions", indices=3) == [{"agent_0": 3, "agent_1": 0, "agent_2": 0}]
+
+
+# ---- trap: seeds and options
+
+
+def test_stock_cannot_be_seeded() -> None:
+    venv = stock(CounterEnv(), 2)
+    with pytest.raises(AttributeError, match="seed"):
+        venv.seed(0)
+    with pytest.raises(AttributeError, match="seed"):
+        PPO("MlpPolicy", venv, seed=0, device="cpu")
+
+
+def test_stock_drops_options() -> None:
+    venv = stock(CounterEnv(), 2)
+    venv.reset(options={"level": 3})
+    assert venv.reset_infos[0]["options"] is None
+
+
+@one_and_two_cpus
+def test_seed_of_ppo_reaches_the_games(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=3, seed=1, n_cpus=n_cpus)
+    PPO("MlpPolicy", venv, seed=0, n_steps=2, batch_size=12, n_epochs=1, device="cpu").learn(12)
+    assert venv.get_attr("last_seed")[::2] == game_seeds(0, 3)
+
+
+@one_and_two_cpus
+def test_two_runs_of_ppo_with_one_seed_end_equal(bridge: Bridge, n_cpus: int) -> None:
+    def train() -> dict[str, Any]:
+        venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
+        model = PPO("MlpPolicy", venv, seed=0, n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(64)
+        return {name: value.numpy() for name, value in model.policy.state_dict().items()}
+
+    first, second = train(), train()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize("n_games", [1, 3, 5])
+def test_games_play_as_if_each_was_alone(bridge: Bridge, n_cpus: int, n_games: int) -> None:
+    """Game i is the ParallelEnv reset with game_seeds(seed, E)[i], and it goes on with its own stream."""
+    venv = bridge(lambda: CounterEnv(2, max_cycles=3), n_games, seed=11, n_cpus=n_cpus)
+    alone = [CounterEnv(2, max_cycles=3) for _ in range(n_games)]
+    expected = [env.reset(seed=seed)[0] for env, seed in zip(alone, game_seeds(11, n_games), strict=True)]
+    observations = venv.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        assert np.array_equal(np.asarray(observations), [game[agent] for game in expected for agent in game])
+        actions = rng.integers(0, 4, venv.num_envs)
+        observations, rewards, dones, _ = venv.step(actions)
+        rows = iter(range(venv.num_envs))
+        for game, env in enumerate(alone):
+            stepped, reward, _, truncations, _ = env.step({a: actions[next(rows)] for a in env.agents})
+            assert rewards[2 * game : 2 * game + 2].tolist() == list(reward.values())
+            assert dones[2 * game : 2 * game + 2].tolist() == list(truncations.values())
+            expected[game] = stepped if env.agents else env.reset()[0]
+
+
+def test_stock_repeats_seeds_on_several_cpus() -> None:
+    venv = stock(CounterEnv(), 4, n_cpus=2)
+    observations, _ = venv.venv.reset(seed=0)
+    assert np.array_equal(draws(observations)[2:4], draws(observations)[4:6])
+    close_stock(venv)
+
+
+@one_and_two_cpus
+def test_no_two_games_share_a_seed(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=4, seed=0, n_cpus=n_cpus)
+    assert len(set(draws(venv.reset()).tolist())) == 8
+
+
+def test_stock_copies_play_the_same_game() -> None:
+    venv = stock(EagerEnv(), 3)
+    assert len(set(draws(venv.reset()).tolist())) == 2  # of the two agents
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize("seed", [None, 0])
+@pytest.mark.parametrize("make", [EagerEnv, EagerEnv()], ids=["factory", "environment"])
+def test_copies_play_different_games(bridge: Bridge, n_cpus: int, seed: int | None, make: Any) -> None:
+    first, second = (draws(bridge(make, 3, seed=seed, n_cpus=n_cpus).reset()) for _ in range(2))
+    assert len(set(first.tolist())) == 6
+    assert np.array_equal(first, second) == (seed == 0)
+
+
+@one_and_two_cpus
+def test_seed_counts_at_the_next_reset_and_once(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=2, seed=0, n_cpus=n_cpus)
+    first = venv.reset()
+    assert not same(venv.reset(), first)
+    assert list(venv.seed(0)) == [seed for seed in game_seeds(0, 2) for _ in range(2)]
+    assert same(venv.reset(), first)
+    unseeded = [venv.seed(None), venv.seed(None)]
+    assert unseeded[0] != unseeded[1]
+
+
+@one_and_two_cpus
+def test_global_random_state_does_not_matter(bridge: Bridge, n_cpus: int) -> None:
+    venvs = []
+    for _ in range(2):
+        np.random.seed(0)  # noqa: NPY002 - the point
+        venvs.append(bridge(CounterEnv, n_games=1, n_cpus=n_cpus))
+    assert not same(venvs[0].reset(), venvs[1].reset())
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "0", True])
+def test_wrong_seed(bridge: Bridge, seed: Any) -> None:
+    with pytest.raises(ValueError, match=f"seed must be an integer, 0 or larger, or None, got {seed!r}"):
+        bridge(CounterEnv, n_games=1, seed=seed)
+
+
+@one_and_two_cpus
+def test_options_reach_every_game_once(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=3, n_cpus=n_cpus)
+    venv.set_options({"level": 3})
+    venv.reset()
+    assert [info["options"] for info in venv.reset_infos] == [{"level": 3}] * 6
+    venv.reset()
+    assert [info["options"] for info in venv.reset_infos] == [None] * 6
+    venv.set_options([{"row": row} for row in range(6)])
+    venv.reset()
+    assert [info["options"]["row"] for info in venv.reset_infos] == [0, 0, 2, 2, 4, 4]
+    with pytest.raises(ValueError, match=r"list of 6 dicts, one per row \(3 games of 2 agents\), got 3"):
+        venv.set_options([{}, {}, {}])
+
+
+# ---- trap: dones
+
+
+def test_stock_dones_are_numbers() -> None:
+    venv = stock(CounterEnv(max_cycles=1), 1)
+    venv.reset()
+    assert venv.step(zeros(venv))[2].dtype == np.uint8
+
+
+@one_and_two_cpus
+def test_dtypes_of_a_step(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    observations, rewards, dones, infos = venv.step(zeros(venv))
+    assert isinstance(observations, np.ndarray)
+    assert [array.dtype.name for array in (observations, rewards, dones)] == ["float32", "float32", "bool"]
+    assert (observations.shape, rewards.shape, dones.shape, len(infos)) == ((4, 3), (4,), (4,), 4)
+
+
+def discounted_return_variance(venv: Any, gamma: float, n_steps: int) -> float:
+    """What VecNormalize says of the variance of discounted returns."""
+    normalised = VecNormalize(venv, norm_obs=False, gamma=gamma)
+    normalised.reset()
+    for _ in range(n_steps):
+        normalised.step(zeros(venv))
+    return float(normalised.ret_rms.var)
+
+
+@one_and_two_cpus
+def test_reward_normalisation(bridge: Bridge, n_cpus: int) -> None:
+    returns: list[float] = []
+    value = np.zeros(2)
+    for step in range(60):
+        value = 0.9 * value + 10.0 * (step % 3 + 1) + np.arange(2)
+        returns.extend(value.tolist())
+        if step % 3 == 2:
+            value = np.zeros(2)
+    expected = np.var(returns)
+    with pytest.warns(UserWarning, match="`render_mode` attribute is not defined"):
+        assert discounted_return_variance(stock(CounterEnv(), 2), 0.9, 60) > 2 * expected
+    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
+    assert discounted_return_variance(venv, 0.9, 60) == pytest.approx(expected, rel=1e-2)
+
+
+# ---- trap: truncation, terminal step
+
+
+def test_stock_hides_truncation() -> None:
+    venv = stock(CounterEnv(max_cycles=1), 1)
+    venv.reset()
+    _, _, dones, infos = venv.step(zeros(venv))
+    assert dones.all()
+    assert not any("TimeLimit.truncated" in info for info in infos)
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize(
+    ("deaths", "truncated"),
+    [({}, [True, True]), ({0: 3, 1: 3}, [False, False]), ({0: 3}, [False, True]), ({0: 2, 1: 2}, [False, False])],
+    ids=["time limit", "both at once", "one terminated, one not", "true end"],
+)
+def test_truncation_is_told(bridge: Bridge, n_cpus: int, deaths: dict[int, int], truncated: list[bool]) -> None:
+    """In the second case the agents are terminated at the time limit: both flags are up, and termination counts."""
+    venv = bridge(lambda: CounterEnv(2, max_cycles=3, deaths=deaths), n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    for _ in range(3):
+        _, _, dones, infos = venv.step(zeros(venv))
+        assert [("TimeLimit.truncated" in info) for info in infos] == dones.tolist()
+        if dones.any():
+            break
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == truncated * 2
+    assert all(type(info["TimeLimit.truncated"]) is bool for info in infos)
+
+
+def test_stock_mixes_reset_infos_into_the_last_step() -> None:
+    venv = stock(CounterEnv(max_cycles=1), 1)
+    venv.reset()
+    infos = venv.step(zeros(venv))[3]
+    assert (infos[0]["step"], infos[0]["episode"]) == (1, 2)
+
+
+@one_and_two_cpus
+def test_last_step_keeps_its_infos(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: CounterEnv(2, max_cycles=2), n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    assert venv.reset_infos == [{"episode": 1, "options": None}] * 4
+    assert venv.step(zeros(venv))[3] == [{"step": 1}] * 4
+    assert venv.reset_infos == [{"episode": 1, "options": None}] * 4
+    observations, _, dones, infos = venv.step(zeros(venv))
+    assert dones.all()
+    assert [sorted(info) for info in infos] == [["TimeLimit.truncated", "step", "terminal_observation"]] * 4
+    assert [info["step"] for info in infos] == [2] * 4
+    assert venv.reset_infos == [{"episode": 2, "options": None}] * 4
+    assert isinstance(observations, np.ndarray)
+    assert observations[:, 0].tolist() == [0] * 4
+    assert [info["terminal_observation"][:2].tolist() for info in infos] == [[2, 0], [2, 1]] * 2
+
+
+@one_and_two_cpus
+def test_value_of_the_state_after_a_time_limit_counts(bridge: Bridge, n_cpus: int) -> None:
+    """SB3 adds gamma * V(terminal observation) to the reward of a truncated row; here it must do so."""
+    venv = bridge(lambda: CounterEnv(2, max_cycles=1), n_games=1, n_cpus=n_cpus)
+    model = PPO("MlpPolicy", venv, n_steps=2, batch_size=4, n_epochs=1, gamma=0.5, seed=0, device="cpu")
+    model.policy.value_net.weight.data.zero_()
+    model.policy.value_net.bias.data.fill_(8.0)
+    model.learn(1)
+    actions = model.rollout_buffer.actions.reshape(2, 2)
+    assert model.rollout_buffer.rewards == pytest.approx(10.0 + np.arange(2) + actions + 0.5 * 8.0)
+
+
+@one_and_two_cpus
+def test_games_may_reuse_their_arrays_and_infos(bridge: Bridge, n_cpus: int) -> None:
+    """Neither the terminal observation nor an older info changes afterwards, and no two rows share an info."""
+    venv = bridge(lambda: ReusingEnv(max_cycles=2), n_games=2, n_cpus=n_cpus)
+    first = np.copy(np.asarray(kept := venv.reset()))
+    infos_of_step_1 = venv.step(zeros(venv))[3]
+    _, _, dones, infos = venv.step(zeros(venv))
+    assert np.array_equal(np.asarray(kept), first)
+    assert dones.all()
+    assert [info["terminal_observation"][:2].tolist() for info in infos] == [[2, 0], [2, 1]] * 2
+    assert [info["steps"] for info in infos_of_step_1] == [[1]] * 4
+    assert [info["steps"] for info in infos] == [[2]] * 4
+    assert [info["steps"] for info in venv.reset_infos] == [[]] * 4
+    nested = [id(info["steps"]) for info in infos] + [id(info["steps"]) for info in venv.reset_infos]
+    assert len(set(nested)) == 8
+
+
+# ---- trap: shared infos
+
+
+class SilentEnv(CounterEnv):
+    """Gives no infos."""
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        return (*super().step(actions)[:4], {a: {} for a in self.possible_agents})
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return super().reset(seed, options)[0], {}
+
+
+def test_stock_shares_empty_infos_on_several_cpus() -> None:
+    venv = stock(SilentEnv(), 2, n_cpus=2)
+    venv.venv.reset()
+    infos = venv.step(zeros(venv))[3]
+    assert infos[0] is infos[3]
+    close_stock(venv)
+
+
+@one_and_two_cpus
+def test_infos_are_distinct(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(SilentEnv, n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    _, _, _, infos = venv.step(zeros(venv))
+    assert infos == [{}] * 4
+    assert venv.reset_infos == [{}] * 4
+    assert len({id(info) for info in [*infos, *venv.reset_infos]}) == 8
+
+
+# ---- trap: attributes and methods
+
+
+def test_stock_has_no_attributes() -> None:
+    venv = stock(CounterEnv(render_mode="rgb_array"), 2)
+    for call in (
+        lambda: venv.get_attr("level"),
+        lambda: venv.set_attr("level", 2),
+        lambda: venv.env_method("poke"),
+    ):
+        with pytest.raises(AttributeError):
+            call()
+    with pytest.warns(UserWarning, match="`render_mode` attribute is not defined"):
+        assert VecMonitor(venv).render_mode is None
+    with pytest.raises(AttributeError):
+        MaskablePPO("MlpPolicy", venv, n_steps=2, device="cpu").learn(2)
+
+
+@one_and_two_cpus
+def test_attributes_by_row(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=3, seed=0, n_cpus=n_cpus)
+    assert venv.get_attr("level") == [1] * 6  # before the first reset
+    venv.reset()
+    assert venv.get_attr("last_seed", indices=[5, 0]) == [game_seeds(0, 3)[2], game_seeds(0, 3)[0]]
+    venv.set_attr("level", 7, indices=[2])
+    assert venv.get_attr("level") == [1, 1, 7, 7, 1, 1]
+    assert venv.get_attr("level", indices=2) == venv.get_attr("level", np.int64(-3)) == [7]  # type: ignore[arg-type]
+    assert venv.get_attr("level", indices=[]) == []
+    assert venv.has_attr("level")
+    assert not venv.has_attr("depth")
+    assert venv.has_attr("action_masks")
+    with pytest.raises(AttributeError, match="has an attribute 'depth'"):
+        venv.get_attr("depth")
+    with pytest.raises(ValueError, match="there is no row 6: expected 0 to 5"):
+        venv.get_attr("level", indices=6)
+
+
+@one_and_two_cpus
+def test_processes(bridge: Bridge, n_cpus: int) -> None:
+    pids = bridge(CounterEnv, n_games=4, n_cpus=n_cpus).get_attr("pid")
+    assert len(set(pids)) == n_cpus
+    assert (os.getpid() in pids) == (n_cpus == 1)
+
+
+@one_and_two_cpus
+def test_methods_by_row_and_by_game(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=3, n_cpus=n_cpus)
+    assert venv.env_method("poke", 10, indices=[2, 0, 3]) == [10, 10, 20]  # rows 2 and 3 are one game
+    assert venv.env_method("poke", amount=1) == [11, 12, 21, 22, 1, 2]
+    assert venv.game_method("poke", 100) == [112, 122, 102]
+    assert venv.game_method("poke", amount=1, games=[2, 0]) == [103, 113]
+    assert venv.game_method("poke", 0, games=-1) == [103]
+    assert venv.env_method("apply", lambda level: level + 1, indices=0) == [2]
+    with pytest.raises(ValueError, match="there is no game 3: expected 0 to 2"):
+        venv.game_method("poke", games=3)
+
+
+@one_and_two_cpus
+def test_questions_do_not_disturb_the_episode(bridge: Bridge, n_cpus: int) -> None:
+    quiet, asked = (bridge(CounterEnv, n_games=2, seed=3, n_cpus=n_cpus) for _ in range(2))
+    quiet.reset()
+    observations = asked.reset()
+    for _ in range(7):
+        before = np.copy(np.asarray(observations))
+        asked.get_attr("level")
+        asked.env_method("poke")
+        asked.has_attr("nothing")
+        assert np.array_equal(np.asarray(observations), before)
+        expected = quiet.step(zeros(quiet))
+        observations, rewards, dones, infos = asked.step(zeros(asked))
+        assert same(expected, (observations, rewards, dones, infos))
+        assert same(quiet.reset_infos, asked.reset_infos)
+
+
+@one_and_two_cpus
+def test_wrappers_are_seen(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: OuterWrapper(CounterEnv()), n_games=2, n_cpus=n_cpus)
+    assert venv.env_is_wrapped(OuterWrapper) == [True] * 4
+    assert venv.env_is_wrapped(OuterWrapper, indices=[1]) == [True]
+    assert venv.env_is_wrapped(TracingEnv) == [False] * 4
+    assert venv.get_attr("colour", 0) == ["red"]
+    venv.set_attr("colour", "blue")
+    venv.set_attr("level", 5)  # belongs to the game: its own methods must see it
+    venv.set_attr("fresh", 6)
+    assert venv.get_attr("colour", 0) == ["blue"]
+    assert venv.env_method("apply", int, indices=0) == [5]
+    assert venv.get_attr("fresh", 0) == [6]
+    assert venv.get_attr("unwrapped", 0)[0].fresh == 6
+    assert venv.get_attr("_rng", 0) == [None]  # private, so PettingZoo's wrapper does not pass it on
+
+
+@one_and_two_cpus
+def test_errors_come_back(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=3, n_cpus=n_cpus)
+    venv.reset()
+    with pytest.raises(LookupError, match="this method always fails") as caught:
+        venv.env_method("fail", indices=5)
+    if n_cpus == 2:
+        assert "in the worker process of game 2" in str(caught.value.__cause__)
+        assert "in fail" in str(caught.value.__cause__)
+    assert venv.step(zeros(venv))[1].tolist() == [10, 11] * 3
+
+
+def test_what_cannot_leave_a_worker(bridge: Bridge) -> None:
+    venv = bridge(UnpicklableEnv, n_games=2, n_cpus=2)
+    with pytest.raises(TypeError, match=r"this reply cannot leave its worker process .* use n_cpus=1"):
+        venv.get_attr("lock")
+    assert venv.get_attr("level") == [1] * 4
+    assert isinstance(bridge(UnpicklableEnv, n_games=1).get_attr("lock")[0], type(threading.Lock()))
+
+
+@one_and_two_cpus
+def test_maskable_ppo_runs(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: CounterEnv(3, deaths={1: 1}), n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    assert np.array_equal(np.stack(venv.env_method("action_masks")), np.tile(np.eye(3, 4, dtype=bool), (2, 1)))
+    venv.step(zeros(venv))
+    masks = venv.env_method("action_masks", indices=[3, 4])
+    assert [mask.tolist() for mask in masks] == [[True, False, False, False], [True] * 4]  # agent 1 has ended
+    model = MaskablePPO("MlpPolicy", venv, n_steps=3, batch_size=18, n_epochs=1, seed=0, device="cpu").learn(18)
+    actions = model.rollout_buffer.actions.reshape(6, 3)  # by row and step
+    assert actions[[0, 2, 3, 5]].tolist() == [[0] * 3, [2] * 3] * 2
+    assert actions[[1, 4], 0].tolist() == [1, 1]
+
+
+# ---- pictures
+
+
+@one_and_two_cpus
+def test_pictures(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: CounterEnv(2, render_mode="rgb_array"), n_games=4, n_cpus=n_cpus)
+    assert venv.render_mode == "rgb_array"
+    assert VecMonitor(venv).render_mode == "rgb_array"
+    assert venv.get_attr("render_mode") == ["rgb_array"] * 8
+    venv.reset()
+    venv.step(zeros(venv))
+    images = venv.get_images()
+    assert len(images) == 8
+    assert all(np.array_equal(np.asarray(image), np.full((4, 6, 3), 1)) for image in images)
+    mosaic = venv.render()
+    assert mosaic is not None
+    assert mosaic.shape == (8, 12, 3)  # one picture per game, not per row
+
+
+@one_and_two_cpus
+def test_no_pictures(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
+    assert venv.render_mode is None
+    assert venv.get_images() == [None] * 4
+    with pytest.warns(UserWarning, match="no `render_mode` was passed"):
+        assert venv.render() is None
+
+
+# ---- trap: agents that die
+
+
+def test_stock_stops_at_an_agents_death() -> None:
+    venv = stock(CounterEnv(2, deaths={1: 1}), 1)
+    venv.reset()
+    with pytest.raises(AssertionError, match="varying numbers of active agents"):
+        venv.step(zeros(venv))
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize("kind", [CounterEnv, DictEnv])
+def test_death_of_an_agent(bridge: Bridge, n_cpus: int, kind: type[CounterEnv]) -> None:
+    def numbers(observation: Any, row: int) -> list[float]:
+        """Step and agent in a row."""
+        if kind is DictEnv:
+            return [float(observation["step"][row]), float(observation["numbers"][row, 0])]
+        return [float(value) for value in observation[row, :2]]
+
+    def terminal(info: dict[str, Any]) -> list[float]:
+        last = info["terminal_observation"]
+        return [float(last["step"]), float(last["numbers"][0])] if kind is DictEnv else last[:2].tolist()
+
+    venv = bridge(lambda: kind(3, max_cycles=3, deaths={1: 1}), n_games=2, n_cpus=n_cpus)
+    for episode in (1, 2):
+        if episode == 1:
+            venv.reset()
+        assert venv.reset_infos == [{"episode": episode, "options": None}] * 6
+        observations, rewards, dones, infos = venv.step(zeros(venv))
+        assert [numbers(observations, row) for row in range(3)] == [[1, 0], [0, 0], [1, 2]]
+        assert rewards[:3].tolist() == [10, 11, 12]
+        assert not dones.any()
+        assert infos[0] == infos[2] == {"step": 1}
+        assert sorted(infos[1]) == ["step", "terminal_observation"]
+        assert terminal(infos[1]) == [1, 1]
+        observations, rewards, dones, infos = venv.step(zeros(venv))
+        assert [numbers(observations, row) for row in range(3)] == [[2, 0], [0, 0], [2, 2]]
+        assert rewards[:3].tolist() == [20, 0, 22]
+        assert not dones.any()
+        assert infos[:3] == [{"step": 2}, {"active": False}, {"step": 2}]
+        observations, rewards, dones, infos = venv.step(zeros(venv))
+        assert [numbers(observations, row) for row in range(3)] == [[0, 0], [0, 1], [0, 2]]  # the next episode
+        assert rewards[:3].tolist() == [30, 0, 32]
+        assert dones.all()
+        assert [terminal(info) for info in infos[:3]] == [[3, 0], [0, 0], [3, 2]]
+        assert [info["TimeLimit.truncated"] for info in infos[:3]] == [True, False, True]
+        assert [info.get("active") for info in infos[:3]] == [None, False, None]
+
+
+@one_and_two_cpus
+def test_an_agents_own_time_limit(bridge: Bridge, n_cpus: int) -> None:
+    """A row that was truncated long before the team is done must not be valued at the team's end."""
+    venv = bridge(lambda: CounterEnv(2, max_cycles=3, cuts={0: 1}), n_games=1, n_cpus=n_cpus)
+    venv.reset()
+    for _ in range(3):
+        _, _, dones, infos = venv.step(zeros(venv))
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, True]
+
+
+@one_and_two_cpus
+def test_ppo_trains_on_games_with_deaths(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: CounterEnv(3, max_cycles=5, deaths={1: 2, 2: 4}), n_games=2, n_cpus=n_cpus)
+    PPO("MlpPolicy", VecMonitor(VecCheckNan(venv)), n_steps=16, batch_size=32, n_epochs=1, device="cpu").learn(96)
+
+
+@one_and_two_cpus
+def test_agent_that_joins_late(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(LateEnv, n_games=1, n_cpus=n_cpus)
+    observations = np.asarray(venv.reset())
+    assert observations[1].tolist() == [0, 0, 0]
+    assert venv.reset_infos[1] == {"active": False}
+    step = venv.step(zeros(venv))
+    assert step[3] == [{"step": 1}, {"active": False}]
+    assert np.asarray(step[0])[1, :2].tolist() == [1, 1]
+    assert venv.step(zeros(venv))[3] == [{"step": 2}, {"step": 2}]
+
+
+@one_and_two_cpus
+def test_bare_game(bridge: Bridge, n_cpus: int) -> None:
+    """No metadata, no render_mode, no infos, agents that stay listed after their end: still a team episode."""
+    with pytest.raises(AttributeError):
+        stock(BareEnv(), 1)
+    venv = bridge(BareEnv, n_games=2, n_cpus=n_cpus)
+    assert np.asarray(venv.reset()).tolist() == [0] * 4
+    assert np.asarray(venv.step(zeros(venv))[0]).tolist() == [1] * 4
+    observations, rewards, dones, infos = venv.step(zeros(venv))
+    assert np.asarray(observations).tolist() == [0, 2] * 2
+    assert not dones.any()
+    assert [info.get("terminal_observation") for info in infos] == [2, None] * 2
+    observations, rewards, dones, infos = venv.step(zeros(venv))
+    assert dones.all()
+    assert rewards.tolist() == [0, 1] * 2
+    assert [info["terminal_observation"] for info in infos] == [0, 3] * 2
+
+
+# ---- one process or two, dict or box, real games
+
+
+def rollout(venv: SuperSuitVecEnv, n_steps: int) -> list[Any]:
+    """Everything that comes out of a venv under fixed actions."""
+    record: list[Any] = [venv.reset(), venv.reset_infos.copy()]
+    venv.action_space.seed(0)
+    for _ in range(n_steps):
+        actions = np.stack([venv.action_space.sample() for _ in range(venv.num_envs)])
+        record.extend([*venv.step(actions), venv.reset_infos.copy()])
+    return record
+
+
+def same(one: Any, other: Any) -> bool:
+    """Equal down to types and bits."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(same(*pair) for pair in zip(one, other, strict=True))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other)
+    return bool(one == other)
+
+
+def kaz() -> Any:
+    """Knights, archers, zombies: agents die, and its surfaces cannot be pickled."""
+    from pettingzoo.butterfly.knights_archers_zombies import knights_archers_zombies
+
+    return knights_archers_zombies.parallel_env(spawn_delay=2, max_zombies=60, max_cycles=140)
+
+
+def rps() -> Any:
+    """Rock, paper, scissors: an AEC game behind PettingZoo's converter."""
+    from pettingzoo.classic.rps import rps as rock_paper_scissors
+
+    return rock_paper_scissors.parallel_env(max_cycles=5)
+
+
+@pytest.mark.parametrize("make", [lambda: CounterEnv(3, deaths={2: 2}), ImageEnv, DictEnv, LateEnv, BareEnv, rps, kaz])
+def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -> None:
+    if make in (kaz, rps):
+        pytest.importorskip("pygame")
+    n_steps = 150 if make is kaz else 12
+    one, two = (rollout(bridge(make, n_games=3, seed=1, n_cpus=n_cpus), n_steps) for n_cpus in (1, 2))
+    assert same(one, two)
+    if make is kaz:
+        assert any(info.get("active") is False for part in one[5::5] for info in part)
+
+
+@one_and_two_cpus
+def test_ppo_with_dict_observations_and_continuous_actions(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(DictEnv, n_games=2, seed=0, n_cpus=n_cpus)
+    PPO("MultiInputPolicy", venv, n_steps=4, batch_size=16, n_epochs=1, device="cpu").learn(32)
+
+
+@one_and_two_cpus
+def test_image_observations(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(ImageEnv, n_games=2, seed=0, n_cpus=n_cpus)
+    assert venv.observation_space == spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    expected = [ImageEnv().reset(seed=seed)[0] for seed in game_seeds(0, 2)]
+    assert np.array_equal(np.asarray(venv.reset()), [game[agent] for game in expected for agent in game])
+
+
+@one_and_two_cpus
+def test_sb3_wrappers_on_top(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(lambda: CounterEnv(2, max_cycles=3, deaths={1: 2}), n_games=2, n_cpus=n_cpus)
+    wrapped = VecNormalize(VecMonitor(VecCheckNan(venv, raise_exception=True)), gamma=0.9)
+    assert (wrapped.n_agents, wrapped.n_games) == (2, 2)
+    assert wrapped.get_attr("level") == [1] * 4
+    wrapped.seed(4)
+    wrapped.reset()
+    assert wrapped.get_attr("last_seed")[::2] == game_seeds(4, 2)
+    for _ in range(3):
+        _, _, dones, infos = wrapped.step(zeros(wrapped))
+    assert dones.all()
+    # VecMonitor counts rows: every agent is an episode to it, also the one that ended early.
+    assert [info["episode"]["r"] for info in infos] == [60, 32] * 2
+    assert [info["episode"]["l"] for info in infos] == [3] * 4
+
+
+def test_toy_games_are_proper() -> None:
+    for env in (CounterEnv(), CounterEnv(3, deaths={1: 2}), ImageEnv(), DictEnv(), ReusingEnv()):
+        parallel_api_test(env, num_cycles=20)
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: UnequalEnv("observation"), "expected one observation space for all agents, got: agent_0 has Box("),
+        (lambda: UnequalEnv("observation"), "agent_1 has Box(0.0, 1.0, (5,), float32); make them equal with "
+         "supersuit.pad_observations_v0"),
+        (lambda: UnequalEnv("action"), "got: agent_0 has Discrete(4), agent_1 has Discrete(7); make them equal with "
+         "supersuit.pad_action_space_v0"),
+        (lambda: parallel_to_aec(CounterEnv()), "got a function that returned the AECEnv counter_v0; convert it with "
+         "pettingzoo.utils.conversions.aec_to_parallel"),
+        (parallel_to_aec(CounterEnv()), "expected a PettingZoo ParallelEnv, got the AECEnv counter_v0; convert it"),
+        (dict, "got a function that returned an object of type dict"),
+        ("counter", "got an object of type str"),
+        (UnpicklableEnv(), "pass a function that makes the environment instead"),
+        (LockedFactory(), "it holds something that cannot be pickled, let it create that"),
+        (toy_envs.same_env_again, "got one that returned the same object for 3 games"),
+    ],
+)  # fmt: skip
+def test_wrong_environment(bridge: Bridge, make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        bridge(make, n_games=3)
+
+
+def test_module_instead_of_environment(bridge: Bridge) -> None:
+    from pettingzoo.classic.rps import rps as module
+
+    with pytest.raises(ValueError, match=r"type module; pass pettingzoo.classic.rps.rps.parallel_env\(...\)"):
+        bridge(module, n_games=1)
+
+
+def test_padding_helps(bridge: Bridge) -> None:
+    venv = bridge(lambda: supersuit.pad_action_space_v0(UnequalEnv("action")), n_games=1)
+    assert venv.action_space == spaces.Discrete(7)
+
+
+class OddSpacesEnv(CounterEnv):
+    """Spaces are given."""
+
+    def __init__(self, observation_space: Any = None, action_space: Any = None):
+        super().__init__()
+        self._observation_space = observation_space or self._observation_space
+        self._action_space = action_space or self._action_space
+
+
+def test_spaces_that_do_not_fit_into_arrays(bridge: Bridge) -> None:
+    with pytest.raises(ValueError, match=r"expected an action space that is one of Discrete, .*, got Dict"):
+        bridge(lambda: OddSpacesEnv(action_space=spaces.Dict({"a": spaces.Discrete(2)})), n_games=1)
+    with pytest.raises(ValueError, match=r"expected an observation space that is one of .* or a Dict .*, got Dict\("):
+        bridge(lambda: OddSpacesEnv(spaces.Dict({"a": spaces.Text(3)})), n_games=1)
+
+
+@pytest.mark.parametrize("name", ["n_games", "n_cpus"])
+@pytest.mark.parametrize("value", [0, -1, 1.0, True, None])
+def test_wrong_counts(bridge: Bridge, name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be an integer, 1 or larger, got {value!r}"):
+        bridge(CounterEnv, **{"n_games": 1, name: value})
+
+
+def test_more_cpus_than_games(bridge: Bridge) -> None:
+    venv = bridge(CounterEnv, n_games=2, seed=0, n_cpus=8)
+    assert len(set(venv.get_attr("pid"))) == 2
+
+
+box = spaces.Box(-1.0, np.array([1.0, 0.7], np.float32), (2,), np.float32)
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize(
+    ("space", "actions", "message"),
+    [
+        (spaces.Discrete(4), [0, 1, 2], "expected actions from Discrete(4) for 4 rows, int64 of shape (4,), "
+         "got int64 of shape (3,)"),
+        (spaces.Discrete(4), [[0], [1], [2], [3]], "got int64 of shape (4, 1)"),
+        (spaces.Discrete(4), [0.0, 1.0, 2.0, 3.0], "got float64 of shape (4,)"),
+        (spaces.Discrete(4), [True] * 4, "got bool of shape (4,)"),
+        (spaces.Discrete(4), None, "got object of shape ()"),
+        (spaces.Discrete(4), [0, 0, 4, 0], "expected actions from Discrete(4), got 4 in row 2 (game 1, agent_0)"),
+        (spaces.Discrete(4), [0, 0, 0, -1], "got -1 in row 3 (game 1, agent_1)"),
+        (spaces.Discrete(2, start=5), [5, 6, 4, 5], "got 4 in row 2"),
+        (spaces.MultiDiscrete([2, 3]), [[0, 0], [0, 3], [0, 0], [0, 0]], "got [0 3] in row 1 (game 0, agent_1)"),
+        (spaces.MultiBinary(2), [[0, 0], [0, 1], [0, 0], [0, 2]], "got [0 2] in row 3"),
+        (box, np.zeros((4, 3)), "float32 of shape (4, 2), got float64 of shape (4, 3)"),
+        (box, [[0, 0], [0, 0], [0, 0], [0, 0.8]], "got [0.  0.8] in row 3"),
+        (box, [[0, 0], [np.nan, 0], [0, 0], [0, 0]], "in row 1"),
+        (box, [[1e300, 0], [0, 0], [0, 0], [0, 0]], "got [inf  0.] in row 0"),
+        (box, np.full((4, 2), "a"), "got <U1 of shape (4, 2)"),
+        (spaces.Box(0, 9, (1,), np.uint8), [[0], [256], [0], [0]], "got [256] in row 1"),
+    ],
+)  # fmt: skip
+def test_wrong_actions(bridge: Bridge, n_cpus: int, space: spaces.Space[Any], actions: Any, message: str) -> None:
+    venv = bridge(lambda: OddSpacesEnv(action_space=space), n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    with pytest.raises(ValueError, match=re.escape(message)):
+        venv.step(actions)
+    assert venv.get_attr("steps") == [0] * 4
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize(
+    ("space", "actions"),
+    [
+        (spaces.Discrete(2, start=5), [5, 6, 5, 6]),
+        (spaces.MultiDiscrete([2, 3]), [[1, 2], [0, 0], [0, 0], [0, 0]]),
+        (spaces.MultiBinary(2), np.ones((4, 2), bool)),
+        (box, [[1, 0.7], [-1, -1], [0, 0], [0, 0]]),  # 0.7 is above the bound before it is rounded like the bound
+    ],
+)
+def test_right_actions(bridge: Bridge, n_cpus: int, space: spaces.Space[Any], actions: Any) -> None:
+    venv = bridge(lambda: OddSpacesEnv(action_space=space), n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    venv.step(actions)
+    arrived = venv.get_attr("last_actions", indices=0)[0]
+    assert np.array_equal(np.stack(list(arrived.values())), np.asarray(actions[:2], space.dtype))
+    assert all(np.asarray(action).dtype == space.dtype for action in arrived.values())
+
+
+@one_and_two_cpus
+def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
+    with pytest.raises(RuntimeError, match=r"no episode has begun .* call reset\(\) before step\(\)"):
+        venv.step(zeros(venv))
+    venv.reset()
+    with pytest.raises(RuntimeError, match="no step has been started"):
+        venv.step_wait()
+    venv.step_async(zeros(venv))
+    for call in (lambda: venv.step_async(zeros(venv)), lambda: venv.get_attr("level")):
+        with pytest.raises(RuntimeError, match=r"a step is under way: call step_wait\(\) first"):
+            call()
+    observations = np.asarray(venv.reset())  # cancels the step
+    assert observations[:, 0].tolist() == [0] * 4
+    assert venv.step(zeros(venv))[1].tolist() == [10, 11] * 2
+    venv.close()
+    for closed_call in (lambda: venv.step_async(zeros(venv)), lambda: venv.get_attr("level"), venv.reset):
+        with pytest.raises(RuntimeError, match=r"the vector environment is closed \(it was closed\)"):
+            closed_call()
+
+
+# ---- games that break
+
+
+@one_and_two_cpus
+@pytest.mark.parametrize(
+    ("how", "error", "message"),
+    [
+        ("raise", ArithmeticError, "the game broke"),
+        ("exit", SystemExit, "3"),
+        ("shape", ValueError, r"observation of agent_0: expected float32 of shape \(3,\), got float32 of shape \(4,\)"),
+        ("dtype", ValueError, r"expected float32 of shape \(3,\), got <U1 of shape \(3,\)"),
+        ("info", TypeError, "the info of agent_0 cannot be copied .* leave out what cannot be pickled"),
+    ],
+)
+def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[BaseException], message: str) -> None:
+    """Its exception comes out, no other game is harmed, and a reset starts afresh."""
+    unlucky = game_seeds(0, 3)[1]
+    venv = bridge(lambda: FaultyEnv(how, unlucky), n_games=3, seed=0, n_cpus=n_cpus)
+    venv.reset()
+    venv.step(zeros(venv))
+    with pytest.raises(error, match=message):
+        venv.step(zeros(venv))
+    assert venv.get_attr("steps") == [2] * 6
+    with pytest.raises(RuntimeError, match=r"stopped by an error\): call reset\(\)"):
+        venv.step(zeros(venv))
+    venv.seed(1)
+    venv.reset()
+    for _ in range(3):
+        dones = venv.step(zeros(venv))[2]
+    assert dones.all()
+
+
+@one_and_two_cpus
+def test_reset_that_breaks(bridge: Bridge, n_cpus: int) -> None:
+    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    venv.set_options([{}, {}, {"fail": True}, {}])
+    with pytest.raises(LookupError, match="no such level"):
+        venv.reset()
+    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+        venv.step(zeros(venv))
+    venv.set_options({})
+    venv.reset()
+    venv.step(zeros(venv))
+
+
+@one_and_two_cpus
+def test_next_episode_that_breaks(bridge: Bridge, n_cpus: int) -> None:
+    class ShortLived(CounterEnv):
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            if self.episode == 1:
+                raise LookupError("only one episode here")
+            return super().reset(seed, options)
+
+    venv = bridge(ShortLived, n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    for _ in range(2):
+        venv.step(zeros(venv))
+    with pytest.raises(LookupError, match="only one episode here"):
+        venv.step(zeros(venv))
+    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+        venv.step(zeros(venv))
+
+
+@one_and_two_cpus
+def test_factory_that_breaks(bridge: Bridge, n_cpus: int) -> None:
+    home = os.getpid()
+    calls = 0
+
+    def make() -> CounterEnv:
+        nonlocal calls
+        calls += 1
+        if calls > 1 or os.getpid() != home:  # the first call is for the spaces
+            raise LookupError("cannot be built twice")
+        return CounterEnv()
+
+    with pytest.raises(LookupError, match="cannot be built twice"):
+        bridge(make, n_games=2, n_cpus=n_cpus)
+
+
+class LocalError(Exception):
+    """Cannot be made again from its args."""
+
+    def __init__(self, one: int, two: int):
+        super().__init__(f"{one} {two}")
+
+
+def test_exception_that_cannot_be_pickled(bridge: Bridge) -> None:
+    class Game(CounterEnv):
+        def step(self, actions: dict[str, Any]) -> Any:
+            raise LocalError(1, 2)
+
+    venv = bridge(Game, n_games=2, n_cpus=2)
+    venv.reset()
+    with pytest.raises(RuntimeError, match="LocalError: 1 2"):
+        venv.step(zeros(venv))
+    assert venv.get_attr("level") == [1] * 4
+    alone = bridge(Game, n_games=1)
+    alone.reset()
+    with pytest.raises(LocalError):
+        alone.step(zeros(alone))
+
+
+# ---- worker processes
+
+
+def workers(venv: SuperSuitVecEnv) -> list[int]:
+    return sorted(set(venv.get_attr("pid")))
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("when", ["asleep", "at work"])
+def test_worker_that_dies(bridge: Bridge, when: str) -> None:
+    venv = bridge(lambda: FaultyEnv("die" if when == "at work" else "none", game_seeds(0, 4)[2]), 4, seed=0, n_cpus=2)
+    venv.reset()
+    first, second = venv.get_attr("pid", indices=[0, 4])
+    venv.step(zeros(venv))
+    if when == "asleep":
+        os.kill(second, signal.SIGKILL)
+    code = -9 if when == "asleep" else 7
+    expected = rf"worker process 1 \(games 2 to 3, pid {second}\) ended with exit code {code}; .* make a new one"
+    start = time.monotonic()
+    with pytest.raises(RuntimeError, match=expected):
+        venv.step(zeros(venv))
+    assert time.monotonic() - start < 5
+    assert not is_running(first)
+    with pytest.raises(RuntimeError, match=r"is closed \(worker process 1 .* ended with exit code"):
+        venv.reset()
+    venv.close()
+
+
+@pytest.mark.timeout(60)
+def test_worker_that_dies_before_a_question(bridge: Bridge) -> None:
+    venv = bridge(CounterEnv, n_games=2, n_cpus=2)
+    os.kill(workers(venv)[0], signal.SIGKILL)
+    with pytest.raises(RuntimeError, match=r"worker process . .* ended with exit code -9"):
+        venv.get_attr("level")
+
+
+@pytest.mark.timeout(60)
+def test_worker_that_is_interrupted(bridge: Bridge) -> None:
+    venv = bridge(lambda: FaultyEnv("odd"), n_games=4, n_cpus=2)
+    pids = workers(venv)
+    venv.reset()
+    venv.step(zeros(venv))
+    with pytest.raises(OddError):
+        venv.step(zeros(venv))
+    assert not any(is_running(pid) for pid in pids)
+    with pytest.raises(RuntimeError, match=r"is closed \(it was interrupted"):
+        venv.reset()
+
+
+@one_and_two_cpus
+def test_close(bridge: Bridge, n_cpus: int, tmp_path: Path) -> None:
+    trace = tmp_path / "closed"
+    venv = bridge(lambda: TracingEnv(str(trace)), n_games=3, n_cpus=n_cpus)
+    venv.reset()
+    pids = [pid for pid in workers(venv) if pid != os.getpid()]
+    assert len(pids) == (0 if n_cpus == 1 else 2)
+    start = time.monotonic()
+    venv.close()
+    assert time.monotonic() - start < 5
+    assert not any(is_running(pid) for pid in pids)
+    assert trace.read_text() == "closed\n" * 3
+    venv.close()
+    assert trace.read_text() == "closed\n" * 3
+
+
+@one_and_two_cpus
+def test_close_during_a_step(bridge: Bridge, n_cpus: int, tmp_path: Path) -> None:
+    trace = tmp_path / "closed"
+    venv = bridge(lambda: TracingEnv(str(trace)), n_games=2, n_cpus=n_cpus)
+    venv.reset()
+    venv.step_async(zeros(venv))
+    venv.close()
+    assert trace.read_text() == "closed\n" * 2
+
+
+@one_and_two_cpus
+def test_close_that_breaks(bridge: Bridge, n_cpus: int, tmp_path: Path) -> None:
+    trace = tmp_path / "closed"
+
+    class Game(TracingEnv):
+        def close(self) -> None:
+            super().close()
+            if self.last_seed == game_seeds(0, 2)[0]:
+                raise LookupError("window is gone")
+
+    venv = bridge(lambda: Game(str(trace)), n_games=2, seed=0, n_cpus=n_cpus)
+    venv.reset()
+    pids = [pid for pid in workers(venv) if pid != os.getpid()]
+    with pytest.raises(LookupError, match="window is gone"):
+        venv.close()
+    assert trace.read_text() == "closed\n" * 2
+    assert not any(is_running(pid) for pid in pids)
+
+
+@pytest.mark.timeout(60)
+def test_close_when_a_worker_is_gone(bridge: Bridge, tmp_path: Path) -> None:
+    trace = tmp_path / "closed"
+    venv = bridge(lambda: TracingEnv(str(trace)), n_games=2, n_cpus=2)
+    venv.reset()
+    first, second = venv.get_attr("pid", indices=[0, 2])
+    os.kill(first, signal.SIGKILL)
+    start = time.monotonic()
+    venv.close()
+    assert time.monotonic() - start < 5
+    assert trace.read_text() == "closed\n"
+    assert not is_running(second)
+
+
+@pytest.mark.timeout(60)
+def test_close_when_a_game_hangs(bridge: Bridge, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Game(CounterEnv):
+        def close(self) -> None:
+            if self.episode:
+                time.sleep(100)
+
+    venv = bridge(Game, n_games=2, n_cpus=2)
+    venv.reset()
+    pids = workers(venv)
+    monkeypatch.setattr(supersuit_stack, "CLOSE_TIMEOUT", 0.3)
+    venv.close()
+    assert not any(is_running(pid) for pid in pids)
+
+
+def test_worker_processes_end_with_a_forgotten_venv() -> None:
+    venv = supersuit_vec_env(CounterEnv, n_games=2, n_cpus=2)
+    pids = workers(venv)
+    del venv
+    gc.collect()
+    assert not any(is_running(pid) for pid in pids)
+
+
+@one_and_two_cpus
+def test_game_that_can_only_be_closed_after_a_reset(bridge: Bridge, n_cpus: int) -> None:
+    class Game(CounterEnv):
+        def close(self) -> None:
+            assert self.episode
+
+    bridge(Game, n_games=2, n_cpus=n_cpus).reset()
+
+
+def test_the_users_own_environment_is_left_alone(bridge: Bridge) -> None:
+    env = CounterEnv()
+    venv = bridge(env, n_games=2)
+    venv.reset()
+    venv.step(zeros(venv))
+    venv.close()
+    assert (env.episode, env.closed) == (0, False)
+
+
+def test_every_game_that_was_made_is_closed(bridge: Bridge) -> None:
+    """SuperSuit makes spare copies and drops them; none of them may hold a game."""
+    toy_envs.MADE.clear()
+    bridge(toy_envs.recorded_env, n_games=3).close()
+    assert [env.closed for env in toy_envs.MADE] == [True] * 4  # one was made for the spaces
+
+
+SCRIPT = """
+import sys
+sys.path.insert(0, {root!r})
+from tests.toy_envs import TracingEnv
+
+def stock(make, n_games, n_cpus):
+    import supersuit
+    flat = supersuit.pettingzoo_env_to_vec_env_v1(make())
+    return supersuit.concat_vec_envs_v1(flat, n_games, num_cpus=n_cpus)
+
+if __name__ == "__main__":
+    from {module} import {function} as make_venv
+    venv = make_venv(lambda: TracingEnv({trace!r}), 2, n_cpus=2)
+    venv.reset()
+    keep = [venv]
+    keep.append(keep)
+    print("end of script", flush=True)
+"""
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(
+    ("module", "function", "ends"),
+    [("__main__", "stock", False), ("hecogrid_envs.supersuit_bridge", "supersuit_vec_env", True)],
+    ids=["stock", "ours"],
+)
+def test_script_that_forgets_to_close(tmp_path: Path, module: str, function: str, ends: bool) -> None:
+    """The stock stack hangs at the interpreter's exit, waiting for workers that nobody told to end."""
+    trace = tmp_path / "closed"
+    root = str(Path(__file__).parents[1])
+    (tmp_path / "script.py").write_text(SCRIPT.format(root=root, module=module, function=function, trace=str(trace)))
+    process = subprocess.Popen([sys.executable, str(tmp_path / "script.py")], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "end of script\n"
+    try:
+        if ends:
+            assert process.wait(30) == 0
+            assert trace.read_text() == "closed\n" * 2
+        else:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(3)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_game_imports_neither_sb3_nor_torch() -> None:
+    code = "import sys, hecogrid_envs; assert not {'torch', 'stable_baselines3', 'supersuit'} & set(sys.modules)"
+    root = str(Path(__file__).parents[1])
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=root)
+
+
+def test_a_blueprint_survives_pickling() -> None:
+    """Where processes are spawned, not forked, SuperSuit's games travel there pickled."""
+    from hecogrid_envs.supersuit_game import Blueprint, Game
+
+    game = pickle.loads(pickle.dumps(Game(Blueprint.of(CounterEnv(3)))))
+    assert game.possible_agents == ["agent_0", "agent_1", "agent_2"]
+    assert isinstance(game.env, CounterEnv)

@@ -1,0 +1,359 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_saf.common.buffers import TeamRolloutBuffer
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.monitor import TeamMonitor
+from tests.team_venv import VECTOR, Array, TeamVenv
+
+N_STEPS, N_GAMES, N_AGENTS = 5, 4, 3
+SPACES: dict[str, tuple[spaces.Space[Any], Callable[..., Any]]] = {
+    "vector": (VECTOR, lambda e, i, k, t: np.array([e, i, k, t], dtype=np.float32)),
+    "tiles": (
+        spaces.Box(0, 99, (2, 2), np.uint8),
+        lambda e, i, k, t: np.array([[e, i], [k, t]], dtype=np.uint8),
+    ),
+    "discrete": (spaces.Discrete(400), lambda e, i, k, t: 100 * e + 30 * i + 10 * k + t),
+    "multi_discrete": (spaces.MultiDiscrete([9, 9, 9, 9]), lambda e, i, k, t: np.array([e, i, k, t])),
+}
+
+
+def make_env(name: str = "vector", lengths: tuple[int, ...] = (3, 2, 4, 7), **kwargs: Any) -> CentralizedValueWrapper:
+    own_space, see = SPACES[name]
+    return CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths, N_AGENTS, own_space, see, **kwargs)))
+
+
+def fill(buffers: list[Any], env: CentralizedValueWrapper, seed: int = 0, n_steps: int = N_STEPS) -> None:
+    """Play, and put the same data with made-up values into all buffers."""
+    rng = np.random.default_rng(seed)
+    obs = env.reset()
+    starts = np.ones(env.num_envs, dtype=bool)
+    for _ in range(n_steps):
+        actions = rng.integers(0, 5, size=env.num_envs)
+        values, log_probs = th.tensor(rng.normal(size=(2, env.num_envs)), dtype=th.float32)
+        new_obs, rewards, dones, _ = env.step(actions)
+        for buffer in buffers:
+            buffer.add(dict(obs), actions.reshape(-1, 1), rewards, starts, values.unsqueeze(1), log_probs)
+        assert isinstance(new_obs, dict)
+        obs, starts = new_obs, dones
+    last_values = th.tensor(rng.normal(size=(env.num_envs, 1)), dtype=th.float32)
+    for buffer in buffers:
+        buffer.compute_returns_and_advantage(last_values, starts)
+
+
+def make_buffer(env: CentralizedValueWrapper, kind: type[DictRolloutBuffer] = TeamRolloutBuffer, **kwargs: Any) -> Any:
+    settings = {"device": "cpu", "gae_lambda": 0.9, "gamma": 0.97, "n_envs": env.num_envs, **kwargs}
+    assert isinstance(env.observation_space, spaces.Dict)
+    return kind(N_STEPS, env.observation_space, env.action_space, **settings)
+
+
+def make_both(name: str) -> tuple[Any, Any]:
+    env = make_env(name)
+    team, stock = make_buffer(env), make_buffer(env, DictRolloutBuffer)
+    fill([team, stock], env)
+    return team, stock
+
+
+def rows_of(samples: list[DictRolloutBufferSamples]) -> list[tuple[Any, ...]]:
+    """All rows, in an order of their own."""
+    rows = []
+    for sample in samples:
+        parts = [*(sample.observations[key] for key in ("obs", "team", "agent")), *sample[1:]]
+        rows += list(zip(*(part.tolist() for part in parts), strict=True))
+    return sorted(rows)
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_rows_and_advantages_are_those_of_sb3s_buffer_to_the_last_bit(name: str) -> None:
+    team, stock = make_both(name)
+    for part in ("advantages", "returns", "values", "log_probs", "rewards", "episode_starts"):
+        np.testing.assert_array_equal(getattr(team, part), getattr(stock, part))
+    samples, stock_samples = list(team.get(6)), list(stock.get(6))
+    assert rows_of(samples) == rows_of(stock_samples)
+    for part, stock_part in zip(samples[0][1:], stock_samples[0][1:], strict=True):
+        assert (part.shape, part.dtype) == (stock_part.shape, stock_part.dtype)
+    for key, stock_value in stock_samples[0].observations.items():
+        value = samples[0].observations[key]
+        assert (value.shape, value.dtype) == (stock_value.shape, stock_value.dtype), key
+
+
+def test_advantages_agree_with_a_loop_of_our_own() -> None:
+    env = make_env()
+    team = make_buffer(env)
+    fill([team], env)
+    rng = np.random.default_rng(0)
+    values = np.zeros((N_STEPS + 1, env.num_envs))
+    for step in range(N_STEPS):
+        rng.integers(0, 5, size=env.num_envs)
+        values[step] = rng.normal(size=(2, env.num_envs))[0]
+    values[N_STEPS] = rng.normal(size=(env.num_envs, 1))[:, 0]
+    for row in range(env.num_envs):
+        game, agent = divmod(row, N_AGENTS)
+        length, advantage = (3, 2, 4, 7)[game], 0.0
+        for step in reversed(range(N_STEPS)):
+            goes_on = (step + 1) % length != 0
+            reward = 100 * game + 10 * agent + step % length + 1
+            error = reward + 0.97 * values[step + 1, row] * goes_on - values[step, row]
+            advantage = error + 0.97 * 0.9 * goes_on * advantage
+            assert team.advantages[step, row] == pytest.approx(advantage, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("batch_size", "sizes"), [(3, [3] * 20), (12, [12] * 5), (21, [21, 21, 18]), (None, [60]), (90, [60])]
+)
+def test_minibatches_hold_whole_teams(batch_size: int | None, sizes: list[int]) -> None:
+    team, _ = make_both("vector")
+    samples = list(team.get(batch_size))
+    assert [len(sample.actions) for sample in samples] == sizes
+    for sample in samples:
+        obs = {key: value.numpy() for key, value in sample.observations.items()}
+        own = obs["obs"].reshape(-1, N_AGENTS, 4)
+        assert obs["agent"].reshape(-1, N_AGENTS).tolist() == [[0, 1, 2]] * len(own)
+        assert own[:, :, 1].tolist() == [[0, 1, 2]] * len(own)
+        for column in (0, 2, 3):
+            assert (own[:, :, column] == own[:, :1, column]).all(), "agents of one game at one step"
+        np.testing.assert_array_equal(
+            obs["team"].reshape(-1, N_AGENTS, N_AGENTS, 4), np.repeat(own[:, None], N_AGENTS, 1)
+        )
+
+
+def test_sb3s_buffer_splits_teams() -> None:
+    """The failing baseline: of 20 team steps in minibatches of 12 rows, hardly one stays together."""
+    _, stock = make_both("vector")
+    np.random.seed(0)  # noqa: NPY002
+    together = 0
+    for sample in stock.get(12):
+        obs = sample.observations["obs"].numpy()
+        together += sum(count == N_AGENTS for count in np.unique(obs[:, [0, 2, 3]], axis=0, return_counts=True)[1])
+    assert together < 5
+
+
+def test_order_is_drawn_anew_from_the_generator_that_sb3_seeds() -> None:
+    team, _ = make_both("vector")
+
+    def order() -> list[list[float]]:
+        return [sample.old_values.tolist() for sample in team.get(6)]
+
+    np.random.seed(3)  # noqa: NPY002
+    first, second = order(), order()
+    assert first != second
+    assert sorted(map(tuple, first)) != sorted(map(tuple, second))
+    np.random.seed(3)  # noqa: NPY002
+    assert [order(), order()] == [first, second]
+    np.random.seed(4)  # noqa: NPY002
+    assert order() != first
+
+
+def test_memory_is_one_observation_per_row_and_32_bytes() -> None:
+    own = spaces.Box(0, 99, (7, 7), np.uint8)
+    parts = CentralizedValueWrapper(TeamVenv((9,) * 4, 10, own, lambda *_: np.zeros((7, 7)))).observation_space
+    team = TeamRolloutBuffer(50, parts, spaces.Discrete(7), "cpu", n_envs=40)  # type: ignore[arg-type]
+    assert team.nbytes == 50 * 40 * (49 + 32)
+    assert list(team.observations) == ["obs"]
+    stock = DictRolloutBuffer(50, parts, spaces.Discrete(7), "cpu", n_envs=40)  # type: ignore[arg-type]
+    stock_bytes = sum(value.nbytes for value in stock.observations.values()) + 50 * 40 * 32
+    assert stock_bytes == 50 * 40 * 579
+
+
+def test_arrays_are_reused_and_hold_the_new_rollout() -> None:
+    env = make_env()
+    team, fresh = make_buffer(env), make_buffer(env)
+    fill([team], env, seed=1)
+    kept = {name: getattr(team, name) for name in ("actions", "rewards", "values", "log_probs", "advantages")}
+    observations = team.observations["obs"]
+    list(team.get(6))
+    team.reset()
+    assert (team.pos, team.full, team.generator_ready) == (0, False, False)
+    fill([team, fresh], env, seed=2)
+    assert all(getattr(team, name) is array for name, array in kept.items())
+    assert team.observations["obs"] is observations
+    assert rows_of(list(team.get())) == rows_of(list(fresh.get()))
+
+
+def test_samples_are_copies() -> None:
+    team, _ = make_both("tiles")
+    sample = next(team.get())
+    before = team.values.copy(), team.observations["obs"].copy(), team.actions.copy()
+    sample.old_values.zero_()
+    sample.actions.zero_()
+    for value in sample.observations.values():
+        value.zero_()
+    for kept, now in zip(before, (team.values, team.observations["obs"], team.actions), strict=True):
+        np.testing.assert_array_equal(kept, now)
+
+
+def a_step(env: CentralizedValueWrapper) -> tuple[dict[str, Array], tuple[Any, ...]]:
+    rest = (np.zeros((env.num_envs, 1)), np.zeros(env.num_envs), np.zeros(env.num_envs), th.zeros(env.num_envs))
+    return env.reset(), (*rest, th.zeros(env.num_envs))
+
+
+def swap_rows(obs: dict[str, Array]) -> None:
+    for value in obs.values():
+        value[[0, 1]] = value[[1, 0]]
+
+
+def shift_rows(obs: dict[str, Array]) -> None:
+    for key, value in obs.items():
+        obs[key] = np.roll(value, 1, axis=0)
+
+
+def swap_games(obs: dict[str, Array]) -> None:
+    obs["team"][:3], obs["team"][3:6] = obs["team"][3:6].copy(), obs["team"][:3].copy()
+
+
+def other_units(obs: dict[str, Array]) -> None:
+    obs["team"] *= 2
+
+
+def reorder_team(obs: dict[str, Array]) -> None:
+    obs["team"][3:6] = obs["team"][3:6, [1, 0, 2]]
+
+
+def larger_team(obs: dict[str, Array]) -> None:
+    obs["team"] = np.concatenate([obs["team"], obs["team"][:, :1]], axis=1)
+
+
+def fewer_rows(obs: dict[str, Array]) -> None:
+    for key in obs:
+        obs[key] = obs[key][:-1]
+
+
+def other_dtype(obs: dict[str, Array]) -> None:
+    obs["obs"] = obs["obs"].astype(np.complex64)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            swap_rows,
+            r"expected rows game-major, then agent, with 'agent' 0 to 2 in each team, got \[1, 0, 2, 0, 1, 2\] ...; no "
+            r"wrapper above CentralizedValueWrapper may reorder rows",
+        ),
+        (shift_rows, r"with 'agent' 0 to 2 in each team, got \[2, 0, 1, 2, 0, 1\] ...;"),
+        (
+            swap_games,
+            "expected 'team' to hold the 'obs' of the team's own rows, but they differ for agent 0 of game 0; change "
+            "or normalise observations below CentralizedValueWrapper only",
+        ),
+        (other_units, "they differ for agent 0 of game 0"),
+        (reorder_team, "they differ for agent 0 of game 1"),
+        (
+            larger_team,
+            r"expected 'obs' of shape \(12, 4\) and dtype float32 and 'team' of shape \(12, 3, 4\), got \(12, 4\) and "
+            r"float32, and \(12, 4, 4\); fill the buffer from the environment that it was made for",
+        ),
+        (fewer_rows, r"got \(11, 4\) and float32, and \(11, 3, 4\)"),
+        (other_dtype, r"got \(12, 4\) and complex64, and \(12, 3, 4\)"),
+    ],
+)
+def test_rows_that_are_no_whole_teams_are_refused(spoil: Callable[[dict[str, Array]], None], message: str) -> None:
+    env = make_env()
+    obs, rest = a_step(env)
+    spoil(obs)
+    with pytest.raises(ValueError, match=message):
+        make_buffer(env).add(obs, *rest)
+
+
+@pytest.mark.parametrize("agent", range(N_AGENTS))
+def test_a_wrong_view_of_any_one_row_is_found_within_n_steps(agent: int) -> None:
+    env = make_env()
+    buffer = make_buffer(env)
+    obs, rest = a_step(env)
+    obs["team"][3 + agent] += 1
+    for _ in range(agent):
+        buffer.add(obs, *rest)
+    with pytest.raises(ValueError, match=f"they differ for agent {agent} of game 1"):
+        buffer.add(obs, *rest)
+
+
+@pytest.mark.parametrize(
+    ("batch_size", "choices"), [(64, "63 or 66"), (1, "3"), (2, "3"), (5, "3 or 6"), (0, "3"), (-3, "3")]
+)
+def test_batch_size_must_be_whole_teams(batch_size: int, choices: str) -> None:
+    team, _ = make_both("vector")
+    with pytest.raises(
+        ValueError,
+        match=r"batch_size counts rows and must be a multiple of n_agents=3, because TeamRolloutBuffer gives whole "
+        rf"teams, got {batch_size}; use batch_size={choices}$",
+    ):
+        next(team.get(batch_size))
+
+
+def test_what_cannot_be_buffered() -> None:
+    env = make_env()
+    with pytest.raises(
+        ValueError,
+        match=r"expected rows of whole teams, a multiple of n_agents=3, got 11 rows .* give the buffer the rows",
+    ):
+        make_buffer(env, n_envs=11)
+    with pytest.raises(ValueError, match="expected the Dict observation space of CentralizedValueWrapper"):
+        TeamRolloutBuffer(5, VECTOR, env.action_space)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a full rollout of 5 steps, got 0; add the rest first"):
+        next(make_buffer(env).get())
+
+
+def make_model(algorithm: Any = PPO, buffer: Any = TeamRolloutBuffer, env: Any = None, **kwargs: Any) -> Any:
+    if algorithm is PPO:
+        kwargs = {"batch_size": 30, "n_epochs": 2, **kwargs}
+    env = env or make_env()
+    return algorithm(
+        "MultiInputPolicy", env, n_steps=N_STEPS, seed=5, device="cpu", rollout_buffer_class=buffer, **kwargs
+    )
+
+
+def weights(model: Any) -> dict[str, list[Any]]:
+    return {name: value.tolist() for name, value in model.policy.state_dict().items()}
+
+
+def test_ppo_trains_saves_loads_and_goes_on(tmp_path: Path) -> None:
+    model = make_model().learn(120)
+    assert isinstance(model.rollout_buffer, TeamRolloutBuffer)
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model", env=make_env(), device="cpu")
+    assert isinstance(loaded.rollout_buffer, TeamRolloutBuffer)
+    assert weights(loaded) == weights(model)
+    loaded.learn(60, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 180
+    assert weights(loaded) != weights(model)
+
+
+def test_two_runs_with_one_seed_end_with_equal_weights() -> None:
+    assert weights(make_model().learn(120)) == weights(make_model().learn(120))
+
+
+def test_a_whole_rollout_as_one_minibatch_teaches_what_sb3s_buffer_teaches() -> None:
+    models = [make_model(buffer=buffer, batch_size=60).learn(60) for buffer in (TeamRolloutBuffer, DictRolloutBuffer)]
+    for value, stock in zip(*(model.policy.parameters() for model in models), strict=True):
+        th.testing.assert_close(value, stock, rtol=1e-4, atol=1e-5)
+
+
+def test_a2c_and_normalised_rewards() -> None:
+    make_model(A2C).learn(120)
+    make_model(env=VecNormalize(make_env(), norm_obs=False)).learn(120)
+
+
+def test_observations_normalised_above_the_wrapper_are_refused() -> None:
+    model = make_model(env=VecNormalize(make_env(), norm_obs_keys=["obs", "team"]))
+    with pytest.raises(ValueError, match="change or normalise observations below CentralizedValueWrapper"):
+        model.learn(60)
+    make_model(env=CentralizedValueWrapper(VecNormalize(make_env().venv))).learn(60)
+
+
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of 64")
+def test_default_batch_size_of_ppo_says_what_to_use() -> None:
+    model = make_model(batch_size=64, env=make_env(lengths=(3, 2, 4, 7) * 2))
+    with pytest.raises(ValueError, match="use batch_size=63 or 66"):
+        model.learn(60)

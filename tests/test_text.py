@@ -1,0 +1,223 @@
+"""Text: golden pages, and what is printed can be read back."""
+
+from __future__ import annotations
+
+import re
+from textwrap import dedent
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hecogrid_envs import text
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.state import check_state
+from hecogrid_envs.text import LEGEND, parse_level, render_text
+
+State = dict[str, npt.NDArray[Any]]
+
+
+def make_state() -> State:
+    walls = np.zeros((7, 4), dtype=bool)
+    walls[[0, -1]] = walls[:, [0, -1]] = True
+    treasures = np.zeros((7, 4), dtype=np.uint8)
+    treasures[1, 1], treasures[2, 1], treasures[4, 2] = 1, 2, 1
+    keys = np.zeros((7, 4), dtype=bool)
+    keys[3, 1] = True
+    return {
+        "walls": walls,
+        "treasures": treasures,
+        "keys": keys,
+        "agent_pos": np.array([(4, 2), (2, 2), (1, 2), (2, 2), (5, 1)]),
+        "agent_dir": np.array([3, 0, 1, 2, 2]),
+        "agent_has_key": np.array([False, False, False, True, True]),
+    }
+
+
+PAGE = f"""\
+step 3  collected 1
+0000111
+#######
+#$_k.W#
+#v2.^.#
+#######
+agents 0^4,2$ 1>2,2 2v1,2 3W2,2 4W5,1
+{LEGEND}"""
+
+
+def assert_equal_states(got: Any, expected: Any) -> None:
+    assert set(got) == set(expected)
+    for name, array in expected.items():
+        np.testing.assert_array_equal(got[name], array, err_msg=name)
+        assert got[name].dtype == array.dtype, name
+
+
+# --- writing
+
+
+def test_page() -> None:
+    assert render_text(make_state(), zones=[0, 0, 0, 0, 1, 1, 1], step=3, collected=1) == PAGE
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    lines = PAGE.splitlines()
+    assert render_text(make_state(), legend=False).splitlines() == lines[2:-1]
+    assert render_text(make_state(), step=0, legend=False).splitlines() == ["step 0", *lines[2:-1]]
+
+
+def test_every_direction_with_and_without_key() -> None:
+    state = make_state()
+    state["agent_pos"] = np.array([(x, y) for y in (1, 2) for x in (1, 2, 3, 4)])
+    state["agent_dir"] = np.array([0, 1, 2, 3] * 2)
+    state["agent_has_key"] = np.array([False] * 4 + [True] * 4)
+    rows = render_text(state).splitlines()
+    assert rows[1:3] == ["#>v<^.#", "#ESWN.#"]
+
+
+@pytest.mark.parametrize(("number", "character"), [(1, "v"), (2, "2"), (9, "9"), (10, "+"), (40, "+")])
+def test_crowds_are_counted(number: int, character: str) -> None:
+    state = make_state()
+    state["agent_pos"] = np.array([(5, 2)] * number)
+    state["agent_dir"] = np.ones(number, dtype=int)
+    state["agent_has_key"] = np.zeros(number, dtype=bool)
+    assert render_text(state).splitlines()[2] == f"#...${character}#"
+
+
+def test_many_agents_fill_several_lines() -> None:
+    state = make_state()
+    state["agent_pos"] = np.array([(5, 2)] * 50)
+    state["agent_dir"] = np.zeros(50, dtype=int)
+    state["agent_has_key"] = np.zeros(50, dtype=bool)
+    lines = [line for line in render_text(state).splitlines() if line.startswith("agents")]
+    assert len(lines) == 4
+    assert max(map(len, lines)) <= 100
+    assert len(parse_level(render_text(state))["agent_dir"]) == 50
+
+
+def test_zones_beyond_nine_are_letters() -> None:
+    assert render_text(make_state(), zones=[9, 10, 35, 36, 0, 0, 0]).splitlines()[0] == "9az0000"
+
+
+def test_colours_add_nothing_but_escapes() -> None:
+    zones = [0, 0, 0, 0, 1, 1, 1]
+    painted = render_text(make_state(), zones=zones, step=3, collected=1, colour=True)
+    assert re.sub(r"\x1b\[[0-9;]*m", "", painted) == PAGE
+
+
+def test_zones_and_things_have_colours_of_their_own() -> None:
+    plain = render_text(make_state(), zones=[0] * 7, colour=True).splitlines()
+    split = render_text(make_state(), zones=[0, 0, 0, 0, 1, 1, 1], colour=True).splitlines()
+    # The bottom wall is one run of one colour in one zone, two in two.
+    assert plain[4].count("\x1b[38") == 1
+    assert split[4].count("\x1b[38") == 2
+    # Wall, treasure, collected, key, floor, carrier, wall: all differ from their neighbours.
+    assert plain[2].count("\x1b[38") == 7
+    assert "38;2;255;0;189" in plain[2]
+
+
+# --- reading
+
+
+def test_page_is_read_back() -> None:
+    expected = make_state()
+    expected["agent_pos"] = expected["agent_pos"].astype(np.int64)
+    assert_equal_states(parse_level(PAGE), expected)
+
+
+@st.composite
+def states(draw: st.DrawFn) -> State:
+    width, height = draw(st.integers(3, 9)), draw(st.integers(3, 9))
+    inner = width * height
+    # 0 floor, 1 treasure, 2 collected, 3 key, 4 wall
+    cells = np.array(draw(st.lists(st.integers(0, 4), min_size=inner, max_size=inner))).reshape(width, height)
+    cells[[0, -1]] = cells[:, [0, -1]] = 4
+    cells[1, 1] = draw(st.integers(0, 2))
+    free = np.argwhere(cells <= 2).tolist()
+    n = draw(st.integers(0, 12))
+    return {
+        "walls": cells == 4,
+        "treasures": np.where(cells <= 2, cells, 0).astype(np.uint8),
+        "keys": cells == 3,
+        "agent_pos": np.array([draw(st.sampled_from(free)) for _ in range(n)], dtype=np.int64).reshape(-1, 2),
+        "agent_dir": np.array([draw(st.integers(0, 3)) for _ in range(n)], dtype=np.int64),
+        "agent_has_key": np.array([draw(st.booleans()) for _ in range(n)], dtype=bool),
+    }
+
+
+@settings(deadline=None)
+@given(states(), st.booleans(), st.booleans())
+def test_every_state_is_read_back(state: State, colour: bool, heading: bool) -> None:
+    zones = np.arange(len(state["walls"])) if heading else None
+    page = render_text(state, zones=zones, step=7 if heading else None, collected=2 if heading else None, colour=colour)
+    assert_equal_states(parse_level(page), state)
+
+
+def test_drawn_level() -> None:
+    state = parse_level(
+        """
+        #####
+        #$ ^#
+        #k._#
+        #E.v#
+        #####
+        """
+    )
+    assert np.argwhere(state["walls"][1:-1, 1:-1]).size == 0
+    assert np.argwhere(state["treasures"] == 1).tolist() == [[1, 1]]
+    assert np.argwhere(state["treasures"] == 2).tolist() == [[3, 2]]
+    assert np.argwhere(state["keys"]).tolist() == [[1, 2]]
+    # Agents in reading order: north at (3, 1), east with a key at (1, 3), south at (3, 3).
+    assert state["agent_pos"].tolist() == [[3, 1], [1, 3], [3, 3]]
+    assert state["agent_dir"].tolist() == [3, 0, 1]
+    assert state["agent_has_key"].tolist() == [False, True, False]
+    params = HECOGridParams(n_agents=3, grid_size=5, n_treasures=2, n_keys=1)
+    assert_equal_states(check_state(state, params), state)
+
+
+def test_agents_line_may_stand_alone() -> None:
+    state = parse_level("####\n#$.#\n#..#\n####\nagents 1<2,2\nagents 0N1,1")
+    assert state["agent_pos"].tolist() == [[1, 1], [2, 2]]
+    assert state["agent_dir"].tolist() == [3, 2]
+    assert state["agent_has_key"].tolist() == [True, False]
+    assert state["treasures"][1, 1] == 1
+
+
+ROOM = "####\n#>.#\n#..#\n####\n"
+WRONG = [
+    ("", "the text holds no map: its rows begin with '#'"),
+    ("step 3\nagents 0>1,1", "the text holds no map: its rows begin with '#'"),
+    ("####\n#.#\n####", "all rows of the map must be 4 long as the first is, row 1 is 3"),
+    ("####\n#?.#\n####", f"cell (1, 1) holds '?', which means nothing ({LEGEND})"),
+    (
+        "####\n#.2#\n####",
+        "several agents share cell (2, 1); add a line that lists all, such as 'agents 0>2,1'",
+    ),
+    (ROOM + "hello", "line 'hello' is no row of the map (they begin with '#'), and no 'agents' line either"),
+    (ROOM + "\n####", "line '####' is no row of the map (they begin with '#'), and no 'agents' line either"),
+    (
+        ROOM + "agents 0x1,1",
+        "agent '0x1,1' cannot be read; write index, direction, x,y, ground, such as 0>2,1 or 3N4,5$",
+    ),
+    (ROOM + "agents 0>1,1 0>1,1", "agent 0 is listed twice"),
+    (ROOM + "agents 0>1,1 2>1,1", "agents must be numbered from 0 to 1, got [0, 2]"),
+    (ROOM + "agents 0>1,4", "agent 0 stands at (1, 4), beyond the map of 4 x 4"),
+    (ROOM + "agents 0>2,2", "the map shows an agent at (1, 1), the 'agents' line does not"),
+]
+
+
+@pytest.mark.parametrize(("level", "message"), WRONG)
+def test_wrong_levels(level: str, message: str) -> None:
+    with pytest.raises(ValueError) as error:  # noqa: PT011 (the whole message is compared)
+        parse_level(level)
+    assert str(error.value) == message
+
+
+def test_the_page_in_the_documentation_is_real() -> None:
+    doc = text.__doc__
+    assert doc is not None
+    page = dedent(doc.split("::\n\n")[1]).rstrip()
+    zones = [int(digit) for digit in page.splitlines()[1]]
+    assert render_text(parse_level(page), zones=zones, step=3, collected=1) == page

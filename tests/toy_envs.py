@@ -1,0 +1,345 @@
+"""Tiny PettingZoo games whose every number is known, for tests of whatever carries games."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+
+
+class CounterEnv(ParallelEnv[str, Any, Any]):
+    """
+    Counts its steps.
+
+    - Observation of agent ``i``: ``[step, i, draw]``, the draw from the game's own generator (made in ``reset``).
+    - Reward of agent ``i``: ``10 * step + i + action``, the step counted after it was taken.
+    - Infos: ``{"step": step}``; reset infos ``{"episode": number, "options": options}``.
+    - End: all agents truncated after ``max_cycles`` steps; an agent in ``deaths`` is terminated at the step given.
+
+    :param n_agents: N
+    :param max_cycles: steps per episode
+    :param deaths: agent's index to the step at which it is terminated
+    :param cuts: agent's index to the step at which it is truncated
+    :param render_mode: None or "rgb_array"
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "counter_v0",
+        "render_modes": ["rgb_array"],
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        n_agents: int = 2,
+        max_cycles: int = 3,
+        deaths: Mapping[int, int] | None = None,
+        cuts: Mapping[int, int] | None = None,
+        render_mode: str | None = None,
+    ):
+        self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
+        self.agents: list[str] = []
+        self.max_cycles = max_cycles
+        self.deaths = dict(deaths or {})
+        self.cuts = dict(cuts or {})
+        self.render_mode = render_mode
+        self.level = 1
+        self.pokes = 0
+        self.episode = 0
+        self.last_seed: int | None = None
+        self.last_actions: dict[str, Any] = {}
+        self.closed = False
+        self._rng: np.random.Generator | None = None
+        self._observation_space: spaces.Space[Any] = self._make_observation_space()
+        self._action_space: spaces.Space[Any] = self._make_action_space()
+
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        return spaces.Box(0.0, np.inf, (3,), np.float32)
+
+    def _make_action_space(self) -> spaces.Space[Any]:
+        return spaces.Discrete(4)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return self._observation_space
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return self._action_space
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        if options and options.get("fail"):
+            raise LookupError("no such level")
+        if seed is not None or self._rng is None:
+            self._rng = np.random.default_rng(seed)
+            self.last_seed = seed
+        self.agents = self.possible_agents[:]
+        self.steps = 0
+        self.episode += 1
+        infos: dict[str, dict[str, Any]] = {a: {"episode": self.episode, "options": options} for a in self.agents}
+        return self._observe(), infos
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        assert set(actions) == set(self.agents), (actions, self.agents)
+        self.last_actions = dict(actions)
+        self.steps += 1
+        acted = self.agents
+        observations = self._observe()
+        rewards = {a: 10.0 * self.steps + self._index(a) + float(np.sum(actions[a])) for a in acted}
+        terminations = {a: self.deaths.get(self._index(a)) == self.steps for a in acted}
+        truncations = {a: self.cuts.get(self._index(a), self.max_cycles) == self.steps for a in acted}
+        infos = {a: {"step": self.steps} for a in acted}
+        self.agents = [a for a in acted if not (terminations[a] or truncations[a])]
+        return observations, rewards, terminations, truncations, infos
+
+    def _index(self, agent: str) -> int:
+        return self.possible_agents.index(agent)
+
+    def _observe(self) -> dict[str, Any]:
+        assert self._rng is not None
+        draws = self._rng.random(len(self.possible_agents), dtype=np.float32)
+        return {a: self._observation(self._index(a), draws[self._index(a)]) for a in self.agents}
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        return np.array([self.steps, index, draw], np.float32)
+
+    def render(self) -> npt.NDArray[np.uint8]:
+        return np.full((4, 6, 3), self.steps, np.uint8)
+
+    def close(self) -> None:
+        self.closed = True
+
+    # What callers reach through get_attr, env_method, ...
+
+    def poke(self, amount: int = 1) -> int:
+        self.pokes += amount
+        return self.pokes
+
+    def fail(self) -> None:
+        raise LookupError("this method always fails")
+
+    def apply(self, function: Callable[[int], Any]) -> Any:
+        return function(self.level)
+
+    def action_masks(self) -> dict[str, npt.NDArray[np.bool_]]:
+        """Agent ``i`` may do ``i`` only."""
+        return {a: np.arange(4) == self._index(a) for a in self.agents}
+
+    @property
+    def pid(self) -> int:
+        return os.getpid()
+
+
+class ImageEnv(CounterEnv):
+    """The same with pictures that hold the draw in every pixel."""
+
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        return spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        return np.full((8, 8, 3), int(draw * 255), np.uint8)
+
+
+class DictEnv(CounterEnv):
+    """The same with a dict observation and continuous actions."""
+
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        return spaces.Dict(
+            {"numbers": spaces.Box(0.0, np.inf, (2,), np.float32), "step": spaces.Discrete(100)},
+        )
+
+    def _make_action_space(self) -> spaces.Space[Any]:
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        return {"numbers": np.array([index, draw], np.float32), "step": self.steps}
+
+
+class EagerEnv(CounterEnv):
+    """Bad on purpose: has its generator before the first reset, so copies of it play the same game."""
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(**kwargs)
+        self._rng = np.random.default_rng()
+
+
+class ReusingEnv(CounterEnv):
+    """Allowed, but dangerous to share: returns the same arrays and the same infos at every step."""
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(**kwargs)
+        self._arrays = {i: np.zeros(3, np.float32) for i in range(len(self.possible_agents))}
+        self._info: dict[str, Any] = {}
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        self._arrays[index][:] = self.steps, index, draw
+        return self._arrays[index]
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        *rest, infos = super().step(actions)
+        self._info["steps"] = [self.steps]
+        return (*rest, dict.fromkeys(infos, self._info))
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        observations, _ = super().reset(seed, options)
+        self._info["steps"] = []
+        return observations, dict.fromkeys(self.agents, self._info)
+
+
+class UnequalEnv(CounterEnv):
+    """Agents differ in their observation space, or in their action space."""
+
+    def __init__(self, kind: str, **kwargs: Any):
+        self.kind = kind
+        super().__init__(**kwargs)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        if self.kind == "observation" and agent == "agent_1":
+            return spaces.Box(0.0, 1.0, (5,), np.float32)
+        return self._observation_space
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        if self.kind == "action" and agent == "agent_1":
+            return spaces.Discrete(7)
+        return self._action_space
+
+
+class BareEnv(ParallelEnv[str, Any, Any]):
+    """As little as a ParallelEnv may have: no ``metadata``, no ``render_mode``; ended agents stay in ``agents``."""
+
+    def __init__(self) -> None:
+        self.possible_agents = ["left", "right"]
+        self.agents = ["left", "right"]
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Discrete(10)
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.MultiDiscrete([2, 3])
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.steps = 0
+        return dict.fromkeys(self.agents, 0), {}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        self.steps += 1
+        terminations = {"left": self.steps >= 2, "right": self.steps >= 3}
+        steps = dict.fromkeys(self.agents, self.steps)
+        return steps, dict.fromkeys(self.agents, 1.0), terminations, dict.fromkeys(self.agents, False), {}
+
+
+class LateEnv(CounterEnv):
+    """Agent 1 joins with the observation after the first step."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        observations, infos = super().reset(seed, options)
+        self.agents = ["agent_0"]
+        return {"agent_0": observations["agent_0"]}, {"agent_0": infos["agent_0"]}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        observations, *rest = super().step(actions)
+        if self.steps == 1:
+            self.agents = self.possible_agents[:]
+            observations = self._observe()
+        return (observations, *rest)
+
+
+class OddError(BaseException):
+    """Not an Exception."""
+
+
+class FaultyEnv(CounterEnv):
+    """
+    Goes wrong at the second step if its generator was given the chosen seed.
+
+    :param seed: of the game that goes wrong, None for all games
+    :param how: "raise", "exit", "die" (the process is gone at once), "shape", "dtype" (of the observation),
+        "info" (one that cannot be copied), "odd" (an exception that is none of Exception's)
+    """
+
+    def __init__(self, how: str, seed: int | None = None, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.how = how
+        self.unlucky_seed = seed
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        observations, *rest, infos = super().step(actions)
+        if self.steps == 2 and self.unlucky_seed in (None, self.last_seed):
+            if self.how == "raise":
+                raise ArithmeticError("the game broke")
+            if self.how == "exit":
+                raise SystemExit(3)
+            if self.how == "die":
+                os._exit(7)
+            if self.how == "shape":
+                observations = dict.fromkeys(observations, np.zeros(4, np.float32))
+            if self.how == "dtype":
+                observations = dict.fromkeys(observations, np.array(["a", "b", "c"]))
+            if self.how == "info":
+                infos = {agent: {"lock": threading.Lock()} for agent in infos}
+            if self.how == "odd":
+                raise OddError
+        return (observations, *rest, infos)
+
+
+class UnpicklableEnv(CounterEnv):
+    """Holds a lock."""
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.lock = threading.Lock()
+
+
+class TracingEnv(CounterEnv):
+    """Appends a line to a file when it is closed, so that a test can see it across processes."""
+
+    def __init__(self, path: str, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.path = path
+
+    def close(self) -> None:
+        if self.episode:  # the example from which the spaces are read never plays
+            with open(self.path, "a") as file:
+                file.write("closed\n")
+
+
+class OuterWrapper(BaseParallelWrapper[str, Any, Any]):
+    """A wrapper with an attribute of its own."""
+
+    def __init__(self, env: ParallelEnv[str, Any, Any]):
+        super().__init__(env)
+        self.colour = "red"
+
+
+class LockedFactory:
+    """Cannot be pickled itself."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+    def __call__(self) -> CounterEnv:
+        return CounterEnv()
+
+
+MADE: list[CounterEnv] = []
+
+
+def recorded_env() -> CounterEnv:
+    """Keep what was made in ``MADE``."""
+    MADE.append(CounterEnv())
+    return MADE[-1]
+
+
+SINGLETON = CounterEnv()
+
+
+def same_env_again() -> CounterEnv:
+    """A factory that is none."""
+    return SINGLETON
