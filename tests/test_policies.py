@@ -306,6 +306,24 @@ def test_critics_parameters_are_those_with_value_in_their_name(
         assert (parameter.grad is None) == ("value" in name), name
 
 
+@pytest.mark.parametrize("policy_class", POLICIES)
+def test_actor_and_critic_both_train_the_encoder(policy_class: type[TeamActorCriticPolicy]) -> None:
+    policy, obs = make_policy(policy_class), team_rows(VECTOR)
+    values, log_prob, _ = policy.evaluate_actions(obs, th.zeros(12).long())
+    for output in (values, log_prob, policy.predict_values(obs)):
+        policy.zero_grad()
+        output.sum().backward(retain_graph=True)
+        for name, parameter in policy.features_extractor.named_parameters():
+            assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_all_that_is_saved_is_trained(policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any]) -> None:
+    policy = make_policy(policy_class, CodeSpace(), **kwargs)
+    trained = {name for name, p in policy.named_parameters(remove_duplicate=False) if p.requires_grad}
+    assert set(policy.state_dict()) == trained
+
+
 # --- spaces and arguments ---------------------------------------------------------------------------------------------
 
 

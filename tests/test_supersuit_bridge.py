@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import pickle
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -719,9 +719,15 @@ def test_sb3_wrappers_on_top(bridge: Bridge, n_cpus: int) -> None:
     assert [info["episode"]["l"] for info in infos] == [3] * 4
 
 
-def test_toy_games_are_proper() -> None:
-    for env in (CounterEnv(), CounterEnv(3, deaths={1: 2}), ImageEnv(), DictEnv(), ReusingEnv()):
-        parallel_api_test(env, num_cycles=20)
+@pytest.mark.parametrize(
+    "env", [CounterEnv(), CounterEnv(3, deaths={1: 2}), ImageEnv(), DictEnv(), ReusingEnv(), EagerEnv()]
+)
+def test_toy_games_are_proper(env: CounterEnv) -> None:
+    parallel_api_test(env, num_cycles=20)
+    observations, _ = env.reset(seed=0)
+    while env.agents:
+        assert all(env.observation_space(agent).contains(seen) for agent, seen in observations.items())
+        observations, *_ = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 
 
 # ---- bad input
@@ -760,6 +766,15 @@ def test_module_instead_of_environment(bridge: Bridge) -> None:
 def test_padding_helps(bridge: Bridge) -> None:
     venv = bridge(lambda: supersuit.pad_action_space_v0(UnequalEnv("action")), n_games=1)
     assert venv.action_space == spaces.Discrete(7)
+
+
+@one_and_two_cpus
+def test_equal_spaces_need_not_be_the_same_object(bridge: Bridge, n_cpus: int) -> None:
+    class Game(CounterEnv):
+        def observation_space(self, agent: str) -> spaces.Space[Any]:
+            return self._make_observation_space()
+
+    bridge(Game, n_games=2, n_cpus=n_cpus).reset()
 
 
 class OddSpacesEnv(CounterEnv):
@@ -831,6 +846,7 @@ def test_wrong_actions(bridge: Bridge, n_cpus: int, space: spaces.Space[Any], ac
         (spaces.Discrete(2, start=5), [5, 6, 5, 6]),
         (spaces.MultiDiscrete([2, 3]), [[1, 2], [0, 0], [0, 0], [0, 0]]),
         (spaces.MultiBinary(2), np.ones((4, 2), bool)),
+        (spaces.Box(0, 9, (1,), np.uint8), [[0], [9], [1], [2]]),
         (box, [[1, 0.7], [-1, -1], [0, 0], [0, 0]]),  # 0.7 is above the bound before it is rounded like the bound
     ],
 )
@@ -974,6 +990,13 @@ def workers(venv: SuperSuitVecEnv) -> list[int]:
     return sorted(set(venv.get_attr("pid")))
 
 
+def kill(pid: int) -> None:
+    """Kill a worker process, and wait until it is gone."""
+    process = next(child for child in multiprocessing.active_children() if child.pid == pid)
+    process.kill()
+    process.join()
+
+
 def is_running(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -990,7 +1013,7 @@ def test_worker_that_dies(bridge: Bridge, when: str) -> None:
     first, second = venv.get_attr("pid", indices=[0, 4])
     venv.step(zeros(venv))
     if when == "asleep":
-        os.kill(second, signal.SIGKILL)
+        kill(second)
     code = -9 if when == "asleep" else 7
     expected = rf"worker process 1 \(games 2 to 3, pid {second}\) ended with exit code {code}; .* make a new one"
     start = time.monotonic()
@@ -1006,7 +1029,7 @@ def test_worker_that_dies(bridge: Bridge, when: str) -> None:
 @pytest.mark.timeout(60)
 def test_worker_that_dies_before_a_question(bridge: Bridge) -> None:
     venv = bridge(CounterEnv, n_games=2, n_cpus=2)
-    os.kill(workers(venv)[0], signal.SIGKILL)
+    kill(workers(venv)[0])
     with pytest.raises(RuntimeError, match=r"worker process . .* ended with exit code -9"):
         venv.get_attr("level")
 
@@ -1051,7 +1074,8 @@ def test_close_during_a_step(bridge: Bridge, n_cpus: int, tmp_path: Path) -> Non
 
 
 @one_and_two_cpus
-def test_close_that_breaks(bridge: Bridge, n_cpus: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("stepping", [False, True])
+def test_close_that_breaks(bridge: Bridge, n_cpus: int, stepping: bool, tmp_path: Path) -> None:
     trace = tmp_path / "closed"
 
     class Game(TracingEnv):
@@ -1063,6 +1087,8 @@ def test_close_that_breaks(bridge: Bridge, n_cpus: int, tmp_path: Path) -> None:
     venv = bridge(lambda: Game(str(trace)), n_games=2, seed=0, n_cpus=n_cpus)
     venv.reset()
     pids = [pid for pid in workers(venv) if pid != os.getpid()]
+    if stepping:
+        venv.step_async(zeros(venv))
     with pytest.raises(LookupError, match="window is gone"):
         venv.close()
     assert trace.read_text() == "closed\n" * 2
@@ -1075,7 +1101,7 @@ def test_close_when_a_worker_is_gone(bridge: Bridge, tmp_path: Path) -> None:
     venv = bridge(lambda: TracingEnv(str(trace)), n_games=2, n_cpus=2)
     venv.reset()
     first, second = venv.get_attr("pid", indices=[0, 2])
-    os.kill(first, signal.SIGKILL)
+    kill(first)
     start = time.monotonic()
     venv.close()
     assert time.monotonic() - start < 5
