@@ -46,7 +46,7 @@ class GameBatch:
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)
         atlases = turned_atlases(self.task, params.rules, params.view_tile_size)
-        self._atlas = atlases.reshape(-1)
+        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(_SLACK, dtype=np.uint8)])
         self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
         self._book = _rule_book(self.task, params)
         self._games = _empty_games(self._book, self.n_games)

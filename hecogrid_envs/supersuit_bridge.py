@@ -21,17 +21,8 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 
 from hecogrid_envs.seeding import game_seeds
-from hecogrid_envs.supersuit_game import (
-    FAILED_STEP,
-    REPLY,
-    RESET_INFOS,
-    STEP_INFO,
-    Blueprint,
-    Game,
-    Info,
-    Letter,
-    MakeEnv,
-)
+from hecogrid_envs.supersuit_blueprint import Blueprint, MakeEnv
+from hecogrid_envs.supersuit_game import FAILED_STEP, REPLY, RESET_INFOS, STEP_INFO, Game, Info, Letter
 from hecogrid_envs.supersuit_stack import build_stack, no_reply
 
 
@@ -149,8 +140,7 @@ class SuperSuitVecEnv(VecEnv):
         self._check_free()
         if not self._begun:
             raise RuntimeError("no episode has begun (or one was stopped by an error): call reset() before step()")
-        checked = self._checked_actions(actions)
-        self._stack.step_async(checked)
+        self._stack.step_async(_checked_actions(self.action_space, self.possible_agents, self.n_games, actions))
         self._stepping = True
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -185,30 +175,6 @@ class SuperSuitVecEnv(VecEnv):
         except BaseException:
             self._begun = False
             raise
-
-    def _checked_actions(self, actions: npt.ArrayLike) -> npt.NDArray[Any]:
-        space = self.action_space
-        array = np.asarray(actions)
-        shape = (self.num_envs, *cast(tuple[int, ...], space.shape))
-        dtype = np.dtype(space.dtype)
-        kinds = {"f": "fiu", "b": "biu"}.get(dtype.kind, "biu" if isinstance(space, spaces.MultiBinary) else "iu")
-        if array.shape != shape or array.dtype.kind not in kinds:
-            raise ValueError(
-                f"expected actions from {space} for {self.num_envs} rows, {dtype} of shape {shape}, "
-                f"got {array.dtype} of shape {array.shape}"
-            )
-        if dtype.kind == "f":  # bounds are rounded to the dtype, so actions must be before they are compared
-            with np.errstate(over="ignore"):
-                array = array.astype(dtype, copy=False)
-        low, high = _bounds(space)
-        outside = np.argwhere(~((array >= low) & (array <= high)))
-        if len(outside):
-            row = int(outside[0, 0])
-            agent = self.possible_agents[row % self.n_agents]
-            raise ValueError(
-                f"expected actions from {space}, got {array[row]} in row {row} (game {row // self.n_agents}, {agent})"
-            )
-        return array.astype(dtype, copy=False)
 
     def close(self) -> None:
         """Close all games and end the worker processes; a second time does nothing."""
@@ -377,6 +343,31 @@ def _checked_indices(kind: str, indices: Iterable[int], n: int) -> list[int]:
         if not -n <= index < n:
             raise ValueError(f"there is no {kind} {index}: expected 0 to {n - 1}")
     return [index % n for index in listed]
+
+
+def _checked_actions(
+    space: spaces.Space[Any], agents: Sequence[Any], n_games: int, actions: npt.ArrayLike
+) -> npt.NDArray[Any]:
+    """Bring the actions of all rows into the dtype of their space, or say what is wrong with them."""
+    array = np.asarray(actions)
+    shape = (n_games * len(agents), *cast(tuple[int, ...], space.shape))
+    dtype = np.dtype(space.dtype)
+    kinds = "fiu" if dtype.kind == "f" else "biu" if isinstance(space, spaces.MultiBinary) else "iu"
+    if array.shape != shape or array.dtype.kind not in kinds:
+        raise ValueError(
+            f"expected actions from {space} for {shape[0]} rows, {dtype} of shape {shape}, "
+            f"got {array.dtype} of shape {array.shape}"
+        )
+    if dtype.kind == "f":  # bounds are rounded to the dtype, so actions must be before they are compared
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype, copy=False)
+    low, high = _bounds(space)
+    outside = np.argwhere(~((array >= low) & (array <= high)))
+    if len(outside):
+        row = int(outside[0, 0])
+        game, agent = divmod(row, len(agents))
+        raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
+    return array.astype(dtype, copy=False)
 
 
 def _bounds(space: spaces.Space[Any]) -> tuple[Any, Any]:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import os
 import pickle
 import traceback
-from collections.abc import Callable, Container, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Container, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
-import cloudpickle
 import numpy as np
 from gymnasium import spaces
-from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo import ParallelEnv
+
+from hecogrid_envs.supersuit_blueprint import AnyParallelEnv, Blueprint, blank, dumps, fitted
 
 #: Key of the letters, in the options of a reset on its way down.
 LETTERS = "supersuit_bridge/letters"
@@ -24,8 +23,6 @@ STEP_INFO = "supersuit_bridge/step_info"
 RESET_INFOS = "supersuit_bridge/reset_infos"
 FAILED_STEP = "supersuit_bridge/failed_step"
 
-AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
-MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
 #: Something to do with a game.
 Letter: TypeAlias = "Callable[[Game], Any]"
 Info: TypeAlias = "dict[str, Any]"
@@ -33,7 +30,6 @@ Info: TypeAlias = "dict[str, Any]"
 #: Info of an agent that does not take part: it has ended before its team, or not joined yet.
 INACTIVE: Info = {"active": False}
 
-_FIXED_SHAPE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
 _UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
 _MISSING = object()
 
@@ -59,180 +55,6 @@ class Failure(NamedTuple):
             except Exception:
                 error = RuntimeError(f"{type(error).__name__}: {error}")
         return cls(error, trace)
-
-
-@dataclass(frozen=True)
-class Blueprint:
-    """
-    What it takes to build a game anywhere, and what is known of it before it is built.
-
-    :param parcel: the environment, or the function that makes it, pickled
-    :param is_factory: whether the parcel holds the function
-    :param agents: N names, in the order of the rows
-    :param observation_space: of every agent
-    :param action_space: of every agent
-    :param metadata: of the environment
-    :param render_mode: of the environment
-    """
-
-    parcel: bytes
-    is_factory: bool
-    agents: tuple[Any, ...]
-    observation_space: spaces.Space[Any]
-    action_space: spaces.Space[Any]
-    metadata: dict[str, Any]
-    render_mode: str | None
-
-    @classmethod
-    def of(cls, make_env: MakeEnv) -> Blueprint:
-        """
-        Draw the blueprint of an environment.
-
-        :param make_env: an environment, or a function that makes one
-        :raises ValueError: if it is no ParallelEnv, cannot be copied, or its agents differ in their spaces
-        """
-        is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
-        example: Any = make_env() if is_factory else make_env
-        _check_is_parallel(example, is_factory)
-        try:
-            agents = tuple(example.possible_agents)
-            return cls(
-                _pickled(make_env, is_factory),
-                is_factory,
-                agents,
-                _checked_space("observation", agents, example.observation_space),
-                _checked_space("action", agents, example.action_space),
-                metadata=dict(getattr(example, "metadata", None) or {}),
-                render_mode=getattr(example, "render_mode", None),
-            )
-        finally:
-            if is_factory:
-                # Games may rely on having been reset before they are closed; this one has only been looked at.
-                with suppress(Exception):
-                    example.close()
-
-    def build(self) -> AnyParallelEnv:
-        """Build a game."""
-        content = pickle.loads(self.parcel)
-        env: AnyParallelEnv = content() if self.is_factory else content
-        return env
-
-
-def _check_is_parallel(env: Any, is_factory: bool) -> None:
-    origin = "a function that returned " if is_factory else ""
-    if isinstance(env, AECEnv):
-        raise ValueError(
-            f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
-            "convert it with pettingzoo.utils.conversions.aec_to_parallel"
-        )
-    if not isinstance(env, ParallelEnv):
-        hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""
-        raise ValueError(
-            "expected a PettingZoo ParallelEnv or a function that makes one, "
-            f"got {origin}an object of type {type(env).__name__}{hint}"
-        )
-    if not getattr(env, "possible_agents", None):
-        raise ValueError(f"expected {env} to list its agents in possible_agents (each gets a row), got none")
-
-
-def _checked_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], spaces.Space[Any]]) -> spaces.Space[Any]:
-    """The one space of all agents."""
-    space_by_agent = {agent: space_of(agent) for agent in agents}
-    first = space_by_agent[agents[0]]
-    others = [f"{agent} has {space}" for agent, space in space_by_agent.items() if space != first]
-    if others:
-        repair = "pad_observations_v0" if kind == "observation" else "pad_action_space_v0"
-        raise ValueError(
-            f"expected one {kind} space for all agents, got: {agents[0]} has {first}, {', '.join(others)}; "
-            f"make them equal with supersuit.{repair}"
-        )
-    parts = _leaves(first) if kind == "observation" else [first]
-    if not all(isinstance(part, _FIXED_SHAPE) for part in parts):
-        names = ", ".join(part.__name__ for part in _FIXED_SHAPE)
-        containers = ", or a Dict or Tuple of those" if kind == "observation" else ""
-        raise ValueError(f"expected an {kind} space that is one of {names}{containers}, got {first}")
-    return first
-
-
-def _leaves(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
-    if isinstance(space, spaces.Dict):
-        return [leaf for part in space.spaces.values() for leaf in _leaves(part)]
-    if isinstance(space, spaces.Tuple):
-        return [leaf for part in space.spaces for leaf in _leaves(part)]
-    return [space]
-
-
-def dumps(content: Any) -> bytes:
-    """
-    Pickle, also what only cloudpickle can.
-
-    :param content: anything; what is defined in an importable module stays what it is on the other side
-    """
-    try:
-        return pickle.dumps(content)
-    except Exception:  # pickle, and the objects it asks, have many ways to decline
-        return bytes(cloudpickle.dumps(content))
-
-
-def _pickled(make_env: MakeEnv, is_factory: bool) -> bytes:
-    try:
-        return dumps(make_env)
-    except Exception as error:
-        advice = (
-            "it holds something that cannot be pickled, let it create that itself"
-            if is_factory
-            else "pass a function that makes the environment instead"
-        )
-        raise ValueError(
-            f"each game needs its own copy of {make_env}, but pickling it failed ({error}); {advice}"
-        ) from error
-
-
-def blank(space: spaces.Space[Any]) -> Any:
-    """
-    Build an observation of zeros.
-
-    :param space: observation space of one agent
-    """
-    if isinstance(space, spaces.Dict):
-        return {key: blank(part) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(blank(part) for part in space.spaces)
-    assert space.shape is not None
-    return np.zeros(space.shape, space.dtype)
-
-
-def fitted(space: spaces.Space[Any], observation: Any, owner: str) -> Any:
-    """
-    Bring an observation into the shape and dtype of its space.
-
-    What does not fit would otherwise stop SuperSuit somewhere inside NumPy, and a worker process for good.
-
-    :param space: observation space of one agent
-    :param observation: the agent's observation
-    :param owner: the agent, for the message
-    :raises ValueError: if it does not fit
-    """
-    if isinstance(space, spaces.Dict):
-        if not isinstance(observation, Mapping) or set(observation) != set(space.spaces):
-            got = list(observation) if isinstance(observation, Mapping) else type(observation).__name__
-            raise ValueError(f"observation of {owner}: expected a dict with {list(space.spaces)}, got {got}")
-        return {key: fitted(part, observation[key], f"{owner}, {key!r}") for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        if not isinstance(observation, (tuple, list)) or len(observation) != len(space.spaces):
-            raise ValueError(f"observation of {owner}: expected {len(space.spaces)} parts, got {observation!r}")
-        parts = zip(space.spaces, observation, strict=True)
-        return tuple(fitted(part, value, f"{owner}, part {i}") for i, (part, value) in enumerate(parts))
-    if type(observation) is np.ndarray and observation.dtype == space.dtype and observation.shape == space.shape:
-        return observation
-    assert space.dtype is not None
-    array = np.asarray(observation)
-    if array.shape != space.shape or not np.can_cast(array.dtype, space.dtype, "same_kind"):
-        raise ValueError(
-            f"observation of {owner}: expected {space.dtype} of shape {space.shape}, "
-            f"got {array.dtype} of shape {array.shape}"
-        )
-    return array.astype(space.dtype, copy=False)
 
 
 class Game(ParallelEnv[Any, Any, Any]):

@@ -29,7 +29,9 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormali
 
 from hecogrid_envs import supersuit_stack
 from hecogrid_envs.seeding import game_seeds
+from hecogrid_envs.supersuit_blueprint import Blueprint
 from hecogrid_envs.supersuit_bridge import SuperSuitVecEnv, supersuit_vec_env
+from hecogrid_envs.supersuit_game import Game
 from tests import toy_envs
 from tests.toy_envs import (
     BareEnv,
@@ -757,6 +759,7 @@ def test_wrong_environment(bridge: Bridge, make: Any, message: str) -> None:
 
 
 def test_module_instead_of_environment(bridge: Bridge) -> None:
+    pytest.importorskip("pygame")
     from pettingzoo.classic.rps import rps as module
 
     with pytest.raises(ValueError, match=r"type module; pass pettingzoo.classic.rps.rps.parallel_env\(...\)"):
@@ -1211,8 +1214,6 @@ def test_the_game_imports_neither_sb3_nor_torch() -> None:
 
 def test_a_blueprint_survives_pickling() -> None:
     """Where processes are spawned, not forked, SuperSuit's games travel there pickled."""
-    from hecogrid_envs.supersuit_game import Blueprint, Game
-
     game = pickle.loads(pickle.dumps(Game(Blueprint.of(CounterEnv(3)))))
     assert game.possible_agents == ["agent_0", "agent_1", "agent_2"]
     assert isinstance(game.env, CounterEnv)

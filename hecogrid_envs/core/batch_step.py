@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from hecogrid_envs.core.generation import new_level
+from hecogrid_envs.core.jit import hot, inlined, kernel
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.rules import act
 from hecogrid_envs.core.types import U8, Games, RuleBook
 
 
-@njit(cache=True, nogil=True)
+@hot
 def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int) -> None:
     """
     Play one step of games ``first`` to ``last - 1``.
@@ -28,7 +27,7 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int)
         games.steps[e] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def reset_games(games: Games, book: RuleBook, which: U8, first: int, last: int) -> None:
     """
     Give new levels to the games that ``which`` marks.
@@ -40,7 +39,7 @@ def reset_games(games: Games, book: RuleBook, which: U8, first: int, last: int) 
             new_level(games, book, e)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _shuffle_order(games: Games, book: RuleBook, e: int) -> None:
     for agent in range(book.n_agents):
         games.order[e, agent] = agent

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hecogrid_envs.constants import Terrain
+from hecogrid_envs.core.jit import inlined, kernel
 from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.types import Games, RuleBook
@@ -16,7 +16,7 @@ _TREASURE = int(Terrain.TREASURE)
 _KEY = int(Terrain.KEY)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def new_level(games: Games, book: RuleBook, e: int) -> None:
     """Reset game ``e`` to a random level."""
     clear(games, book, e)
@@ -28,7 +28,7 @@ def new_level(games: Games, book: RuleBook, e: int) -> None:
     draw_level(games, book, e)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clear(games: Games, book: RuleBook, e: int) -> None:
     """Empty map inside the outer wall, counters at zero."""
     width = book.width
@@ -47,7 +47,7 @@ def clear(games: Games, book: RuleBook, e: int) -> None:
     games.paid[e] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place_objects(games: Games, book: RuleBook, e: int) -> None:
     inside = book.width - 2
     n_cells = inside * inside
@@ -65,7 +65,7 @@ def _place_objects(games: Games, book: RuleBook, e: int) -> None:
         games.terrain[e, (cell // inside + 1) * book.width + cell % inside + 1] = terrain
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _place_agent(games: Games, book: RuleBook, e: int, agent: int) -> None:
     inside = book.width - 2
     while True:
@@ -79,7 +79,7 @@ def _place_agent(games: Games, book: RuleBook, e: int, agent: int) -> None:
     arrive(games, e, agent, y * book.width + x)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw_level(games: Games, book: RuleBook, e: int) -> None:
     """Derive everything that views need from terrain and agents, at the start of an episode."""
     planes, bits = e * 4 * book.plane_bytes, e * 4 * book.bits_bytes
@@ -98,7 +98,7 @@ def draw_level(games: Games, book: RuleBook, e: int) -> None:
                     set_wall_bits(games, book, e, x, y)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def present_colour(games: Games, book: RuleBook, e: int, agent: int) -> int:
     """Palette index of an agent by its present zone and key."""
     if games.has_key[e, agent]:

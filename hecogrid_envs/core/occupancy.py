@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from hecogrid_envs.constants import AGENT_PALETTE, Terrain
+from hecogrid_envs.core.jit import inlined
 from hecogrid_envs.core.types import Games, RuleBook
 from hecogrid_envs.tiles import FIRST_AGENT, FIRST_KEY, FIRST_TERRAIN
 
@@ -14,7 +13,7 @@ _COLLECTED = int(Terrain.COLLECTED)
 _KEY = int(Terrain.KEY)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def arrive(games: Games, e: int, agent: int, cell: int) -> None:
     """Put an agent last in the order of arrival of a cell."""
     last = games.tail[e, cell]
@@ -28,7 +27,7 @@ def arrive(games: Games, e: int, agent: int, cell: int) -> None:
     games.crowd[e, cell] += 1
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def leave(games: Games, e: int, agent: int, cell: int) -> None:
     """Take an agent out of its cell; if it was first, the next becomes first."""
     previous, following = games.before[e, agent], games.after[e, agent]
@@ -43,7 +42,7 @@ def leave(games: Games, e: int, agent: int, cell: int) -> None:
     games.crowd[e, cell] -= 1
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def count_around(games: Games, book: RuleBook, e: int, x: int, y: int) -> int:
     """Agents within ``support_radius`` (Chebyshev) of a cell."""
     radius, width = book.support_radius, book.width
@@ -59,7 +58,7 @@ def count_around(games: Games, book: RuleBook, e: int, x: int, y: int) -> int:
     return total
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def agent_code(ground: int, colour: int, direction: int) -> int:
     """Tile code of an agent; ``ground`` is the terrain it stands on."""
     layer = 0
@@ -70,41 +69,40 @@ def agent_code(ground: int, colour: int, direction: int) -> int:
     return FIRST_AGENT + (layer * _N_COLOURS + colour) * 4 + direction
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def plane_offset(book: RuleBook, facing: int, x: int, y: int) -> int:
     """
     Where a cell lies in the plane that is turned for a viewer facing ``facing``.
 
-    In each plane the viewer looks towards smaller rows and its right is towards larger columns.
+    In each plane the viewer looks towards smaller rows and its right is towards larger columns, so opposite directions
+    read the same plane from opposite ends.
     """
-    last = book.stride - 1
     px, py = x + book.pad, y + book.pad
-    if facing == 0:
-        return (last - px) * book.stride + py
-    if facing == 1:
-        return (last - py) * book.stride + last - px
-    if facing == 2:
-        return px * book.stride + last - py
-    return py * book.stride + px
+    upright = py * book.stride + px if facing & 1 else px * book.stride + book.stride - 1 - py
+    return upright if facing >= 2 else book.stride * book.stride - 1 - upright
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def redraw_cell(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
     """Write a cell's present tile code into the four planes."""
     cell = y * book.width + x
     ground = games.terrain[e, cell]
     first = games.head[e, cell]
+    # Code of the cell as seen facing north, and by how much it turns for the other directions: a quarter each.
+    low = FIRST_TERRAIN + ground
+    turn, step = 0, 0
+    if first >= 0:
+        low, turn, step = agent_code(ground, games.colour[e, first], 0), games.direction[e, first] + 3, -1
+    elif ground == _KEY:
+        low, turn, step = FIRST_KEY, 1, 1
+    plane = e * 4 * book.plane_bytes
     for facing in range(4):
-        if first >= 0:
-            code = agent_code(ground, games.colour[e, first], (games.direction[e, first] - facing + 3) & 3)
-        elif ground == _KEY:
-            code = FIRST_KEY + ((facing + 1) & 3)
-        else:
-            code = FIRST_TERRAIN + ground
-        games.planes[(e * 4 + facing) * book.plane_bytes + plane_offset(book, facing, x, y)] = code
+        code = low + ((turn + step * facing) & 3)
+        games.planes[plane + plane_offset(book, facing, x, y)] = code
+        plane += book.plane_bytes
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def set_wall_bits(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
     """Mark a cell as opaque in the four orientations."""
     for facing in range(4):

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from hecogrid_envs.core.jit import inlined
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -16,7 +17,7 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def next_word(rng: npt.NDArray[np.uint64], game: int) -> np.uint64:
     """Advance a game's generator and return 64 random bits."""
     state = rng[game] + _GAMMA
@@ -26,7 +27,7 @@ def next_word(rng: npt.NDArray[np.uint64], game: int) -> np.uint64:
     return word ^ (word >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def below(rng: npt.NDArray[np.uint64], game: int, n: int) -> int:
     """Draw an integer from 0 to n - 1, every one equally likely (Lemire 2019); n < 2**32."""
     bound = np.uint64(n)

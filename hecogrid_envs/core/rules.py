@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from hecogrid_envs.constants import Command, Terrain
 from hecogrid_envs.core.generation import present_colour
+from hecogrid_envs.core.jit import inlined
 from hecogrid_envs.core.occupancy import arrive, count_around, leave, redraw_cell
 from hecogrid_envs.core.types import Games, RuleBook
 
@@ -26,7 +25,7 @@ _TEAM_SUPPORT = 1
 _KEY_FOR_TREASURE = 2
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def act(games: Games, book: RuleBook, e: int, agent: int, action: int) -> None:
     """Let one agent act; it sees the effects of those who acted before it."""
     command = book.command_of[book.zone_of_column[games.x[e, agent]], action]
@@ -48,7 +47,7 @@ def act(games: Games, book: RuleBook, e: int, agent: int, action: int) -> None:
     redraw_cell(games, book, e, games.x[e, agent], games.y[e, agent])
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _front(games: Games, e: int, agent: int) -> tuple[int, int]:
     """Cell in front of an agent; agents are never on the outer wall, so it exists."""
     direction = games.direction[e, agent]
@@ -57,7 +56,7 @@ def _front(games: Games, e: int, agent: int) -> tuple[int, int]:
     return games.x[e, agent] + dx, games.y[e, agent] + dy
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _forward(games: Games, book: RuleBook, e: int, agent: int) -> None:
     front_x, front_y = _front(games, e, agent)
     front = front_y * book.width + front_x
@@ -75,7 +74,7 @@ def _forward(games: Games, book: RuleBook, e: int, agent: int) -> None:
         _try_to_collect(games, book, e, agent, x, y)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _pick_up(games: Games, book: RuleBook, e: int, agent: int) -> None:
     x, y = games.x[e, agent], games.y[e, agent]
     if games.terrain[e, y * book.width + x] == _TREASURE:
@@ -88,7 +87,7 @@ def _pick_up(games: Games, book: RuleBook, e: int, agent: int) -> None:
         redraw_cell(games, book, e, front_x, front_y)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _drop(games: Games, book: RuleBook, e: int, agent: int) -> None:
     front_x, front_y = _front(games, e, agent)
     front = front_y * book.width + front_x
@@ -99,7 +98,7 @@ def _drop(games: Games, book: RuleBook, e: int, agent: int) -> None:
         redraw_cell(games, book, e, front_x, front_y)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _try_to_collect(games: Games, book: RuleBook, e: int, agent: int, old_x: int, old_y: int) -> None:
     """Collect the treasure under an agent if the task's condition holds; (old_x, old_y) is where its action began."""
     if book.task == _KEY_FOR_TREASURE and not games.has_key[e, agent]:
@@ -116,7 +115,7 @@ def _try_to_collect(games: Games, book: RuleBook, e: int, agent: int, old_x: int
         games.paid[e] += 1
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _supporters_before(games: Games, book: RuleBook, e: int, agent: int, old_x: int, old_y: int) -> int:
     """Agents around the cell where the action began, at that moment: the others have not moved since."""
     radius = book.support_radius

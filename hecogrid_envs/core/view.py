@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hecogrid_envs.core.jit import hot, inlined
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
 from hecogrid_envs.core.types import U8, Games, RuleBook
-from hecogrid_envs.core.words import load_word, store_word
+from hecogrid_envs.core.words import copy_16, load_word, store_word
 
 _ONE = np.uint64(1)
 _BYTE = np.uint64(255)
 _WORD_BYTES = 8
+_CHUNK_BYTES = 16
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def view_corner(games: Games, book: RuleBook, e: int, agent: int) -> int:
     """Offset of the top left cell of an agent's view in the plane turned for it."""
     here = plane_offset(book, games.direction[e, agent], games.x[e, agent], games.y[e, agent])
     return here - (book.view_size - 1 - book.view_offset) * book.stride - book.view_size // 2
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _spread_right(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
     """Cells that light reaches from ``seen`` towards larger columns through ``clear`` cells, by doubling."""
     reached, path = seen & clear, clear
@@ -33,7 +34,7 @@ def _spread_right(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
     return reached
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _spread_left(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
     """As :func:`_spread_right`, towards smaller columns."""
     reached, path = seen & clear, clear
@@ -45,7 +46,7 @@ def _spread_left(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
     return reached
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
     """
     Compute which cells of its view an agent sees and keep it in ``games.sight``.
@@ -63,8 +64,8 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
     bits = (e * 4 + games.direction[e, agent]) * book.bits_bytes
     corner = view_corner(games, book, e, agent)
     for row in range(size):
-        games.sight[words + row] = 0
-    games.sight[words + own_row] = _ONE << np.uint64(own_column)
+        games.sight[np.uint64(words + row)] = 0
+    games.sight[np.uint64(words + own_row)] = _ONE << np.uint64(own_column)
     # Upwards from the agent's row, then downwards from it. Row 0 hands on to no row and is not swept;
     # the rows behind the agent are dark until the second pass.
     for sweep in range(2):
@@ -74,7 +75,7 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
             bit = corner + row * book.stride
             walls = load_word(games.wall_bits, bits + (bit >> 3)) >> np.uint64(bit & 7)
             clear = ~walls & every
-            seen = games.sight[words + row]
+            seen = games.sight[np.uint64(words + row)]
             lit = np.uint64(0)
             right = _spread_right(seen & rightwards, clear & rightwards, size)
             seen |= (right | (right << _ONE)) & every
@@ -82,14 +83,14 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
             left = _spread_left(seen & leftwards, clear & leftwards, size)
             seen |= left | (left >> _ONE)
             lit |= left | (left >> _ONE)
-            games.sight[words + row] = seen
+            games.sight[np.uint64(words + row)] = seen
             if 0 <= following < size:
-                games.sight[words + following] |= lit & every
+                games.sight[np.uint64(words + following)] |= lit & every
             row = following
     games.sight_known[e, agent] = 1
 
 
-@njit(cache=True, nogil=True)
+@hot
 def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) -> None:
     """
     Write the views of games ``first`` to ``last - 1`` as tile codes.
@@ -108,9 +109,9 @@ def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) 
             end = start + size * size
             source = (e * 4 + games.direction[e, agent]) * book.plane_bytes + view_corner(games, book, e, agent)
             for row in range(size):
-                seen = games.sight[words + row]
+                seen = games.sight[np.uint64(words + row)]
                 for k in range(n_words):
-                    mask = book.spread[np.int64((seen >> np.uint64(_WORD_BYTES * k)) & _BYTE)]
+                    mask = book.spread[(seen >> np.uint64(_WORD_BYTES * k)) & _BYTE]
                     codes = load_word(games.planes, source + row * book.stride + _WORD_BYTES * k) & mask
                     to = start + row * size + _WORD_BYTES * k
                     if to + _WORD_BYTES <= end:
@@ -123,7 +124,7 @@ def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) 
             out[start + own] = agent_code(ground, games.colour[e, agent], 3)
 
 
-@njit(cache=True, nogil=True)
+@hot
 def draw_pictures(
     codes: U8, facing: U8, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
 ) -> None:
@@ -132,7 +133,7 @@ def draw_pictures(
 
     :param codes: (B * V * V,) codes of B views
     :param facing: (B,) directions of the viewers
-    :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction
+    :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction, and slack for whole chunks
     :param turn_bytes: bytes from one direction's tiles to the next; 0 if all directions may share the first
     :param size: V
     :param tile: t
@@ -140,23 +141,34 @@ def draw_pictures(
     :param first: first view to draw
     :param last: one beyond the last view to draw
     """
-    line = 3 * tile
+    line, tile_bytes = 3 * tile, 3 * tile * tile
     for view in range(first, last):
         turned = facing[view] * turn_bytes
-        to = view * size * size * tile * line
+        to = view * size * size * tile_bytes
+        end = to + size * size * tile_bytes
         for row in range(size):
             cell = (view * size + row) * size
             for pixel_row in range(tile):
+                source = turned + pixel_row * line
                 for column in range(size):
-                    source = turned + (np.int64(codes[cell + column]) * tile + pixel_row) * line
-                    if line >= _WORD_BYTES:
-                        k = 0
-                        while k + _WORD_BYTES < line:
-                            store_word(out, to + k, load_word(atlas, source + k))
-                            k += _WORD_BYTES
-                        # The last word overlaps the one before it instead of running into the next tile.
-                        store_word(out, to + line - _WORD_BYTES, load_word(atlas, source + line - _WORD_BYTES))
+                    # An unsigned index spares the check for counting from the end.
+                    at = source + np.int64(codes[np.uint64(cell + column)]) * tile_bytes
+                    if line <= _CHUNK_BYTES and to + _CHUNK_BYTES <= end:
+                        # Writes past the tile; what comes next, written later, repairs it.
+                        copy_16(out, to, atlas, at)
                     else:
-                        for k in range(line):
-                            out[to + k] = atlas[source + k]
+                        _copy_line(out, to, atlas, at, line)
                     to += line
+
+
+@inlined
+def _copy_line(out: U8, to: int, atlas: U8, source: int, line: int) -> None:
+    """Copy one line of a tile and nothing beyond it."""
+    if line < _WORD_BYTES:
+        for k in range(line):
+            out[to + k] = atlas[source + k]
+        return
+    for k in range(0, line - _WORD_BYTES, _WORD_BYTES):
+        store_word(out, to + k, load_word(atlas, source + k))
+    # The last word overlaps the one before it.
+    store_word(out, to + line - _WORD_BYTES, load_word(atlas, source + line - _WORD_BYTES))
