@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain, TreasureState
+from hecogrid_envs.core import announce_compilation
 from hecogrid_envs.core.batch_step import reset_games, step_games
 from hecogrid_envs.core.generation import clear, draw_level
 from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
@@ -42,6 +43,7 @@ class GameBatch:
     def __init__(self, task: str, params: HECOGridParams, n_games: int = 1, n_threads: int = 1):
         self.task: TaskName = check_task(task)
         params.check_fits(self.task)
+        announce_compilation()
         self.params = params
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)
@@ -53,6 +55,11 @@ class GameBatch:
         self._seeded = np.zeros(self.n_games, dtype=bool)
         n, v = params.n_agents, params.view_size
         self._codes = np.zeros((self.n_games, n, v, v), dtype=np.uint8)
+        self._threads: ThreadPoolExecutor | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Threads stay with the process; a copy makes its own.
+        return {**self.__dict__, "_threads": None}
 
     def reset(self, which: npt.NDArray[np.bool_] | None = None, seeds: Sequence[int | None] | None = None) -> None:
         """
@@ -130,9 +137,10 @@ class GameBatch:
             work(0, self.n_games)
             return
         edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int)
-        with ThreadPoolExecutor(self.n_threads) as pool:
-            for done in [pool.submit(work, int(a), int(b)) for a, b in pairwise(edges)]:
-                done.result()
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(self.n_threads, thread_name_prefix="hecogrid")
+        for done in [self._threads.submit(work, int(a), int(b)) for a, b in pairwise(edges)]:
+            done.result()
 
     @property
     def rewards(self) -> npt.NDArray[np.float64]:

@@ -14,7 +14,7 @@ import numpy as np
 from stable_baselines3 import PPO
 
 import hecogrid_envs
-from hecogrid_envs.params import TASK_NAMES
+from hecogrid_envs.params import TASK_NAMES, check_task
 from sb3_saf import EvaluationResult, LightEncoder, RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 
 #: The ``small`` size of the experiments: 5 agents, grid 15, 25 treasures.
@@ -64,7 +64,12 @@ def parse(arguments: list[str] | None = None) -> Options:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"))
     parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")
-    return Options(**vars(parser.parse_args(arguments)))
+    options = Options(**vars(parser.parse_args(arguments)))
+    try:
+        hecogrid_envs.HECOGridParams(**options.level).check_fits(check_task(options.task))
+    except ValueError as error:
+        parser.error(str(error))
+    return options
 
 
 def train(options: Options) -> PPO:

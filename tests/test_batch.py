@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import hecogrid_envs
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds
 from hecogrid_envs.constants import TreasureState
 
@@ -127,3 +134,34 @@ def test_released_rules_keep_directions_until_a_seed() -> None:
     assert batch.get_state()["agent_dir"].tolist() == turned != [0] * 5
     batch.reset(seeds=[0])
     assert batch.get_state()["agent_dir"].tolist() == [0] * 5
+
+
+def test_a_copy_plays_on_like_the_original() -> None:
+    batch = GameBatch("KeyForTreasure", PARAMS, 4, n_threads=2)
+    batch.reset(seeds=game_seeds(0, 4))
+    actions = np.random.default_rng(0).integers(0, 7, size=(60, 4, 5))
+    for row in actions[:20]:
+        batch.step(row)
+    copy = pickle.loads(pickle.dumps(batch))
+    for row in actions[20:]:
+        for one in (batch, copy):
+            one.step(row)
+            one.reset(one.truncated)
+        np.testing.assert_array_equal(batch.observe(), copy.observe())
+        np.testing.assert_array_equal(batch.order, copy.order)
+
+
+def test_first_compilation_is_announced(tmp_path: Path) -> None:
+    """Once on a machine: a fresh copy of the package says that it compiles, the second process does not."""
+    shutil.copytree(
+        Path(hecogrid_envs.__file__).parent, tmp_path / "hecogrid_envs", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    code = "import hecogrid_envs; hecogrid_envs.GameBatch('TeamSupport', hecogrid_envs.HECOGridParams())"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONSAFEPATH": "1"}
+    said = []
+    for _ in range(2):
+        process = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+        )
+        said.append("compiling" in process.stderr)
+    assert said == [True, False]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import sys
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -33,6 +34,12 @@ def _drop_stale_kernels() -> None:
             stale.unlink(missing_ok=True)
         cache.mkdir(exist_ok=True)
         stamp.write_text(fingerprint)
+
+
+def announce_compilation() -> None:
+    """Say that the first call takes longer, where nothing compiled is on disk yet."""
+    if not any((_PACKAGE / "core" / "__pycache__").glob("*.nbi")):
+        print("hecogrid_envs: compiling the kernels, once on this machine (some seconds)", file=sys.stderr, flush=True)
 
 
 _drop_stale_kernels()

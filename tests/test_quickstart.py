@@ -1,0 +1,34 @@
+"""``make train`` in small: everything it promises is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as imageio
+import pytest
+from stable_baselines3 import PPO
+
+from sb3_saf import quickstart
+
+
+def test_it_leaves_model_curve_video_and_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "run"
+    quickstart.main(["--game-steps", "3200", "--output", str(output), "--no-progress-bar", "--coordination", "1"])
+    printed = capsys.readouterr().out
+    assert "Training SAF on TeamSupport" in printed
+    assert all(f"  {name}" in printed for name in ("SAF", "random"))
+    model = PPO.load(output / "model.zip")
+    assert model.num_timesteps == 3200 * 5
+    assert imageio.imread(output / "learning_curve.png").shape == (480, 840, 4)
+    assert len(imageio.imread(output / "episode.gif")) == 51
+    assert list((output / "tb" / "saf_1").glob("events.out.tfevents.*"))
+    for name in ("model.zip", "learning_curve.png", "episode.gif", "tb"):
+        assert str(output / name) in printed
+
+
+def test_wrong_levels_are_one_line_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        quickstart.main(["--coordination", "6", "--output", str(tmp_path)])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.endswith("coordination must be an integer from 1 to 5 (1 <= coordination <= n_agents), got 6")
