@@ -10,7 +10,7 @@ VENV = .venv
 RUN = $(VENV)/bin/python -m
 INSTALLED = $(VENV)/.installed
 
-.PHONY: help install train test check format-check lint types format clean distclean
+.PHONY: help install train test bench check format-check lint types format clean distclean
 
 help: ## this list (the default)
 	@echo "make TARGET, with TARGET one of"
@@ -27,6 +27,9 @@ check: $(INSTALLED) ## what CI runs: format, lint, types, tests
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory types
 	@$(MAKE) --no-print-directory test
+
+bench: $(INSTALLED) ## measure speed, side by side; writes benchmarks/results.md
+	@$(RUN) benchmarks.environments
 
 format-check: $(INSTALLED)
 	@echo "== format"

@@ -1,0 +1,1 @@
+"""Programs that measure speed, each against its baselines in one run."""
