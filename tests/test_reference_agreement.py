@@ -33,13 +33,13 @@ def configurations(draw: st.DrawFn, max_tile: int = 14) -> dict[str, Any]:
         "grid_size": size,
         "coordination": draw(st.integers(1, min(3, n_agents))),
         "heterogeneity": draw(st.integers(1, size - 2)),
-        "n_treasures": draw(st.integers(0, min(12, room - n_keys))),
+        "n_treasures": draw(st.integers(0, room - n_keys)),
         "n_keys": n_keys,
         "clutter_density": clutter,
         "view_size": view_size,
         "view_tile_size": draw(st.integers(1, max_tile)),
         "view_offset": draw(st.integers(0, min(3, view_size - 1))),
-        "support_radius": draw(st.integers(0, 4)),
+        "support_radius": draw(st.integers(0, 3)),
         "rules": draw(st.sampled_from(["paper", "released"])),
         "agent_order": draw(st.sampled_from(["random", "index"])),
     }
@@ -74,7 +74,7 @@ def crowded(state: StateMapping, rng: np.random.Generator) -> StateMapping:
 
 @pytest.mark.parametrize("task", TASK_NAMES)
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
-@given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(1, 12))
+@given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(5, 25))
 def test_kernels_agree_with_the_reference(task: str, params: dict[str, Any], seed: int, n_steps: int) -> None:
     batch = GameBatch(task, HECOGridParams(**params))
     batch.reset(seeds=[seed])
