@@ -89,13 +89,17 @@ def masked_parameters(action_space: spaces.Space[Any], parameters: th.Tensor, ma
             f"expected action masks of shape {(len(parameters), n_choices)}, one flag for each choice of "
             f"{action_space}, got {tuple(masks.shape)}; let the environment's action_masks give that"
         )
+    if isinstance(action_space, spaces.MultiBinary):
+        off, on = masks.unflatten(1, (-1, 2)).unbind(dim=2)
+        kept, otherwise = off & on, _FORBIDDEN * (off.to(parameters.dtype) - on.to(parameters.dtype))
+    else:
+        some = [
+            part.any(dim=1, keepdim=True).expand_as(part) for part in th.split(masks, _choices(action_space), dim=1)
+        ]
+        kept, otherwise = masks, _FORBIDDEN * th.cat(some, dim=1).to(parameters.dtype)
     if parameters.dim() == 3:
-        masks = masks.unsqueeze(1)
-    if not isinstance(action_space, spaces.MultiBinary):
-        return parameters.where(masks, parameters.new_tensor(_FORBIDDEN))
-    off, on = masks.unflatten(-1, (-1, 2)).unbind(dim=-1)
-    forced = (off.to(parameters.dtype) - on.to(parameters.dtype)) * _FORBIDDEN
-    return parameters.where(off & on, forced)
+        kept, otherwise = kept.unsqueeze(1), otherwise.unsqueeze(1)
+    return parameters.where(kept, otherwise)
 
 
 def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:

@@ -245,6 +245,10 @@ class TeamPolicy(BasePolicy):
         features = [extractor(preprocess_obs(part, own_space, self.normalize_images)) for part in parts]
         return features[0] if len(features) == 1 else th.cat(features)
 
+    def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
+        """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
+        return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
+
     def _distribution(self, obs: PyTorchObs, own: OwnViews) -> Distribution:
         agent = self._agent(obs) if self.actor.reads_agent else None
         return self.actor.distribution(self.views.per_agent(self.actor, own, agent))

@@ -37,7 +37,7 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
     #: There are no masks for Box actions, so nothing reads it.
     log_std_init: float = 0.0
 
-    def forward(  # type: ignore[override]
+    def forward(
         self, obs: PyTorchObs, deterministic: bool = False, action_masks: Masks | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
@@ -54,7 +54,7 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
         log_prob = distribution.log_prob(actions)
         return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, own), log_prob
 
-    def evaluate_actions(  # type: ignore[override]
+    def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: Masks | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """
@@ -67,7 +67,7 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
         """
         own = self.views.own(self._own(obs))
         distribution = self._masked_distribution(obs, own, action_masks)
-        return self._values(obs, own), distribution.log_prob(actions), distribution.entropy()
+        return self._values(obs, own), self._likelihood(distribution, actions), distribution.entropy()
 
     def get_distribution(  # type: ignore[override]
         self, obs: PyTorchObs, action_masks: Masks | None = None

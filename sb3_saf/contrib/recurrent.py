@@ -27,7 +27,7 @@ from sb3_saf.ippo.policies import IPPOParts
 from sb3_saf.mappo.policies import MAPPOParts
 from sb3_saf.saf.policies import SAFParts
 
-LstmStates = tuple[th.Tensor, th.Tensor]
+LstmStates = tuple[th.Tensor, ...]
 
 
 class RecurrentCritic(nn.Module):
@@ -182,7 +182,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         own = self.views.own(self._own(obs))
         distribution, _ = self._recall_distribution(obs, own, lstm_states.pi, episode_starts)
         values, _ = self._recall_values(obs, own, lstm_states.vf, episode_starts)
-        return values, distribution.log_prob(actions), distribution.entropy()
+        return values, self._likelihood(distribution, actions), distribution.entropy()
 
     def get_distribution(  # type: ignore[override]
         self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
@@ -242,7 +242,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         self, inputs: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor, lstm: nn.LSTM
     ) -> tuple[th.Tensor, LstmStates]:
         """(B, H) outputs of an LSTM, and its states after the last step: (B, ...) inputs, sequence by sequence."""
-        outputs, states = self._process_sequence(inputs, lstm_states, episode_starts, lstm)
+        outputs, states = self._process_sequence(inputs, lstm_states, episode_starts, lstm)  # type: ignore[arg-type]
         return outputs, states  # type: ignore[return-value]  # sb3-contrib's annotation says one tensor
 
 

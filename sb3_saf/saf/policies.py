@@ -45,6 +45,8 @@ class SAFParts(MAPPOParts):
         check_choice("critic_input", self.critic_input, get_args(CriticInput))
         for name in ("n_policies", "n_slots", "latent_dim"):
             check_at_least_one(name, getattr(self, name))
+        # Saved models may bring a list.
+        object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
 
     def actor(self, spec: NetworkSpec) -> Actor:
         """The policy pool; with a single policy there is nothing to select, and the actor is MAPPO's."""
