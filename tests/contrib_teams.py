@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from tests.toy_teams import VECTOR, ToyTeams
 
@@ -76,7 +76,8 @@ class CueTeams(ToyTeams):
 
     :param pays: ``"own"`` pays 1 for the action that names the own cue (0 for -1, 1 for 1), else 0; ``"mate"`` pays
         the next agent's cue, whatever the action
-    :param kwargs: of ToyTeams
+    :param n_agents: N
+    :param n_games: E
     """
 
     def __init__(self, pays: Literal["own", "mate"], n_agents: int = 2, n_games: int = 16):
@@ -96,16 +97,12 @@ class CueTeams(ToyTeams):
             "agent": np.tile(np.arange(self.n_agents), self.n_games),
         }
 
-    def reset(self) -> VecEnvObs:
-        return super().reset()
-
     def step_wait(self) -> VecEnvStepReturn:
         is_last = self._time % self.length == self.length - 1
         if self.pays == "own":
             paid = (self._actions[:, 0] == (self.cues.reshape(-1) + 1) / 2).astype(np.float32)
         else:
             paid = np.roll(self.cues, -1, axis=1).reshape(-1).astype(np.float32)
-        self._first = np.zeros(self.num_envs)
         self._time += 1
         done = self._time % self.length == 0
         obs = self._observe()
