@@ -17,6 +17,8 @@ from sb3_saf.common.evaluation import (
     evaluate_team,
 )
 from sb3_saf.common.monitor import TeamMonitor
+from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
+from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
 from sb3_saf.ippo.policies import IPPOPolicy
 from sb3_saf.mappo.policies import MAPPOPolicy
 from sb3_saf.registration import register_all
@@ -32,13 +34,19 @@ register_all()
 __all__ = [
     "CentralizedValueWrapper",
     "EvaluationResult",
+    "IPPOLstmPolicy",
+    "IPPOMaskablePolicy",
     "IPPOPolicy",
     "LightEncoder",
+    "MAPPOLstmPolicy",
+    "MAPPOMaskablePolicy",
     "MAPPOPolicy",
     "MLPEncoder",
     "ObservationEncoder",
     "PaperCNN",
     "RandomPolicy",
+    "SAFLstmPolicy",
+    "SAFMaskablePolicy",
     "SAFPolicy",
     "TeamEvalCallback",
     "TeamMonitor",

@@ -5,19 +5,28 @@ from __future__ import annotations
 import warnings
 from typing import Final
 
+from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.common.game_steps import log_game_steps
+from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
+from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
 from sb3_saf.ippo.policies import IPPOPolicy
 from sb3_saf.mappo.policies import MAPPOPolicy
 from sb3_saf.saf.policies import SAFPolicy
 
 #: Which names each algorithm learns. SB3 keeps one dict per algorithm.
 POLICIES: Final[dict[type[BaseAlgorithm], dict[str, type[BasePolicy]]]] = {
-    algorithm: {"IPPOPolicy": IPPOPolicy, "MAPPOPolicy": MAPPOPolicy, "SAFPolicy": SAFPolicy}
-    for algorithm in (PPO, A2C)
+    algorithm: {policy.__name__: policy for policy in policies}
+    for algorithm, policies in (
+        (PPO, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
+        (A2C, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
+        (TRPO, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
+        (RecurrentPPO, (IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy)),
+        (MaskablePPO, (IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy)),
+    )
 }
 
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_saf.common.distributions import distribution_of, n_action_parameters
+from sb3_saf.common.distributions import distribution_of, masked_parameters, n_action_parameters
 from sb3_saf.common.networks import AgentHeads, mlp
 
 #: Orthogonal gain of the last layer: first policies are close to uniform.
@@ -93,6 +93,26 @@ class Actor(nn.Module, ABC):
 
         :param parameters: (B, P')
         """
+
+    def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        As ``forward``, but with the parameters of every policy, which is where masks of actions have to apply.
+
+        :param features: (K, d) features of own observations
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: (K, P'')
+        """
+        result: th.Tensor = self(features, agent)
+        return result
+
+    def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
+        """
+        Make the distribution over allowed actions of what ``unmixed`` gave.
+
+        :param parameters: (B, P'')
+        :param masks: (B, M) bool, the choices that are allowed (see ``masked_parameters``)
+        """
+        return self.distribution(masked_parameters(self.action_space, parameters, masks))
 
 
 class SinglePolicy(Actor):

@@ -35,6 +35,56 @@ class TeamCritic(nn.Module, ABC):
         """
 
 
+class TeamStates(nn.Module, ABC):
+    """
+    What a critic knows of each agent, before it judges. A critic with memory remembers these.
+
+    :param states_dim: S, size of a state
+    """
+
+    def __init__(self, states_dim: int):
+        super().__init__()
+        self.states_dim = states_dim
+
+    @abstractmethod
+    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        State of every agent of every team.
+
+        :param features: (K, d) features of views
+        :param teams: (G, N) int64, which view each agent of a team has
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N, S)
+        """
+
+
+class JointStates(TeamStates):
+    """
+    An agent's state is that of its whole team, side by side, and whose state it is (one-hot).
+
+    :param features_dim: d
+    :param n_agents: N
+    :param agent_identity: False leaves out whose state it is: all agents of a team then have the same
+    :param members: makes each agent's own state, of size d; None for the features of its view
+    """
+
+    def __init__(self, features_dim: int, n_agents: int, agent_identity: bool, members: TeamStates | None = None):
+        super().__init__(features_dim * n_agents + (n_agents if agent_identity else 0))
+        self.agent_identity = agent_identity
+        self.members = members
+
+    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamStates`; agents that take no part are read as zeros."""
+        members = features[teams] if self.members is None else self.members.states(features, teams, active)
+        if active is not None:
+            members = members * active.unsqueeze(2)
+        n_teams, n_agents, _ = members.shape
+        joint = members.flatten(1).unsqueeze(1).expand(-1, n_agents, -1)
+        if not self.agent_identity:
+            return joint
+        return th.cat([joint, th.eye(n_agents, device=joint.device).expand(n_teams, -1, -1)], dim=2)
+
+
 class OwnValueHead(nn.Module):
     """
     Value of an agent from its own features.

@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from itertools import product
 from math import prod
-from typing import Any, Final, cast
+from typing import Any, ClassVar, Final, cast
 
 import torch as th
 from gymnasium import spaces
@@ -19,10 +19,13 @@ from stable_baselines3.common.distributions import (
     CategoricalDistribution,
     DiagGaussianDistribution,
     Distribution,
+    kl_divergence,
     make_proba_distribution,
 )
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
+from torch.distributions import Distribution as TorchDistribution
+from torch.distributions import register_kl
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
@@ -30,6 +33,8 @@ from torch.utils.checkpoint import checkpoint
 MAX_ENUMERATED_ACTIONS: Final = 4096
 #: Numbers held at once while enumerating; more rows are done in parts that backpropagation computes again.
 _ENUMERATED_AT_ONCE: Final = 1 << 22
+#: Logit of what a mask forbids: its probability is zero to the last bit, and all sums stay finite.
+_FORBIDDEN: Final = -1e8
 
 
 def n_action_parameters(action_space: spaces.Space[Any]) -> int:
@@ -60,6 +65,41 @@ def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> D
     else:
         distribution.proba_distribution(action_logits=parameters)
     return cast(Distribution, distribution)
+
+
+def masked_parameters(action_space: spaces.Space[Any], parameters: th.Tensor, masks: th.Tensor) -> th.Tensor:
+    """
+    Parameters of the policies with forbidden choices taken out.
+
+    A mask that allows none of the choices of an action dimension leaves them equally likely: such rows (agents that
+    are out of the game) act, but teach nothing.
+
+    :param action_space: Discrete, MultiDiscrete or MultiBinary
+    :param parameters: (B, P), or (B, U, P) for a pool
+    :param masks: (B, M) bool, True for what is allowed: the choices of each dimension in turn (of a MultiBinary: off,
+        on), as sb3-contrib wants them
+    :return: as ``parameters``
+    :raises ValueError: if the masks do not fit, or the actions are of a Box
+    """
+    if isinstance(action_space, spaces.Box):
+        raise ValueError(f"continuous actions cannot be masked, got {action_space}")
+    n_choices = sum(_choices(action_space))
+    if masks.shape != (len(parameters), n_choices):
+        raise ValueError(
+            f"expected action masks of shape {(len(parameters), n_choices)}, one flag for each choice of "
+            f"{action_space}, got {tuple(masks.shape)}; let the environment's action_masks give that"
+        )
+    if isinstance(action_space, spaces.MultiBinary):
+        off, on = masks.unflatten(1, (-1, 2)).unbind(dim=2)
+        kept, otherwise = off & on, _FORBIDDEN * (off.to(parameters.dtype) - on.to(parameters.dtype))
+    else:
+        some = [
+            part.any(dim=1, keepdim=True).expand_as(part) for part in th.split(masks, _choices(action_space), dim=1)
+        ]
+        kept, otherwise = masks, _FORBIDDEN * th.cat(some, dim=1).to(parameters.dtype)
+    if parameters.dim() == 3:
+        kept, otherwise = kept.unsqueeze(1), otherwise.unsqueeze(1)
+    return parameters.where(kept, otherwise)
 
 
 def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
@@ -144,6 +184,11 @@ class PoolDistribution(_FromPool):
         self.log_weights, self.parameters = log_weights, parameters
         return self
 
+    @property
+    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # read-only
+        """What TRPO compares: the distribution of policy and action together."""
+        return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
+
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """
         Log-likelihood by logsumexp over policies.
@@ -194,6 +239,34 @@ class PoolDistribution(_FromPool):
         return th.cat([checkpoint(part, *arguments, use_reentrant=False) for arguments in parts])
 
 
+class PolicyAndAction(TorchDistribution):
+    """
+    Which policy is drawn, and what it does: here for its divergence, KL(w || w') + sum_u w_u KL(pi_u || pi'_u).
+
+    That is never less than the divergence of the mixtures, which has no closed form (the policy is one more thing to
+    tell them apart by), and zero where nothing differs: who stays within it, as TRPO does, stays within the other.
+
+    :param log_weights: (B, U), normalised
+    :param policies: distribution of B * U rows, those of a mixture's policies consecutive
+    """
+
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, log_weights: th.Tensor, policies: Distribution):
+        super().__init__(log_weights.shape[:1], validate_args=False)
+        self.log_weights = log_weights
+        self.policies = policies
+
+
+@register_kl(PolicyAndAction, PolicyAndAction)
+def _divergence(one: PolicyAndAction, other: PolicyAndAction) -> th.Tensor:
+    """(B,) see :class:`PolicyAndAction`."""
+    weights = one.log_weights.exp()
+    # SB3 gives one number per row, or one per action dimension.
+    of_actions = kl_divergence(one.policies, other.policies).reshape(*weights.shape, -1).sum(dim=2)
+    return (weights * (one.log_weights - other.log_weights + of_actions)).sum(dim=1)
+
+
 class SelectedDistribution(_FromPool):
     """
     The distribution of the one policy that was drawn; deterministic actions are those of the favourite policy.
@@ -206,7 +279,14 @@ class SelectedDistribution(_FromPool):
         super().__init__()
         self.drawn = drawn
         self.favourite = favourite
-        self.distribution = drawn.distribution
+
+    @property
+    def distribution(self) -> TorchDistribution:  # type: ignore[override]  # read-only
+        """Not there: TRPO would compare policies drawn at different times."""
+        raise ValueError(
+            "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
+            "(TRPO's KL divergence) says nothing; use selection='mixture'"
+        )
 
     def proba_distribution(self, *args: Any, **kwargs: Any) -> SelectedDistribution:
         """Set the parameters of the drawn policy."""

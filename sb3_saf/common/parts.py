@@ -15,7 +15,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_saf.common.actor import Actor, SinglePolicy
-from sb3_saf.common.critic import Heads, OwnValueHead, TeamCritic
+from sb3_saf.common.critic import Heads, OwnValueHead, TeamCritic, TeamStates
 
 
 class NetworkSpec(NamedTuple):
@@ -67,6 +67,10 @@ class TeamParts(ABC):
     @abstractmethod
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic:
         """Make the critic."""
+
+    def team_states(self, spec: NetworkSpec) -> TeamStates | None:
+        """Make what the critic knows of each agent before it judges; None if it is the features of its own view."""
+        return None
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

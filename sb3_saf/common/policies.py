@@ -1,5 +1,6 @@
 """
-The policy class that SAF, MAPPO and IPPO share: SB3's ActorCriticPolicy for rows that carry their team's joint view.
+What the policies of SAF, MAPPO and IPPO share, for rows that carry their team's joint view: all of their construction
+and reading of rows (``TeamPolicy``), and SB3's ActorCriticPolicy of them (``TeamActorCriticPolicy``).
 
 The actor reads ``obs`` (and ``agent``, with one head per agent); only the critic reads ``team``. Letters: B rows, N
 agents.
@@ -17,10 +18,11 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
 
 from sb3_saf.common.actor import ActionHead, Actor
 from sb3_saf.common.critic import OwnValueHead, TeamCritic
@@ -36,9 +38,11 @@ NetArch = list[int] | dict[str, list[int]]
 _SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
 
 
-class TeamActorCriticPolicy(ActorCriticPolicy):
+class TeamPolicy(BasePolicy):
     """
-    Policy for PPO and A2C on rows of teams: one row is one agent in one game at one step.
+    Base of policies on rows of teams: one row is one agent in one game at one step.
+
+    It goes in front of one of the actor-critic policies of SB3 or sb3-contrib, whose networks it replaces by its own.
 
     A row's observation is that of ``CentralizedValueWrapper``: ``obs``, ``team`` and ``agent``. The actor reads
     ``obs`` alone: what other agents see cannot change an action's probability by a bit. Each distinct observation of
@@ -64,7 +68,12 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
     parts_class: ClassVar[type[TeamParts]]
 
     actor: Actor
-    value_net: OwnValueHead | TeamCritic  # type: ignore[assignment]
+    value_net: OwnValueHead | TeamCritic
+    features_dim: int
+    net_arch: NetArch
+    activation_fn: type[nn.Module]
+    log_std_init: float
+    ortho_init: bool
 
     def __init__(
         self,
@@ -89,6 +98,7 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         self.chunk_size = chunk_size
         self.distinct = distinct
         self.views = ViewEncoder(self._encode, distinct)
+        # The next class in line is SB3's or sb3-contrib's, which takes more than BasePolicy.
         super().__init__(
             observation_space,
             action_space,
@@ -99,11 +109,6 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
             **kwargs,
         )
 
-    @classmethod
-    @abstractmethod
-    def paper_table_kwargs(cls) -> dict[str, Any]:
-        """Arguments with which the policy has as many parameters as in the paper's table."""
-
     # --- construction -----------------------------------------------------------------------------------------------
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
@@ -112,17 +117,29 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         # The critic comes last: policies of one seed that differ in the critic start with the same encoder and actor.
-        spec = self._network_spec()
-        self.actor = self.parts.actor(spec)
+        self._build_actor()
+        self._build_critic(lr_schedule)
+
+    def _build_actor(self) -> None:
+        self.actor = self._make_actor()
         if self.ortho_init:
             self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
             orthogonal_init(self.actor)
+
+    def _build_critic(self, lr_schedule: Schedule) -> None:
+        """Make the critic, and the optimizer of everything."""
         # TRPO tells the critic's parameters by "value" in their name: everything below value_net has it.
-        self.value_net = self.parts.critic(spec)
+        self.value_net = self._make_critic()
         if self.ortho_init:
             orthogonal_init(self.value_net)
         learning_rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _make_actor(self) -> Actor:
+        return self.parts.actor(self._network_spec())
+
+    def _make_critic(self) -> OwnValueHead | TeamCritic:
+        return self.parts.critic(self._network_spec())
 
     def _network_spec(self) -> NetworkSpec:
         actor_hidden, value_hidden = _hidden_sizes(self.net_arch)
@@ -139,11 +156,11 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         for name in _SDE_ARGUMENTS:
-            del data[name]
+            data.pop(name, None)
         return data | asdict(self.parts) | {"distinct": self.distinct, "chunk_size": self.chunk_size}
 
     @property
-    def log_std(self) -> th.Tensor:  # type: ignore[override]  # read-only, and one row per policy
+    def log_std(self) -> th.Tensor:
         """(policies, D) log standard deviations of Box actions; there is no such attribute for other actions."""
         heads = [module for module in self.actor.modules() if isinstance(module, ActionHead)]
         found: list[th.Tensor] = [head.log_std for head in heads if head.log_std is not None]
@@ -152,40 +169,6 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         return th.stack(found)
 
     # --- what SB3 calls ---------------------------------------------------------------------------------------------
-
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """
-        Act and estimate values.
-
-        :param obs: rows
-        :param deterministic: whether to take the most likely actions
-        :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
-        """
-        own = self.views.own(self._own(obs))
-        distribution = self._distribution(obs, own)
-        actions = distribution.get_actions(deterministic=deterministic)
-        log_prob = distribution.log_prob(actions)
-        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, own), log_prob
-
-    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """
-        Evaluate given actions.
-
-        :param obs: rows
-        :param actions: (B, ...) actions
-        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
-        """
-        own = self.views.own(self._own(obs))
-        distribution = self._distribution(obs, own)
-        return self._values(obs, own), distribution.log_prob(actions), distribution.entropy()
-
-    def get_distribution(self, obs: PyTorchObs) -> Distribution:
-        """
-        Action distribution; ``team`` is not read and may be missing.
-
-        :param obs: rows, or own observations alone (B, ...)
-        """
-        return self._distribution(obs, self.views.own(self._own(obs)))
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -262,6 +245,10 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         features = [extractor(preprocess_obs(part, own_space, self.normalize_images)) for part in parts]
         return features[0] if len(features) == 1 else th.cat(features)
 
+    def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
+        """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
+        return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
+
     def _distribution(self, obs: PyTorchObs, own: OwnViews) -> Distribution:
         agent = self._agent(obs) if self.actor.reads_agent else None
         return self.actor.distribution(self.views.per_agent(self.actor, own, agent))
@@ -276,6 +263,49 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
             own = self.views.own(self._own(obs)) if own is None else own
             values = self.views.per_agent(critic, own, self._agent(obs) if critic.reads_agent else None)
         return values.unsqueeze(1)
+
+
+class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc]  # value_net, log_std: ours
+    """Policy for PPO, A2C and TRPO on rows of teams; see :class:`TeamPolicy` for the parameters."""
+
+    @classmethod
+    @abstractmethod
+    def paper_table_kwargs(cls) -> dict[str, Any]:
+        """Arguments with which the policy has as many parameters as in the paper's table."""
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Act and estimate values.
+
+        :param obs: rows
+        :param deterministic: whether to take the most likely actions
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
+        """
+        own = self.views.own(self._own(obs))
+        distribution = self._distribution(obs, own)
+        actions = distribution.get_actions(deterministic=deterministic)
+        log_prob = distribution.log_prob(actions)
+        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, own), log_prob
+
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """
+        Evaluate given actions.
+
+        :param obs: rows
+        :param actions: (B, ...) actions
+        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
+        """
+        own = self.views.own(self._own(obs))
+        distribution = self._distribution(obs, own)
+        return self._values(obs, own), distribution.log_prob(actions), distribution.entropy()
+
+    def get_distribution(self, obs: PyTorchObs) -> Distribution:
+        """
+        Action distribution; ``team`` is not read and may be missing.
+
+        :param obs: rows, or own observations alone (B, ...)
+        """
+        return self._distribution(obs, self.views.own(self._own(obs)))
 
 
 def _entry(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:

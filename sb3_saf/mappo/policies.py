@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sb3_saf.common.critic import OwnValueHead, TeamCritic
+from sb3_saf.common.critic import JointStates, OwnValueHead, TeamCritic, TeamStates
 from sb3_saf.common.parts import NetworkSpec, TeamParts
 from sb3_saf.common.policies import TeamActorCriticPolicy
 from sb3_saf.mappo.critic import JointCritic
@@ -28,6 +28,13 @@ class MAPPOParts(TeamParts):
         return JointCritic(
             spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn, self.heads, self.agent_identity
         )
+
+    def team_states(self, spec: NetworkSpec) -> TeamStates | None:
+        """[z_1, ..., z_N], and whose value is asked where one head serves all agents."""
+        return self._joint(spec.features_dim, spec.n_agents)
+
+    def _joint(self, features_dim: int, n_agents: int, members: TeamStates | None = None) -> JointStates:
+        return JointStates(features_dim, n_agents, self.agent_identity and self.heads == "shared", members)
 
 
 class MAPPOPolicy(TeamActorCriticPolicy):

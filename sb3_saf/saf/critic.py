@@ -8,7 +8,7 @@ from typing import Literal
 import torch as th
 from torch import nn
 
-from sb3_saf.common.critic import Heads, JointValueHead, OwnValueHead, TeamCritic
+from sb3_saf.common.critic import Heads, JointValueHead, OwnValueHead, TeamCritic, TeamStates
 from sb3_saf.common.networks import mlp
 from sb3_saf.saf.knowledge_source import KnowledgeSource
 
@@ -16,11 +16,47 @@ from sb3_saf.saf.knowledge_source import KnowledgeSource
 CriticInput = Literal["own", "team"]
 
 
-class SAFCritic(TeamCritic):
+class SAFStates(TeamStates):
     """
-    V_i from s_i^SAF (arXiv 2210.03022, section 5):
+    s_i^SAF of every agent (arXiv 2210.03022, section 5):
 
     m'_i = g_theta(z_i), s_i = g_omega(z_i), slots written from m', m_i read with s_i, s_i^SAF = g_phi([s_i, m_i]).
+
+    :param features_dim: size of z
+    :param n_agents: N
+    :param activation_fn: activation of all MLPs
+    :param n_slots: L
+    :param latent_dim: d, size of messages, states and slots
+    :param projection_hidden: sizes of the hidden layers of g_theta, g_omega and g_phi
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        n_agents: int,
+        activation_fn: type[nn.Module],
+        n_slots: int,
+        latent_dim: int,
+        projection_hidden: Sequence[int],
+    ):
+        super().__init__(latent_dim)
+        self.message_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        self.state_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        self.knowledge_source = KnowledgeSource(n_agents, latent_dim, n_slots)
+        self.combine_net = mlp([2 * latent_dim, *projection_hidden, latent_dim], activation_fn)
+
+    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamStates`."""
+        # g_theta and g_omega depend on one view only: once per view, then gathered.
+        messages, states = self.message_net(features)[teams], self.state_net(features)[teams]
+        read = self.knowledge_source(messages, states, active)
+        combined: th.Tensor = self.combine_net(th.cat([states, read], dim=2))
+        return combined
+
+
+class SAFCritic(SAFStates, TeamCritic):
+    """
+    V_i from s_i^SAF, or from those of the whole team.
 
     :param features_dim: size of z
     :param n_agents: N
@@ -47,28 +83,12 @@ class SAFCritic(TeamCritic):
         latent_dim: int,
         projection_hidden: Sequence[int],
     ):
-        super().__init__()
-        self.message_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
-        self.state_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
-        self.knowledge_source = KnowledgeSource(n_agents, latent_dim, n_slots)
-        self.combine_net = mlp([2 * latent_dim, *projection_hidden, latent_dim], activation_fn)
+        super().__init__(features_dim, n_agents, activation_fn, n_slots, latent_dim, projection_hidden)
         self.value_head: OwnValueHead | JointValueHead
         if critic_input == "own":
             self.value_head = OwnValueHead(latent_dim, n_agents, hidden, activation_fn, heads)
         else:
             self.value_head = JointValueHead(latent_dim, n_agents, hidden, activation_fn, heads, agent_identity)
-
-    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
-        """
-        s^SAF of every agent; see :meth:`forward` for the parameters.
-
-        :return: (G, N, d)
-        """
-        # g_theta and g_omega depend on one view only: once per view, then gathered.
-        messages, states = self.message_net(features)[teams], self.state_net(features)[teams]
-        read = self.knowledge_source(messages, states, active)
-        combined: th.Tensor = self.combine_net(th.cat([states, read], dim=2))
-        return combined
 
     def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`."""

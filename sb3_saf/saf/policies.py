@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, get_args
 
 from sb3_saf.common.actor import Actor
-from sb3_saf.common.critic import OwnValueHead, TeamCritic
+from sb3_saf.common.critic import OwnValueHead, TeamCritic, TeamStates
 from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one, check_choice
 from sb3_saf.common.policies import TeamActorCriticPolicy
 from sb3_saf.mappo.policies import MAPPOParts
-from sb3_saf.saf.critic import CriticInput, SAFCritic
+from sb3_saf.saf.critic import CriticInput, SAFCritic, SAFStates
 from sb3_saf.saf.policy_pool import PolicyPool, Selection
 
 
@@ -45,6 +45,8 @@ class SAFParts(MAPPOParts):
         check_choice("critic_input", self.critic_input, get_args(CriticInput))
         for name in ("n_policies", "n_slots", "latent_dim"):
             check_at_least_one(name, getattr(self, name))
+        # Saved models may bring a list.
+        object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
 
     def actor(self, spec: NetworkSpec) -> Actor:
         """The policy pool; with a single policy there is nothing to select, and the actor is MAPPO's."""
@@ -78,6 +80,20 @@ class SAFParts(MAPPOParts):
             latent_dim=self.latent_dim,
             projection_hidden=self.projection_arch,
         )
+
+    def team_states(self, spec: NetworkSpec) -> TeamStates | None:
+        """s_i^SAF, or those of all agents."""
+        if not self.knowledge_source:
+            return super().team_states(spec)
+        states = SAFStates(
+            spec.features_dim,
+            spec.n_agents,
+            spec.activation_fn,
+            n_slots=self.n_slots,
+            latent_dim=self.latent_dim,
+            projection_hidden=self.projection_arch,
+        )
+        return states if self.critic_input == "own" else self._joint(self.latent_dim, spec.n_agents, states)
 
 
 class SAFPolicy(TeamActorCriticPolicy):

@@ -19,6 +19,7 @@ from sb3_saf.common.actor import ActionHead, Actor
 from sb3_saf.common.distributions import (
     SelectedDistribution,
     distribution_of,
+    masked_parameters,
     mixture_log_probs,
     mixture_of,
     n_action_parameters,
@@ -105,17 +106,34 @@ class PolicyPool(Actor):
         :param agent: not read
         :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
         """
-        log_weights, actions = self.evaluate(features)
         if self._is_categorical_mixture:
-            return mixture_log_probs(log_weights, actions)
+            return mixture_log_probs(*self.evaluate(features))
+        return self.unmixed(features)
+
+    def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`Actor`; (K, d) to (K, U + U P) weights and parameters."""
+        log_weights, actions = self.evaluate(features)
         return th.cat([log_weights, actions.flatten(1)], dim=1)
 
     def distribution(self, parameters: th.Tensor) -> Distribution:
         """See :class:`Actor`."""
         if self._is_categorical_mixture:
             return distribution_of(self.action_space, parameters)
+        return self._of_pool(self._split(parameters))
+
+    def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
+        """See :class:`Actor`; masked first, then mixed, so that masks leave the choice among policies as it is."""
+        log_weights, actions = self._split(parameters)
+        return self._of_pool(PoolOutput(log_weights, masked_parameters(self.action_space, actions, masks)))
+
+    def _split(self, parameters: th.Tensor) -> PoolOutput:
+        """Weights and parameters of B rows, out of (B, U + U P)."""
         log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
-        actions = flat.reshape(-1, self.n_policies, n_action_parameters(self.action_space))
+        shape = (-1, self.n_policies, n_action_parameters(self.action_space))
+        return PoolOutput(log_weights, flat.reshape(shape))
+
+    def _of_pool(self, output: PoolOutput) -> Distribution:
+        log_weights, actions = output
         if self.selection == "mixture":
             return mixture_of(self.action_space, log_weights, actions)
         favourite = policy_parameters(actions, log_weights.argmax(dim=1))

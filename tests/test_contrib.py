@@ -1,0 +1,713 @@
+"""The same critics and pool in sb3-contrib's TRPO, RecurrentPPO and MaskablePPO."""
+
+from __future__ import annotations
+
+import copy
+import csv
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+import sb3_saf
+from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy, evaluate_team, make_team_env
+from sb3_saf.common.distributions import distribution_of, masked_parameters, mixture_of
+from sb3_saf.common.policies import TeamPolicy
+from sb3_saf.common.teams import TeamSpaces
+from sb3_saf.contrib.maskable import TeamMaskablePolicy
+from sb3_saf.contrib.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
+from sb3_saf.saf.policy_pool import PolicyPool
+from tests.contrib_teams import CueTeams, MaskedTeams, choices_of, is_allowed, random_masks
+from tests.toy_envs import CounterEnv
+from tests.toy_teams import VECTOR, ToyTeams, take, team_rows, to_numpy
+
+HIDDEN = 6
+FAMILIES = ("IPPO", "MAPPO", "SAF")
+ACTIONS: dict[str, spaces.Space[Any]] = {
+    "discrete": spaces.Discrete(3),
+    "multi-discrete": spaces.MultiDiscrete([3, 2]),
+    "multi-binary": spaces.MultiBinary(2),
+    "box": spaces.Box(-1.0, 1.0, (2,), np.float32),
+}
+MASKABLE = [name for name in ACTIONS if name != "box"]
+ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"": TRPO, "Lstm": RecurrentPPO, "Maskable": MaskablePPO}
+NAMES = [f"{family}{kind}Policy" for kind in ALGORITHMS for family in FAMILIES]
+#: Every way to set up a critic or an actor that changes what is computed.
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    ("IPPO", {}),
+    ("IPPO", {"heads": "per_agent"}),
+    ("MAPPO", {}),
+    ("MAPPO", {"agent_identity": False}),
+    ("MAPPO", {"heads": "per_agent"}),
+    ("SAF", {}),
+    ("SAF", {"heads": "per_agent"}),
+    ("SAF", {"critic_input": "team"}),
+    ("SAF", {"selection": "gumbel"}),
+    ("SAF", {"n_policies": 1, "knowledge_source": False}),
+]
+
+
+def kind_of(name: str) -> str:
+    return next(kind for kind in ("Lstm", "Maskable", "") if name.endswith(f"{kind}Policy"))
+
+
+def sizes_of(name: str) -> dict[str, Any]:
+    """Arguments of a small policy."""
+    sizes: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
+    if name.startswith("SAF"):
+        sizes |= {"latent_dim": 8, "projection_arch": (10,)}
+    return sizes | ({"lstm_hidden_size": HIDDEN} if "Lstm" in name else {})
+
+
+def make_policy(
+    name: str, action_space: spaces.Space[Any] = ACTIONS["discrete"], noise: float = 0.3, **kwargs: Any
+) -> Any:
+    """A small policy for three agents, with noise on the actor's small first weights so that every part matters."""
+    th.manual_seed(0)
+    policy_class: type[TeamPolicy] = getattr(sb3_saf, name)
+    space = TeamSpaces.of(VECTOR, 3).to_dict_space()
+    policy = policy_class(space, action_space, lambda _: 1e-3, **(sizes_of(name) | kwargs))
+    with th.no_grad():
+        for parameter in policy.actor.parameters():
+            parameter.add_(noise * th.randn_like(parameter))
+    return policy
+
+
+def make_venv(name: str, action: str = "discrete") -> ToyTeams:
+    return MaskedTeams(ACTIONS[action]) if "Maskable" in name else ToyTeams(action_space=ACTIONS[action])
+
+
+def make_model(name: str, venv: ToyTeams | None = None, seed: int = 0, **kwargs: Any) -> Any:
+    """An algorithm on 4 games of 3 agents; a rollout has 8 steps (96 rows), an episode 5."""
+    settings: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "device": "cpu", "seed": seed}
+    settings |= {} if kind_of(name) == "" else {"n_epochs": 2}
+    policy_kwargs = sizes_of(name) | kwargs.pop("policy_kwargs", {})
+    venv = make_venv(name) if venv is None else venv
+    return ALGORITHMS[kind_of(name)](name, venv, policy_kwargs=policy_kwargs, **(settings | kwargs))
+
+
+def equal_weights(one: th.nn.Module, other: th.nn.Module) -> bool:
+    first, second = one.state_dict(), other.state_dict()
+    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
+
+
+def unchanged(before: th.nn.Module, after: th.nn.Module) -> set[str]:
+    """Names of parameters with an output whose weights did not change."""
+    old, new = dict(before.named_parameters()), dict(after.named_parameters())
+    return {
+        name
+        for name in new
+        if not (new[name] - old[name]).flatten(1 if new[name].dim() > 1 else 0).abs().sum(dim=-1).min() > 0
+    }
+
+
+def no_memory(n_sequences: int) -> LstmStates:
+    return th.zeros(1, n_sequences, HIDDEN), th.zeros(1, n_sequences, HIDDEN)
+
+
+# --- all three algorithms ---------------------------------------------------------------------------------------------
+
+
+def test_names_are_registered() -> None:
+    for kind, algorithm in ALGORITHMS.items():
+        for family in FAMILIES:
+            name = f"{family}{kind}Policy"
+            assert algorithm.policy_aliases[name] is getattr(sb3_saf, name)
+    assert "SAFPolicy" not in MaskablePPO.policy_aliases
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_weight_is_trained(name: str) -> None:
+    model = make_model(name)
+    before = copy.deepcopy(model.policy)
+    model.learn(96)
+    assert unchanged(before, model.policy) == set()
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize(
+    ("kind", "action"),
+    # The discrete ones are trained above; MaskablePPO takes no Box actions.
+    [(kind, action) for kind in ALGORITHMS for action in (MASKABLE if kind == "Maskable" else list(ACTIONS))[1:]],
+)
+def test_every_action_space_is_trained(kind: str, action: str) -> None:
+    name = f"SAF{kind}Policy"
+    model = make_model(name, make_venv(name, action))
+    before = copy.deepcopy(model.policy)
+    model.learn(96)
+    assert unchanged(before, model.policy) == set()
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_two_runs_of_one_seed_end_alike(kind: str) -> None:
+    one, other, third = (make_model(f"SAF{kind}Policy", seed=seed).learn(96) for seed in (1, 1, 2))
+    assert equal_weights(one.policy, other.policy)
+    assert not equal_weights(one.policy, third.policy)
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_model_saves_loads_and_continues(kind: str, tmp_path: Path) -> None:
+    name = f"SAF{kind}Policy"
+    model = make_model(name, policy_kwargs={"n_policies": 3, "critic_input": "team", "chunk_size": 7}).learn(96)
+    model.save(tmp_path / "model")
+    loaded: Any = ALGORITHMS[kind].load(tmp_path / "model", env=make_venv(name), device="cpu")
+    assert type(loaded.policy) is type(model.policy)
+    assert (loaded.policy.parts, loaded.policy.chunk_size) == (model.policy.parts, 7)
+    assert equal_weights(model.policy, loaded.policy)
+    obs = to_numpy(team_rows(VECTOR))
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    loaded.learn(96, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 192
+    assert not equal_weights(model.policy, loaded.policy)
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_game_steps_are_logged(kind: str, tmp_path: Path) -> None:
+    model = make_model(f"IPPO{kind}Policy")
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(192)
+    model.logger.close()
+    with open(tmp_path / "progress.csv") as file:
+        rows = list(csv.DictReader(file))
+    # 3 agents: 96 rows are 32 steps of games.
+    assert [row["time/game_steps"] for row in rows] == ["32", "64"]
+
+
+def test_one_seed_starts_alike() -> None:
+    for family in FAMILIES:
+        plain, masked = (make_policy(f"{family}{kind}Policy", noise=0.0) for kind in ("", "Maskable"))
+        assert equal_weights(plain, masked)
+    ippo, mappo = (make_policy(name, noise=0.0) for name in ("IPPOLstmPolicy", "MAPPOLstmPolicy"))
+    for part in ("features_extractor", "lstm_actor", "actor"):
+        assert equal_weights(getattr(ippo, part), getattr(mappo, part))
+
+
+# --- TRPO -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["IPPOPolicy", "MAPPOPolicy", "SAFPolicy"])
+def test_trpos_policy_step_moves_actor_and_encoder_and_its_value_step_the_critic(name: str) -> None:
+    # The policy step does not use the learning rate; without line search there is no policy step.
+    for settings, critic_moves in (({"learning_rate": 0.0}, False), ({"line_search_max_iter": 0}, True)):
+        model = make_model(name, **settings)
+        before = copy.deepcopy(model.policy)
+        model.learn(96)
+        expected = {n for n, _ in model.policy.named_parameters() if ("value" in n) != critic_moves}
+        assert unchanged(before, model.policy) == expected
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_trpos_line_search_finds_better_policies_within_its_region(action: str) -> None:
+    venv = ToyTeams(action_space=ACTIONS[action], n_views=6, n_games=8)
+    model = make_model("SAFPolicy", venv, n_steps=10, batch_size=240, gamma=0.0, target_kl=0.02)
+    for _ in range(4):
+        model.learn(240, reset_num_timesteps=False)
+        logged = model.logger.name_to_value
+        assert logged["train/is_line_search_success"] == 1.0
+        assert 0 < logged["train/kl_divergence_loss"] < 0.02
+        assert logged["train/policy_objective"] > 0
+
+
+def test_trpo_improves() -> None:
+    # Reward: first number of the view times the action, minus a tenth of the action. Best action by the view's sign.
+    venv = ToyTeams(n_views=6, n_games=8)
+    model = make_model("SAFPolicy", venv, n_steps=10, batch_size=240, gamma=0.0, target_kl=0.1, n_critic_updates=4)
+    best = np.where(venv._views[:, 0] > 0.1, 2, 0)
+    model.learn(14 * 240)
+    np.testing.assert_array_equal(model.predict(venv._views, deterministic=True)[0], best)
+
+
+def test_trpo_refuses_policies_that_are_drawn_anew() -> None:
+    for action in ("discrete", "multi-discrete"):
+        venv = ToyTeams(action_space=ACTIONS[action])
+        with pytest.raises(ValueError, match=r"TRPO's KL divergence\) says nothing; use selection='mixture'"):
+            make_model("SAFPolicy", venv, policy_kwargs={"selection": "gumbel"}).learn(96)
+
+
+def random_mixtures(space: spaces.Space[Any], n_parameters: int) -> list[tuple[th.Tensor, th.Tensor]]:
+    return [(th.randn(7, 4).log_softmax(dim=1), th.randn(7, 4, n_parameters)) for _ in range(2)]
+
+
+@pytest.mark.parametrize("action", ["multi-discrete", "multi-binary"])
+def test_the_pools_divergence_bounds_that_of_its_actions(action: str) -> None:
+    space = ACTIONS[action]
+    first, second = random_mixtures(space, 5 if action == "multi-discrete" else 2)
+    one, other = (mixture_of(space, *mixture).distribution for mixture in (first, second))
+    assert isinstance(one, th.distributions.Distribution) and isinstance(other, th.distributions.Distribution)
+    found = th.distributions.kl_divergence(one, other)
+    joint_actions = [th.tensor([action] * 7) for action in product(*map(range, choices_of(space)))]
+
+    def log_probs(mixture: tuple[th.Tensor, th.Tensor], of_each_policy: bool) -> th.Tensor:
+        log_weights, parameters = mixture
+        by_policy = th.stack(
+            [
+                th.stack([distribution_of(space, parameters[:, u]).log_prob(a.float()) for a in joint_actions], dim=1)
+                for u in range(4)
+            ],
+            dim=1,
+        )
+        both = (log_weights.unsqueeze(2) + by_policy).flatten(1)
+        return both if of_each_policy else both.view(7, 4, -1).logsumexp(dim=1)
+
+    exact = {}
+    for of_each_policy in (True, False):
+        p, q = (log_probs(mixture, of_each_policy) for mixture in (first, second))
+        exact[of_each_policy] = (p.exp() * (p - q)).sum(dim=1)
+    th.testing.assert_close(found, exact[True])
+    assert (found > exact[False]).all()
+    th.testing.assert_close(th.distributions.kl_divergence(one, one), th.zeros(7))
+
+
+def test_the_pools_divergence_for_continuous_actions() -> None:
+    first, second = random_mixtures(ACTIONS["box"], 4)
+    one, other = (mixture_of(ACTIONS["box"], *mixture).distribution for mixture in (first, second))
+    assert isinstance(one, th.distributions.Distribution) and isinstance(other, th.distributions.Distribution)
+    (w, a), (v, b) = first, second
+    mean, std, other_mean, other_std = a[..., :2], a[..., 2:].exp(), b[..., :2], b[..., 2:].exp()
+    normals = (other_std / std).log() + (std**2 + (mean - other_mean) ** 2) / (2 * other_std**2) - 0.5
+    expected = (w.exp() * (w - v + normals.sum(dim=2))).sum(dim=1)
+    th.testing.assert_close(th.distributions.kl_divergence(one, other), expected)
+
+
+# --- RecurrentPPO -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch_size", [96, 37])
+@pytest.mark.parametrize(("family", "kwargs"), [v for v in VARIANTS if v[1].get("selection") != "gumbel"])
+def test_training_sees_the_values_and_likelihoods_of_the_rollout(
+    family: str, kwargs: dict[str, Any], batch_size: int
+) -> None:
+    model = make_model(f"{family}LstmPolicy", n_epochs=1, learning_rate=0.0, policy_kwargs=kwargs)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(0.3 * th.randn_like(parameter))
+    # The second rollout starts within an episode, with what was remembered of it.
+    model.learn(192)
+    n_rows = 0
+    for batch in model.rollout_buffer.get(batch_size):
+        actions = batch.actions.long().flatten()
+        found = model.policy.evaluate_actions(batch.observations, actions, batch.lstm_states, batch.episode_starts)
+        mask = batch.mask > 0
+        th.testing.assert_close(found[0].flatten()[mask], batch.old_values[mask], rtol=0, atol=1e-5)
+        assert ((found[1] - batch.old_log_prob)[mask].exp() - 1).abs().max() < 1e-5
+        n_rows += int(mask.sum())
+    assert n_rows == 96
+
+
+def lstm_by_hand(lstm: Any, inputs: th.Tensor, starts: list[bool]) -> th.Tensor:
+    """(T, H) outputs for one sequence (T, S), by the gates' equations."""
+    hidden, cell, outputs = th.zeros(HIDDEN), th.zeros(HIDDEN), []
+    for x, start in zip(inputs, starts, strict=True):
+        if start:
+            hidden, cell = th.zeros(HIDDEN), th.zeros(HIDDEN)
+        gates = lstm.weight_ih_l0 @ x + lstm.bias_ih_l0 + lstm.weight_hh_l0 @ hidden + lstm.bias_hh_l0
+        i, f, g, o = gates.chunk(4)
+        cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
+        hidden = o.sigmoid() * cell.tanh()
+        outputs.append(hidden)
+    return th.stack(outputs)
+
+
+@pytest.mark.parametrize(("family", "kwargs"), [v for v in VARIANTS if v[1].get("selection") != "gumbel"])
+def test_memory_against_an_independent_loop(family: str, kwargs: dict[str, Any]) -> None:
+    policy = make_policy(f"{family}LstmPolicy", **kwargs)
+    assert isinstance(policy.value_net, RecurrentCritic)
+    n_steps, rows = 5, team_rows(VECTOR, n_games=10)
+    # Two sequences: agent 2 of games 0 to 4, and agent 0 of games 5 to 9 as if they were one game's steps.
+    sequences = take(rows, [3 * t + 2 for t in range(n_steps)] + [15 + 3 * t for t in range(n_steps)])
+    starts = [[False] * n_steps, [False, False, True, False, False]]
+    values, log_prob, _ = policy.evaluate_actions(
+        sequences, th.zeros(10).long(), RNNStates(no_memory(2), no_memory(2)), th.tensor(starts).flatten().float()
+    )
+    for number, agent in enumerate((2, 0)):
+        steps = take(sequences, slice(number * n_steps, (number + 1) * n_steps))  # type: ignore[arg-type]
+        latent = lstm_by_hand(policy.lstm_actor, policy.features_extractor(steps["obs"]), starts[number])
+        agents = th.full((n_steps,), agent)
+        expected = policy.actor.distribution(policy.actor(latent, agents)).log_prob(th.zeros(n_steps).long())
+        th.testing.assert_close(log_prob.view(2, -1)[number], expected)
+        known = [policy.features_extractor(team) for team in steps["team"]]  # z of each step's team
+        if policy.value_net.team_states is None:
+            inputs = [z[agent] for z in known]
+        else:
+            one_team = th.arange(3).unsqueeze(0)
+            inputs = [policy.value_net.team_states.states(z, one_team)[0, agent] for z in known]
+        latent = lstm_by_hand(policy.value_net.lstm, th.stack(inputs), starts[number])
+        th.testing.assert_close(values.view(2, -1)[number], policy.value_net.head(latent, agents))
+
+
+def test_what_joint_critics_remember() -> None:
+    z, teams = th.randn(5, 12), th.tensor([[0, 1, 2], [4, 4, 3]])
+    joint = z[teams].flatten(1)
+    mappo = make_policy("MAPPOLstmPolicy").value_net.team_states
+    assert mappo.states_dim == 3 * 12 + 3
+    for agent in range(3):
+        identity = th.eye(3)[agent].expand(2, -1)
+        assert th.equal(mappo.states(z, teams)[:, agent], th.cat([joint, identity], dim=1))
+    alike = make_policy("MAPPOLstmPolicy", agent_identity=False).value_net.team_states
+    assert alike.states_dim == 36 and th.equal(alike.states(z, teams)[:, 2], joint)
+    active = th.tensor([[True, False, True], [True, True, True]])
+    masked = z[teams] * active.unsqueeze(2)
+    assert th.equal(alike.states(z, teams, active)[:, 0], masked.flatten(1))
+    own, team = (make_policy("SAFLstmPolicy", critic_input=kind).value_net.team_states for kind in ("own", "team"))
+    own.load_state_dict(team.members.state_dict())
+    assert (own.states_dim, team.states_dim) == (8, 3 * 8 + 3)
+    assert th.equal(team.states(z, teams)[:, 1, :24], own.states(z, teams).flatten(1))
+    plain = make_policy("SAFPolicy").value_net
+    own.load_state_dict({k: v for k, v in plain.state_dict().items() if not k.startswith("value_head")})
+    assert th.equal(own.states(z, teams), plain.states(z, teams))
+
+
+@pytest.mark.parametrize(("family", "kwargs"), VARIANTS)
+def test_nothing_but_own_observation_and_own_memory_changes_an_action_by_a_bit(
+    family: str, kwargs: dict[str, Any]
+) -> None:
+    policy, obs = make_policy(f"{family}LstmPolicy", **kwargs), team_rows(VECTOR)
+    actor, critic = ((th.randn(1, 12, HIDDEN), th.randn(1, 12, HIDDEN)) for _ in range(2))
+    starts = (th.arange(12) % 4 == 1).float()
+    others = obs | {"team": team_rows(VECTOR, n_views=12, seed=1)["team"]}
+    # Row 7 keeps its memory; its teammates and all critics get other memories.
+    elsewhere: LstmStates = tuple(th.where((th.arange(12) == 7).view(1, -1, 1), s, th.randn_like(s)) for s in actor)
+    th.manual_seed(3)
+    actions, values, log_prob, states = policy(obs, RNNStates(actor, critic), starts)
+    th.manual_seed(3)
+    again, other_values, other_log_prob, other_states = policy(others, RNNStates(actor, no_memory(12)), starts)
+    assert th.equal(actions, again) and th.equal(log_prob, other_log_prob)
+    assert all(th.equal(one, other) for one, other in zip(states.pi, other_states.pi, strict=True))
+    assert (values != other_values).any()
+    th.manual_seed(3)
+    _, _, _, states_7 = policy(obs, RNNStates(elsewhere, critic), starts)
+    assert all(th.equal(one[:, 7], other[:, 7]) for one, other in zip(states.pi, states_7.pi, strict=True))
+    assert not th.equal(states.pi[0], states_7.pi[0])
+    if kwargs.get("selection") != "gumbel":
+        th.manual_seed(3)
+        acted = policy.get_distribution(obs, actor, starts)[0].distribution.probs
+        assert th.equal(acted[7], policy.get_distribution(obs, elsewhere, starts)[0].distribution.probs[7])
+
+
+def test_predict_remembers_on_plain_own_observations() -> None:
+    policy, obs = make_policy("SAFLstmPolicy"), to_numpy(team_rows(VECTOR, n_games=4, n_views=12))
+    starts = np.ones(12, dtype=bool)
+    state = plain_state = None
+    singles: list[Any] = [None] * 12
+    for step in range(4):
+        shifted = {key: np.roll(value, 3 * step, axis=0) for key, value in obs.items()}
+        actions, state = policy.predict(shifted, state, starts, deterministic=True)
+        plain, plain_state = policy.predict(shifted["obs"], plain_state, starts, deterministic=True)
+        np.testing.assert_array_equal(plain, actions)
+        assert state[0].shape == (1, 12, HIDDEN)
+        np.testing.assert_array_equal(plain_state, state)
+        for row in range(12):
+            action, singles[row] = policy.predict(shifted["obs"][row], singles[row], deterministic=True)
+            assert action.shape == () and action == actions[row]
+            np.testing.assert_allclose(singles[row][0][:, 0], state[0][:, row], atol=1e-6)
+        starts[:] = False
+    forgotten, _ = policy.predict(obs, state, np.ones(12, dtype=bool), deterministic=True)
+    np.testing.assert_array_equal(forgotten, policy.predict(obs, deterministic=True)[0])
+
+
+CUE_SETTINGS = {"n_steps": 12, "batch_size": 384, "n_epochs": 8, "learning_rate": 5e-3, "gamma": 1.0}
+
+
+@pytest.mark.parametrize(("name", "solves"), [("SAFLstmPolicy", True), ("SAFPolicy", False)])
+def test_a_cue_seen_earlier_decides_the_right_action(name: str, solves: bool) -> None:
+    # The cue is gone when it pays to name it: with memory all are named, without memory half of them.
+    algorithm: type[OnPolicyAlgorithm] = RecurrentPPO if solves else PPO
+    sizes = sizes_of(name) | ({"lstm_hidden_size": 16} if solves else {})
+    model = algorithm(name, CueTeams("own"), policy_kwargs=sizes, seed=0, device="cpu", **CUE_SETTINGS)  # type: ignore[arg-type]
+    model.learn(8 * 384)
+    named = evaluate_team(model, CueTeams("own"), 400, warn=False).mean / 2
+    assert named == 1.0 if solves else abs(named - 0.5) < 0.08
+
+
+def error_of_last_values(policy: TeamRecurrentPolicy) -> float:
+    """Mean squared error of the values just before the only reward."""
+    venv = CueTeams("mate")
+    venv.seed(5)
+    obs, hidden = venv.reset(), policy.lstm_actor.hidden_size
+    states = RNNStates(*((th.zeros(1, 32, hidden), th.zeros(1, 32, hidden)) for _ in range(2)))
+    for step in range(3):
+        rows = {key: th.as_tensor(value) for key, value in obs.items()}  # type: ignore[union-attr]
+        with th.no_grad():
+            actions, values, _, states = policy(rows, states, th.full((32,), float(step == 0)))
+        obs, rewards, _, _ = venv.step(actions.numpy())
+    return float(((values[:, 0].numpy() - rewards) ** 2).mean())
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "knows"),
+    [
+        ("SAFLstmPolicy", {}, True),
+        ("MAPPOLstmPolicy", {}, True),
+        ("IPPOLstmPolicy", {}, False),
+        ("MAPPOLstmPolicy", {"enable_critic_lstm": False}, False),
+    ],
+)
+def test_a_critic_remembers_what_a_teammate_saw(name: str, kwargs: dict[str, Any], knows: bool) -> None:
+    # -1 or 1 is paid, as the teammate's cue said two steps ago. Who cannot know it is wrong by 1, squared.
+    sizes = sizes_of(name) | {"lstm_hidden_size": 16} | kwargs
+    settings: dict[str, Any] = CUE_SETTINGS | {"gae_lambda": 1.0, "vf_coef": 1.0}
+    model = RecurrentPPO(name, CueTeams("mate"), policy_kwargs=sizes, seed=0, device="cpu", **settings)
+    model.learn(8 * 384)
+    error = error_of_last_values(model.policy)  # type: ignore[arg-type]
+    assert error < 0.01 if knows else 0.9 < error < 1.1
+
+
+def test_time_limits_are_bootstrapped_from_single_rows() -> None:
+    # The only episode that ends within the rollout does so by a time limit, for 12 rows.
+    model = make_model("SAFLstmPolicy", n_epochs=1)
+    asked: list[int] = []
+    predict_values = model.policy.predict_values
+
+    def noting(obs: Any, *args: Any) -> th.Tensor:
+        asked.append(len(obs["obs"]))
+        values: th.Tensor = predict_values(obs, *args)
+        return values
+
+    model.policy.predict_values = noting
+    model.learn(96)
+    assert asked == [1] * 12 + [12]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"shared_lstm": True}, r"no LSTM shared by actor and critic.*leave shared_lstm=False"),
+        ({"lstm_hidden_size": 0}, r"lstm_hidden_size must be a whole number of at least 1, got 0"),
+        ({"n_lstm_layers": 1.5}, r"n_lstm_layers must be a whole number of at least 1, got 1.5"),
+        ({"use_sde": True}, r"no state-dependent exploration"),
+    ],
+)
+def test_bad_arguments_of_recurrent_policies(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_policy("SAFLstmPolicy", **kwargs)
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"n_lstm_layers": 2, "lstm_kwargs": {"bias": False}}, {"enable_critic_lstm": False}]
+)
+def test_recurrent_policy_saves_and_loads(kwargs: dict[str, Any], tmp_path: Path) -> None:
+    policy = make_policy("SAFLstmPolicy", heads="per_agent", chunk_size=5, **kwargs)
+    policy.save(str(tmp_path / "policy"))
+    loaded = SAFLstmPolicy.load(str(tmp_path / "policy"), device="cpu")
+    assert equal_weights(policy, loaded)
+    assert (loaded.parts, loaded.chunk_size) == (policy.parts, 5)
+    n_layers = kwargs.get("n_lstm_layers", 1)
+    obs, states = team_rows(VECTOR), tuple(th.randn(n_layers, 12, HIDDEN) for _ in range(2))
+    starts = th.zeros(12)
+    assert th.equal(loaded.predict_values(obs, states, starts), policy.predict_values(obs, states, starts))
+    model = make_model("SAFLstmPolicy", policy_kwargs=kwargs)
+    before = copy.deepcopy(model.policy)
+    model.learn(96)
+    assert unchanged(before, model.policy) == set()
+
+
+def test_without_the_critics_lstm_it_is_ppos_critic() -> None:
+    policy, plain = make_policy("SAFLstmPolicy", enable_critic_lstm=False), make_policy("SAFPolicy")
+    plain.value_net.load_state_dict(policy.value_net.state_dict())
+    plain.features_extractor.load_state_dict(policy.features_extractor.state_dict())
+    obs = team_rows(VECTOR)
+    assert th.equal(policy.predict_values(obs, no_memory(12), th.zeros(12)), plain.predict_values(obs))
+
+
+# --- naive encoding gives the same ------------------------------------------------------------------------------------
+
+
+def evaluate(policy: TeamPolicy, obs: dict[str, th.Tensor], actions: th.Tensor) -> tuple[Any, Any, Any]:
+    """Values, log-likelihoods and entropies of 30 rows, as the policy's algorithm asks for them."""
+    if isinstance(policy, TeamRecurrentPolicy):
+        generator = th.Generator().manual_seed(1)
+        states = [tuple(th.randn(1, 6, HIDDEN, generator=generator) for _ in range(2)) for _ in range(2)]
+        starts = (th.arange(30) % 7 == 4).float()
+        return policy.evaluate_actions(obs, actions, RNNStates(*states), starts)
+    assert isinstance(policy, TeamMaskablePolicy)
+    masks = random_masks(policy.action_space, 30, np.random.default_rng(0))
+    masks[np.arange(30), actions] = True
+    return policy.evaluate_actions(obs, actions, masks)
+
+
+@pytest.mark.parametrize("kind", ["Lstm", "Maskable"])
+@pytest.mark.parametrize(("family", "kwargs"), VARIANTS)
+def test_naive_encoding_gives_the_same_loss_and_gradients(kind: str, family: str, kwargs: dict[str, Any]) -> None:
+    obs, results = team_rows(VECTOR, n_games=10), []
+    weights = th.randn(3, 30, generator=th.Generator().manual_seed(5))
+    actions = th.randint(3, (30,), generator=th.Generator().manual_seed(6))
+    for settings in ({"chunk_size": 3}, {"chunk_size": None, "distinct": False}):
+        policy = make_policy(f"{family}{kind}Policy", **settings, **kwargs)
+        th.manual_seed(5)
+        values, log_prob, entropy = evaluate(policy, obs, actions)
+        loss = (weights[0] * values[:, 0] + weights[1] * log_prob + weights[2] * entropy).mean()
+        loss.backward()
+        results.append((loss.detach(), {n: p.grad for n, p in policy.named_parameters() if p.grad is not None}))
+    (loss, gradients), (expected_loss, expected) = results
+    th.testing.assert_close(loss, expected_loss, rtol=1e-5, atol=1e-6)
+    assert gradients.keys() == expected.keys()
+    for name, gradient in gradients.items():
+        assert (gradient - expected[name]).abs().max() <= 1e-5 * expected[name].abs().max().clamp_min(1.0), name
+
+
+# --- MaskablePPO ------------------------------------------------------------------------------------------------------
+
+
+def enumerated(policy: TeamMaskablePolicy, obs: dict[str, th.Tensor], masks: np.ndarray) -> tuple[th.Tensor, th.Tensor]:
+    """All joint actions (J, D), and the exact probability of each for each row (B, J), by the definition."""
+    pool, choices = policy.actor, choices_of(policy.action_space)
+    assert isinstance(pool, PolicyPool)
+    log_weights, parameters = pool.evaluate(policy.features_extractor(obs["obs"]))
+    if isinstance(policy.action_space, spaces.MultiBinary):
+        parameters = th.stack([th.zeros_like(parameters), parameters], dim=3).flatten(2)  # logits of off and on
+    weights = parameters.exp() * th.tensor(masks).unsqueeze(1)
+    factors = [part / part.sum(dim=2, keepdim=True) for part in th.split(weights, choices, dim=2)]
+    joint = list(product(*map(range, choices)))
+    by_action = [
+        sum(
+            log_weights[:, u].exp() * th.stack([f[:, u, a] for f, a in zip(factors, action, strict=True)]).prod(dim=0)
+            for u in range(pool.n_policies)
+        )
+        for action in joint
+    ]
+    return th.tensor(joint), th.stack(by_action, dim=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("action", MASKABLE)
+def test_masked_mixture_against_enumeration(action: str) -> None:
+    space = ACTIONS[action]
+    policy, obs = make_policy("SAFMaskablePolicy", space), team_rows(VECTOR, n_views=12)
+    masks = random_masks(space, 12, np.random.default_rng(0))
+    joint, expected = enumerated(policy, obs, masks)
+    th.testing.assert_close(expected.sum(dim=1), th.ones(12))
+    shape = (12, *(space.shape or ()))
+    for action_index, joint_action in enumerate(joint):
+        actions = joint_action.expand(12, -1).reshape(shape).float()
+        _, log_prob, entropy = policy.evaluate_actions(obs, actions, masks)
+        th.testing.assert_close(log_prob.exp(), expected[:, action_index], rtol=1e-5, atol=1e-7)
+        forbidden = ~is_allowed(space, actions.numpy(), masks)
+        assert (log_prob.exp()[forbidden] == 0).all()
+    th.testing.assert_close(entropy, -th.special.xlogy(expected, expected).sum(dim=1), rtol=1e-5, atol=1e-6)
+    modes, values, log_prob = policy(obs, deterministic=True, action_masks=masks)
+    assert th.equal(modes.reshape(12, -1).long(), joint[expected.argmax(dim=1)])
+    th.testing.assert_close(log_prob.exp(), expected.max(dim=1).values, rtol=1e-5, atol=1e-7)
+    th.testing.assert_close(values, policy.predict_values(obs))
+
+
+@pytest.mark.parametrize("action", MASKABLE)
+@pytest.mark.parametrize("kwargs", [{}, {"selection": "gumbel"}, {"n_policies": 1}])
+def test_forbidden_actions_are_never_taken(action: str, kwargs: dict[str, Any]) -> None:
+    space = ACTIONS[action]
+    policy = make_policy("SAFMaskablePolicy", space, **kwargs)
+    obs, masks = to_numpy(team_rows(VECTOR, n_games=400)), random_masks(space, 1200, np.random.default_rng(0))
+    assert not is_allowed(space, policy.predict(obs)[0], masks).all()
+    for deterministic in (False, True):
+        actions, _ = policy.predict(obs, deterministic=deterministic, action_masks=masks)
+        assert is_allowed(space, actions, masks).all()
+        plain, _ = policy.predict(obs["obs"], deterministic=deterministic, action_masks=masks)
+        assert is_allowed(space, plain, masks).all()
+    one, _ = policy.predict(obs["obs"][3], action_masks=masks[3])
+    assert is_allowed(space, one, masks[3:4]).all()
+
+
+@pytest.mark.parametrize("action", MASKABLE)
+def test_training_keeps_to_the_masks_and_sees_the_likelihoods_of_the_rollout(action: str) -> None:
+    venv = MaskedTeams(ACTIONS[action])
+    model = make_model("SAFMaskablePolicy", venv, n_epochs=1, learning_rate=0.0, policy_kwargs={"ortho_init": False})
+    model.learn(192)
+    assert (venv.n_actions, venv.n_forbidden) == (192, 0)
+    for batch in model.rollout_buffer.get(24):
+        actions = batch.actions.long().flatten() if action == "discrete" else batch.actions
+        _, log_prob, _ = model.policy.evaluate_actions(batch.observations, actions, batch.action_masks)
+        assert ((log_prob - batch.old_log_prob).exp() - 1).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("action", MASKABLE)
+@pytest.mark.parametrize("kwargs", [{}, {"n_policies": 1}])
+def test_masks_that_allow_everything_change_nothing(action: str, kwargs: dict[str, Any]) -> None:
+    policy = make_policy("SAFMaskablePolicy", ACTIONS[action], **kwargs)
+    obs, everything = team_rows(VECTOR), np.ones((12, sum(choices_of(ACTIONS[action]))))
+    actions, _, _ = policy(obs)
+    for one, other in zip(
+        policy.evaluate_actions(obs, actions), policy.evaluate_actions(obs, actions, everything), strict=True
+    ):
+        th.testing.assert_close(one, other)
+
+
+def test_masks_that_allow_nothing_teach_nothing() -> None:
+    for space in (ACTIONS[name] for name in MASKABLE):
+        policy, obs = make_policy("SAFMaskablePolicy", space), team_rows(VECTOR)
+        n_choices, n_joint = sum(choices_of(space)), np.prod(choices_of(space))
+        nothing = np.zeros((12, n_choices), dtype=bool)
+        actions, _, log_prob = policy(obs, action_masks=nothing)
+        th.testing.assert_close(log_prob, th.full((12,), -float(np.log(n_joint))))
+        policy.evaluate_actions(obs, actions, nothing)[1].sum().backward()
+        assert all(p.grad is None or p.grad.abs().max() < 1e-6 for p in policy.actor.parameters())
+
+
+def test_the_mask_leaves_the_choice_among_policies_as_it_is() -> None:
+    # Two policies, chosen alike: one sure of action 0, one undecided between 1 and 2. Masking 1 makes the second sure
+    # of 2, and both actions as likely. Masking the mixture (1/2, 1/4, 1/4) would give 2/3 and 1/3.
+    parameters = th.tensor([[[50.0, 0.0, 0.0], [-50.0, 0.0, 0.0]]])
+    masked = masked_parameters(ACTIONS["discrete"], parameters, th.tensor([[True, False, True]]))
+    log_weights = th.full((1, 2), 0.5).log()
+    found = mixture_of(ACTIONS["discrete"], log_weights, masked).distribution
+    assert isinstance(found, th.distributions.Categorical)
+    th.testing.assert_close(found.probs, th.tensor([[0.5, 0.0, 0.5]]))
+
+
+@pytest.mark.parametrize(("family", "kwargs"), VARIANTS)
+def test_masked_actions_depend_on_own_observation_and_own_mask_only(family: str, kwargs: dict[str, Any]) -> None:
+    policy, obs = make_policy(f"{family}MaskablePolicy", **kwargs), team_rows(VECTOR)
+    others = obs | {"team": team_rows(VECTOR, n_views=12, seed=1)["team"]}
+    masks = random_masks(ACTIONS["discrete"], 12, np.random.default_rng(0))
+    other_masks = random_masks(ACTIONS["discrete"], 12, np.random.default_rng(1))
+    other_masks[7] = masks[7]
+    outcomes = []
+    for rows, given in ((obs, masks), (others, masks), (obs, other_masks)):
+        th.manual_seed(3)
+        actions, _, acted = policy(rows, action_masks=given)
+        th.manual_seed(3)
+        log_prob = policy.evaluate_actions(rows, actions, given)[1]
+        outcomes.append((actions, log_prob, acted))
+    assert all(th.equal(one, other) for one, other in zip(outcomes[0], outcomes[1], strict=True))
+    th.manual_seed(3)
+    kept = policy.evaluate_actions(obs, outcomes[0][0], other_masks)[1]
+    assert th.equal(kept[7], outcomes[0][1][7])
+    assert not th.equal(kept, outcomes[0][1])
+
+
+def test_masks_reach_the_algorithm_through_every_wrapper() -> None:
+    # CounterEnv: agent i may do i only.
+    env = make_team_env(CounterEnv, n_envs=2)
+    env.reset()
+    assert is_masking_supported(env)
+    np.testing.assert_array_equal(get_action_masks(env), np.tile(np.eye(2, 4, dtype=bool), (2, 1)))
+    model = MaskablePPO(
+        "SAFMaskablePolicy", env, n_steps=4, batch_size=16, n_epochs=1, policy_kwargs=sizes_of("SAF"), device="cpu"
+    )
+    model.learn(16)
+    np.testing.assert_array_equal(model.rollout_buffer.actions.reshape(-1), model.rollout_buffer.action_masks.argmax(1))
+    assert env.get_attr("last_actions")[0] == {"agent_0": 0, "agent_1": 1}
+
+
+def test_malformed_masks_are_refused() -> None:
+    policy, obs = make_policy("SAFMaskablePolicy", ACTIONS["multi-binary"]), team_rows(VECTOR)
+    with pytest.raises(ValueError, match=r"action masks of shape \(12, 4\), one flag for each choice .*got \(12, 3\)"):
+        policy(obs, action_masks=np.ones((12, 3)))
+    with pytest.raises(ValueError, match=r"continuous actions cannot be masked"):
+        masked_parameters(ACTIONS["box"], th.zeros(1, 4), th.ones(1, 2, dtype=th.bool))
+
+
+def test_maskable_policy_saves_and_loads(tmp_path: Path) -> None:
+    policy = make_policy("SAFMaskablePolicy", heads="per_agent", chunk_size=5, normalize_images=False)
+    policy.save(str(tmp_path / "policy"))
+    loaded = SAFMaskablePolicy.load(str(tmp_path / "policy"), device="cpu")
+    assert equal_weights(policy, loaded)
+    assert (loaded.parts, loaded.chunk_size, loaded.normalize_images) == (policy.parts, 5, False)
+    assert isinstance(loaded, SAFMaskablePolicy) and not isinstance(loaded, (SAFPolicy, MAPPOPolicy, IPPOPolicy))
