@@ -28,6 +28,7 @@ from sb3_saf.common.encoders import ObservationEncoder
 from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one
 from sb3_saf.common.teams import AGENT_KEY, OBS_KEY, TEAM_KEY, TEAM_KEYS, TeamSpaces
+from sb3_saf.common.value_normalizer import ValueNormalizer
 from sb3_saf.common.views import OwnViews, ViewEncoder
 
 NetArch = list[int] | dict[str, list[int]]
@@ -52,6 +53,9 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
     :param distinct: False encodes every row, which gives the same numbers slowly
     :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
+    :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
+        ``sb3_saf.common.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. Values that the policy
+        gives, ``train/value_loss`` and ``clip_range_vf`` are on the raw scale either way
     :param use_sde: refused; here because SB3's algorithms pass it
     :param share_features_extractor: actor and critic always share the encoder; False is refused
     :param features_extractor_class: encoder, built on the space of ``obs``
@@ -65,6 +69,7 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
 
     actor: Actor
     value_net: OwnValueHead | TeamCritic  # type: ignore[assignment]
+    value_normalizer: ValueNormalizer | None
 
     def __init__(
         self,
@@ -75,6 +80,7 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         *,
         distinct: bool = True,
         chunk_size: int | None = 512,
+        normalize_values: bool = False,
         use_sde: bool = False,
         share_features_extractor: bool = True,
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
@@ -88,6 +94,7 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         self.parts = self.parts_class(**_taken(kwargs, {field.name for field in fields(self.parts_class)}))
         self.chunk_size = chunk_size
         self.distinct = distinct
+        self.normalize_values = normalize_values
         self.views = ViewEncoder(self._encode, distinct)
         super().__init__(
             observation_space,
@@ -121,6 +128,7 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         self.value_net = self.parts.critic(spec)
         if self.ortho_init:
             orthogonal_init(self.value_net)
+        self.value_normalizer = ValueNormalizer() if self.normalize_values else None
         learning_rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
@@ -140,7 +148,8 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         data = super()._get_constructor_parameters()
         for name in _SDE_ARGUMENTS:
             del data[name]
-        return data | asdict(self.parts) | {"distinct": self.distinct, "chunk_size": self.chunk_size}
+        own = {name: getattr(self, name) for name in ("distinct", "chunk_size", "normalize_values")}
+        return data | asdict(self.parts) | own
 
     @property
     def log_std(self) -> th.Tensor:  # type: ignore[override]  # read-only, and one row per policy
@@ -275,7 +284,8 @@ class TeamActorCriticPolicy(ActorCriticPolicy):
         else:
             own = self.views.own(self._own(obs)) if own is None else own
             values = self.views.per_agent(critic, own, self._agent(obs) if critic.reads_agent else None)
-        return values.unsqueeze(1)
+        values = values.unsqueeze(1)
+        return values if self.value_normalizer is None else self.value_normalizer(values)
 
 
 def _entry(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
