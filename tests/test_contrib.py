@@ -711,3 +711,10 @@ def test_maskable_policy_saves_and_loads(tmp_path: Path) -> None:
     assert equal_weights(policy, loaded)
     assert (loaded.parts, loaded.chunk_size, loaded.normalize_images) == (policy.parts, 5, False)
     assert isinstance(loaded, SAFMaskablePolicy) and not isinstance(loaded, (SAFPolicy, MAPPOPolicy, IPPOPolicy))
+
+
+@pytest.mark.parametrize(("algorithm", "policy"), [(RecurrentPPO, "SAFLstmPolicy"), (MaskablePPO, "SAFMaskablePolicy")])
+def test_value_normalisation_is_refused_where_no_buffer_can_update_it(algorithm: Any, policy: str) -> None:
+    env = sb3_saf.make_team_env("TeamTogether", n_envs=2, n_agents=3, grid_size=8, n_treasures=5)
+    with pytest.raises(ValueError, match=f"^normalize_values=True needs TeamRolloutBuffer.*of {policy} do not take"):
+        algorithm(policy, env, policy_kwargs={"normalize_values": True})

@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, Tens
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf.common.teams import AGENT_KEY, OBS_KEY, TEAM_KEY, Array, TeamSpaces, check_whole_teams
+from sb3_saf.common.value_normalizer import Rescaling, update_statistics
 
 #: Arrays with one entry per step and row, beside the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
@@ -31,6 +32,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     - **Minibatches** hold whole teams, agents in index order, so no team is encoded in two minibatches. ``batch_size``
       counts rows and must be a multiple of N; the last minibatch may be smaller.
     - **Advantages** are SB3's, computed by its code.
+    - **Value normalisation**: a policy with ``normalize_values=True`` gets the returns of each rollout into its
+      statistics. Minibatches then give as old values what the unchanged critic says under the new statistics, so that
+      PPO's ``clip_range_vf`` starts from no difference; advantages and :attr:`values` are those of the rollout.
     - Rows that are not whole teams in index order are refused when they are added.
 
     The order of teams comes from NumPy's global generator, as in SB3, so seeded runs repeat.
@@ -60,6 +64,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
         self._allocated = False
+        self._rescaling: Rescaling | None = None
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
     def reset(self) -> None:
@@ -100,6 +105,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         self._check_rows(obs)
         super().add(obs, action, reward, episode_start, value, log_prob)
+
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
+        """
+        See the base class; then the returns go into the statistics of a policy that normalises values.
+
+        :param last_values: (B, 1) values of what follows the rollout, as they come from the policy
+        :param dones: (B,) whether an episode ended with the last step
+        """
+        super().compute_returns_and_advantage(last_values, dones)
+        self._rescaling = update_statistics(last_values, self.returns)
 
     def _check_rows(self, obs: dict[str, Array]) -> None:
         own, team, agents = (np.asarray(obs[key]) for key in (OBS_KEY, TEAM_KEY, AGENT_KEY))
@@ -173,11 +188,17 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         return DictRolloutBufferSamples(
             observations=self._rebuild(self._take(self.observations[OBS_KEY], batch_inds)),
             actions=self._take(self.actions, batch_inds).float().flatten(end_dim=1),
-            old_values=self._take(self.values, batch_inds).flatten(),
+            old_values=self._old_values(batch_inds),
             old_log_prob=self._take(self.log_probs, batch_inds).flatten(),
             advantages=self._take(self.advantages, batch_inds).flatten(),
             returns=self._take(self.returns, batch_inds).flatten(),
         )
+
+    def _old_values(self, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
+        values = self._take(self.values, team_steps).flatten()
+        if self._rescaling is None:
+            return values
+        return values * self._rescaling.scale + self._rescaling.shift
 
     def _take(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
         """(T, B, ...) -> (K, N, ...); rows lie game-major, so each team step is one stretch of memory."""

@@ -30,6 +30,7 @@ from sb3_saf.common.encoders import ObservationEncoder
 from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one
 from sb3_saf.common.teams import AGENT_KEY, OBS_KEY, TEAM_KEY, TEAM_KEYS, TeamSpaces
+from sb3_saf.common.value_normalizer import ValueNormalizer
 from sb3_saf.common.views import OwnViews, ViewEncoder
 
 NetArch = list[int] | dict[str, list[int]]
@@ -56,6 +57,9 @@ class TeamPolicy(BasePolicy):
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
     :param distinct: False encodes every row, which gives the same numbers slowly
     :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
+    :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
+        ``sb3_saf.common.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. Values that the policy
+        gives, ``train/value_loss`` and ``clip_range_vf`` are on the raw scale either way
     :param use_sde: refused; here because SB3's algorithms pass it
     :param share_features_extractor: actor and critic always share the encoder; False is refused
     :param features_extractor_class: encoder, built on the space of ``obs``
@@ -69,11 +73,14 @@ class TeamPolicy(BasePolicy):
 
     actor: Actor
     value_net: OwnValueHead | TeamCritic
+    value_normalizer: ValueNormalizer | None
     features_dim: int
     net_arch: NetArch
     activation_fn: type[nn.Module]
     log_std_init: float
     ortho_init: bool
+    #: Whether ``normalize_values`` may be used: the algorithm takes a rollout buffer that updates the statistics.
+    normalizes_values: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -84,6 +91,7 @@ class TeamPolicy(BasePolicy):
         *,
         distinct: bool = True,
         chunk_size: int | None = 512,
+        normalize_values: bool = False,
         use_sde: bool = False,
         share_features_extractor: bool = True,
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
@@ -97,6 +105,12 @@ class TeamPolicy(BasePolicy):
         self.parts = self.parts_class(**_taken(kwargs, {field.name for field in fields(self.parts_class)}))
         self.chunk_size = chunk_size
         self.distinct = distinct
+        if normalize_values and not self.normalizes_values:
+            raise ValueError(
+                f"normalize_values=True needs TeamRolloutBuffer, which the algorithms of {type(self).__name__} do not "
+                "take; leave normalize_values=False, or use PPO with SAFPolicy, MAPPOPolicy or IPPOPolicy"
+            )
+        self.normalize_values = normalize_values
         self.views = ViewEncoder(self._encode, distinct)
         # The next class in line is SB3's or sb3-contrib's, which takes more than BasePolicy.
         super().__init__(
@@ -132,6 +146,7 @@ class TeamPolicy(BasePolicy):
         self.value_net = self._make_critic()
         if self.ortho_init:
             orthogonal_init(self.value_net)
+        self.value_normalizer = ValueNormalizer() if self.normalize_values else None
         learning_rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
@@ -157,7 +172,8 @@ class TeamPolicy(BasePolicy):
         data = super()._get_constructor_parameters()
         for name in _SDE_ARGUMENTS:
             data.pop(name, None)
-        return data | asdict(self.parts) | {"distinct": self.distinct, "chunk_size": self.chunk_size}
+        own = {name: getattr(self, name) for name in ("distinct", "chunk_size", "normalize_values")}
+        return data | asdict(self.parts) | own
 
     @property
     def log_std(self) -> th.Tensor:
@@ -262,11 +278,14 @@ class TeamPolicy(BasePolicy):
         else:
             own = self.views.own(self._own(obs)) if own is None else own
             values = self.views.per_agent(critic, own, self._agent(obs) if critic.reads_agent else None)
-        return values.unsqueeze(1)
+        values = values.unsqueeze(1)
+        return values if self.value_normalizer is None else self.value_normalizer(values)
 
 
 class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc]  # value_net, log_std: ours
     """Policy for PPO, A2C and TRPO on rows of teams; see :class:`TeamPolicy` for the parameters."""
+
+    normalizes_values: ClassVar[bool] = True
 
     @classmethod
     @abstractmethod

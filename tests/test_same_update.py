@@ -1,0 +1,90 @@
+"""One real PPO update is the same whichever buffer holds the data and whether views are encoded once or every time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_saf import TeamRolloutBuffer
+from sb3_saf.common.policies import TeamActorCriticPolicy
+from tests.test_policies import ACTIONS, VARIANTS
+from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
+
+#: Policies drawn anew at every evaluation do not evaluate alike twice.
+EXACT = [(policy_class, kwargs) for policy_class, kwargs in VARIANTS if kwargs.get("selection") != "gumbel"]
+#: SB3's buffer as the default, ours, and each with every row encoded.
+WAYS: list[tuple[type[DictRolloutBuffer] | None, bool]] = [
+    (None, True),
+    (TeamRolloutBuffer, True),
+    (None, False),
+    (TeamRolloutBuffer, False),
+]
+
+
+def updated(
+    policy_class: type[TeamActorCriticPolicy],
+    kwargs: dict[str, Any],
+    own: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    buffer_class: type[DictRolloutBuffer] | None,
+    distinct: bool,
+) -> PPO:
+    """A model that collected one rollout of 120 rows and took one step on all of it."""
+    sizes: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}, "chunk_size": 7}
+    if not distinct:
+        sizes |= {"distinct": False, "chunk_size": None}
+    model = PPO(
+        policy_class,
+        ToyTeams(own, action_space),
+        n_steps=10,
+        batch_size=120,
+        n_epochs=1,
+        ent_coef=0.01,
+        clip_range_vf=0.2,
+        max_grad_norm=1e6,  # gradients as they are
+        rollout_buffer_class=buffer_class,
+        policy_kwargs=sizes | kwargs,
+        seed=0,
+        device="cpu",
+    )
+    return model.learn(120, log_interval=None)  # type: ignore[arg-type]  # None keeps what was logged
+
+
+def gradients(model: PPO) -> dict[str, th.Tensor]:
+    return {name: p.grad for name, p in model.policy.named_parameters() if p.grad is not None}
+
+
+@pytest.mark.parametrize(
+    ("own", "action_space"),
+    [(VECTOR, ACTIONS["discrete"]), (CodeSpace(), ACTIONS["box"])],
+    ids=["vector-discrete", "codes-box"],
+)
+@pytest.mark.parametrize(("policy_class", "kwargs"), EXACT)
+def test_buffers_and_encodings_give_the_same_loss_and_gradients(
+    policy_class: type[TeamActorCriticPolicy],
+    kwargs: dict[str, Any],
+    own: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+) -> None:
+    reference, *others = (updated(policy_class, kwargs, own, action_space, *way) for way in WAYS)
+    assert type(reference.rollout_buffer) is DictRolloutBuffer
+    assert isinstance(reference.policy, ActorCriticPolicy)
+    expected = gradients(reference)
+    assert expected.keys() == dict(reference.policy.named_parameters()).keys()
+    for model in others:
+        # The same rollout: rewards are made of views and actions. (SB3's buffer reorders the other arrays.)
+        rewards, same = model.rollout_buffer.rewards, reference.rollout_buffer.rewards
+        np.testing.assert_allclose(rewards, same, rtol=1e-6, atol=1e-6)
+        for tag in ("train/loss", "train/value_loss", "train/policy_gradient_loss", "train/entropy_loss"):
+            logged, right = (m.logger.name_to_value[tag] for m in (model, reference))
+            assert logged == pytest.approx(right, rel=1e-5, abs=1e-6), tag
+        for name, gradient in gradients(model).items():
+            scale = expected[name].abs().max().clamp_min(1.0)
+            assert (gradient - expected[name]).abs().max() <= 1e-5 * scale, name

@@ -1,0 +1,335 @@
+"""Value normalisation inside stock PPO and A2C."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch as th
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_saf import TeamRolloutBuffer, make_team_env
+from sb3_saf.common.centralized import TimeLimit
+from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.common.teams import TeamSpaces
+from sb3_saf.common.value_normalizer import MIN_STD, Rescaling, ValueNormalizer, update_statistics
+from tests.probe_envs import DelayedReward
+from tests.test_policies import NAMES, POLICIES, equal_weights, make_policy
+from tests.toy_teams import VECTOR, ToyTeams, team_rows
+
+Returns = npt.NDArray[np.float64]
+
+
+def some_returns(mean: float = 40.0, std: float = 7.0, shape: tuple[int, ...] = (50, 12), seed: int = 0) -> Returns:
+    return np.random.default_rng(seed).normal(mean, std, shape)
+
+
+def make_model(policy: str = "SAFPolicy", normalize: bool = True, algorithm: Any = PPO, **kwargs: Any) -> Any:
+    sizes: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
+    kwargs = {"policy_kwargs": sizes | {"normalize_values": normalize}, "env": ToyTeams(), "n_steps": 10} | kwargs
+    if algorithm is PPO:
+        kwargs = {"batch_size": 120, "n_epochs": 2} | kwargs
+    kwargs = {"rollout_buffer_class": TeamRolloutBuffer} | kwargs
+    return algorithm(policy, seed=0, device="cpu", **kwargs)
+
+
+def normalizer_of(policy: Any) -> ValueNormalizer:
+    assert isinstance(policy.value_normalizer, ValueNormalizer)
+    return policy.value_normalizer
+
+
+class Returned(BaseCallback):
+    """Keeps the returns of all rollouts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.returns: list[Returns] = []
+
+    def _on_rollout_end(self) -> None:
+        self.returns.append(self.model.rollout_buffer.returns.copy())  # type: ignore[attr-defined]
+
+    def _on_step(self) -> bool:
+        return True
+
+
+# --- statistics -------------------------------------------------------------------------------------------------------
+
+
+def test_statistics_are_numpys_over_all_returns() -> None:
+    normalizer = ValueNormalizer()
+    sets = [some_returns(1000.0, 2.0, (3,), 0), some_returns(-5.0, 30.0, (200, 7), 1), some_returns(8.0, 0.1, (1,), 2)]
+    for returns in sets:
+        normalizer.update(returns)
+    everything = np.concatenate([returns.ravel() for returns in sets])
+    assert int(normalizer.count) == everything.size == 1404
+    assert float(normalizer.mean) == pytest.approx(everything.mean(), rel=1e-6)
+    assert float(normalizer.var) == pytest.approx(everything.var(), rel=1e-6)
+    assert float(normalizer.std) == pytest.approx(everything.std(), rel=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_every_rollout_counts_once(algorithm: Any) -> None:
+    model, callback = make_model(algorithm=algorithm), Returned()
+    model.learn(5 * 120, callback=callback)
+    assert len(callback.returns) == 5
+    everything = np.array(callback.returns, dtype=np.float64)
+    normalizer = normalizer_of(model.policy)
+    assert int(normalizer.count) == everything.size == 600
+    assert float(normalizer.mean) == pytest.approx(everything.mean(), abs=1e-6)
+    assert float(normalizer.var) == pytest.approx(everything.var(), rel=1e-5)
+
+
+def test_values_are_the_critics_outputs_until_the_first_update() -> None:
+    outputs = th.randn(100) * 10.0
+    assert th.equal(ValueNormalizer()(outputs), outputs)
+
+
+def test_an_update_says_how_values_change() -> None:
+    normalizer, outputs = ValueNormalizer(), th.randn(20)
+    for seed, mean in enumerate((40.0, -3.0)):
+        before = normalizer(outputs)
+        scale, shift = normalizer.update(some_returns(mean, seed=seed))
+        th.testing.assert_close(normalizer(outputs), before * scale + shift, rtol=1e-5, atol=1e-5)
+    assert normalizer.update(np.zeros(0)) == Rescaling(1.0, 0.0)
+
+
+def test_returns_that_hardly_vary_are_not_blown_up() -> None:
+    normalizer = ValueNormalizer()
+    normalizer.update(np.full(1000, 3.0))
+    assert float(normalizer.mean) == 3.0 and float(normalizer.var) == 0.0
+    assert normalizer(th.ones(1)).item() == pytest.approx(3.0 + MIN_STD)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_returns_must_be_finite(bad: float) -> None:
+    normalizer = ValueNormalizer()
+    with pytest.raises(ValueError, match=r"returns must be finite, got NaN or infinity; check the environment's"):
+        normalizer.update(np.array([1.0, bad]))
+    assert int(normalizer.count) == 0
+
+
+def test_values_without_a_normaliser_update_nothing() -> None:
+    assert update_statistics(th.zeros(3), np.zeros(3)) is None
+    normalizer = ValueNormalizer()
+    assert update_statistics(normalizer(th.zeros(3)), np.zeros(3)) is not None
+    assert int(normalizer.count) == 3
+
+
+# --- the gradient is that of the normalised loss ----------------------------------------------------------------------
+
+
+def gradients_of(policy: TeamActorCriticPolicy, loss: th.Tensor) -> dict[str, th.Tensor]:
+    policy.zero_grad()
+    loss.backward()
+    return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+
+
+@pytest.mark.parametrize("policy_class", POLICIES)
+@pytest.mark.parametrize("method", ["evaluate_actions", "predict_values"])
+def test_sb3s_loss_has_the_gradient_of_the_normalised_loss(policy_class: Any, method: str) -> None:
+    policy, obs = make_policy(policy_class, normalize_values=True), team_rows(VECTOR)
+    plain = make_policy(policy_class)
+    plain.load_state_dict(policy.state_dict(), strict=False)
+    normalizer_of(policy).update(some_returns())
+    mean, std = some_returns().mean(), some_returns().std()
+    returns = th.as_tensor(some_returns(shape=(12,), seed=1), dtype=th.float32)
+
+    def values_of(which: TeamActorCriticPolicy) -> th.Tensor:
+        if method == "predict_values":
+            return which.predict_values(obs).flatten()
+        return which.evaluate_actions(obs, th.zeros(12).long())[0].flatten()
+
+    values, outputs = values_of(policy), values_of(plain)
+    th.testing.assert_close(values, mean + std * outputs, rtol=1e-6, atol=1e-5)
+    found = gradients_of(policy, th.nn.functional.mse_loss(returns, values))
+    expected = gradients_of(plain, th.nn.functional.mse_loss((returns - mean) / std, outputs))
+    assert found.keys() == expected.keys() and len(found) > 4
+    for name, gradient in found.items():
+        scale = expected[name].abs().max().clamp_min(1.0)
+        assert (gradient - expected[name]).abs().max() <= 1e-6 * scale, name
+
+
+def test_without_rescaling_the_gradient_would_be_std_squared_too_large() -> None:
+    normalizer = ValueNormalizer()
+    normalizer.update(some_returns(std=7.0))
+    returns = th.as_tensor(some_returns(seed=1)[0], dtype=th.float32)
+    outputs = th.zeros(12, requires_grad=True)
+    th.nn.functional.mse_loss(returns, normalizer(outputs)).backward()
+    plain = th.zeros(12, requires_grad=True)
+    th.nn.functional.mse_loss(returns, normalizer.mean + normalizer.std * plain).backward()
+    assert outputs.grad is not None and plain.grad is not None
+    ratio = (plain.grad / outputs.grad).mean().item()
+    assert ratio == pytest.approx(some_returns(std=7.0).var(), rel=1e-5)
+    assert 48 < ratio < 52  # here; for returns of HECOGrid's size more
+
+
+# --- advantages -------------------------------------------------------------------------------------------------------
+
+GAMMA, LAMBDA, LENGTH, STEPS, GAMES, OUTPUT = 0.9, 0.8, 4, 11, 3, 0.5
+
+
+def rollout_of_a_constant_critic(time_limit: TimeLimit, normalize: bool) -> Any:
+    """One rollout of 11 steps, episodes of 4: two whole ones and a part. The critic's output is 0.5 everywhere."""
+    env = make_team_env(DelayedReward, n_envs=GAMES, seed=1, time_limit=time_limit, length=LENGTH)
+    model = make_model(
+        "MAPPOPolicy", normalize, env=env, n_steps=STEPS, batch_size=66, gamma=GAMMA, gae_lambda=LAMBDA, n_epochs=1,
+        learning_rate=0.0, vf_coef=0.0,
+    )  # fmt: skip
+    with th.no_grad():
+        for name, parameter in model.policy.value_net.named_parameters():
+            parameter.fill_(OUTPUT if parameter.shape == (1,) else 0.0)
+            assert "value_head" in name
+    if normalize:
+        normalizer_of(model.policy).update(some_returns(6.0, 3.0))
+    return model.learn(STEPS * GAMES * 2)
+
+
+def advantages_by_a_loop(own: npt.NDArray[Any], value: float, time_limit: TimeLimit) -> npt.NDArray[np.float64]:
+    """(T, B) from what agents see, for a critic that says ``value`` everywhere: the sum of discounted TD errors."""
+    advantages = np.zeros(own.shape[:2])
+    for step in range(STEPS):
+        for row in range(own.shape[1]):
+            weight = 1.0
+            for later in range(step, STEPS):
+                ends = later % LENGTH == LENGTH - 1
+                reward = float(own[later, row, 0]) if ends else 0.0
+                follows = 0.0 if ends and time_limit == "terminal" else value
+                advantages[step, row] += weight * (reward + GAMMA * follows - value)
+                if ends:
+                    break
+                weight *= GAMMA * LAMBDA
+    return advantages
+
+
+@pytest.mark.parametrize("time_limit", ["terminal", "bootstrap"])
+@pytest.mark.parametrize("normalize", [False, True])
+def test_advantages_of_a_constant_critic(time_limit: TimeLimit, normalize: bool) -> None:
+    buffer = rollout_of_a_constant_critic(time_limit, normalize).rollout_buffer
+    before = some_returns(6.0, 3.0)
+    value = before.mean() + before.std() * OUTPUT if normalize else OUTPUT
+    own = buffer.observations["obs"].reshape(STEPS, 2 * GAMES, -1)
+    assert {-1.0, 1.0} == set(own[:, :, 0].ravel())
+    expected = advantages_by_a_loop(own, value, time_limit)
+    np.testing.assert_allclose(buffer.values, value, rtol=1e-6)
+    np.testing.assert_allclose(buffer.advantages, expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(buffer.returns, expected + value, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("time_limit", "error"), [("terminal", 7.0), ("bootstrap", 1.8)])
+def test_forgetting_to_denormalise_breaks_advantages(
+    time_limit: TimeLimit, error: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """
+    The failing baseline: a rollout with the critic's plain outputs, 0.5 instead of about 7.5. The last step before a
+    true end is then off by 7.0, and every bootstrapped step by (1 - gamma) 7.0: 1.8 over an episode.
+    """
+    right = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages.copy()
+    with monkeypatch.context() as patch:
+        patch.setattr(ValueNormalizer, "forward", lambda self, outputs: outputs)
+        wrong = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages
+    assert abs(wrong - right).max() == pytest.approx(error, abs=0.1)
+    assert abs(right).max() > 1.0
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_old_values_are_what_the_unchanged_critic_says(name: str) -> None:
+    """Otherwise ``clip_range_vf`` would start from a difference that the new statistics made."""
+    model = make_model(name, learning_rate=0.0, n_epochs=1)
+    normalizer_of(model.policy).update(some_returns(shape=(40,)))
+    model.learn(120)
+    model.policy.set_training_mode(False)
+    for samples in model.rollout_buffer.get(30):
+        values = model.policy.predict_values(samples.observations).flatten()
+        th.testing.assert_close(samples.old_values, values, rtol=0, atol=1e-4)
+    # What the stored values are off by: the statistics moved from those of made-up returns to the rollout's.
+    assert abs(model.rollout_buffer.values.mean() - values.detach().mean().item()) > 1.0
+
+
+def test_clipped_value_loss_trains_the_critic() -> None:
+    model = make_model(clip_range_vf=0.2)
+    before = copy.deepcopy(model.policy.value_net)
+    model.learn(240)
+    assert not equal_weights(before, model.policy.value_net)
+
+
+@pytest.mark.parametrize("load", [False, True])
+def test_a_buffer_that_never_updates_the_statistics_fails(load: bool, tmp_path: Path) -> None:
+    model = make_model()
+    if load:  # saved statistics are no excuse
+        model.learn(120).save(tmp_path / "model")
+        custom = {"rollout_buffer_class": DictRolloutBuffer}
+        model = PPO.load(tmp_path / "model", env=ToyTeams(), device="cpu", custom_objects=custom)
+        assert int(normalizer_of(model.policy).count) == 120
+    else:
+        model = make_model(rollout_buffer_class=DictRolloutBuffer)
+    with pytest.raises(
+        ValueError, match=r"values are being trained and none did; pass rollout_buffer_class=sb3_saf\.T"
+    ):
+        model.learn(120)
+
+
+def test_sb3s_default_buffer_still_serves_without_normalisation() -> None:
+    make_model(normalize=False, rollout_buffer_class=None).learn(120)
+
+
+def test_gradients_of_a_policy_in_use_need_no_statistics() -> None:
+    policy, obs = make_policy(POLICIES[2], normalize_values=True), team_rows(VECTOR)
+    policy.set_training_mode(False)
+    policy.predict_values(obs).sum().backward()
+
+
+class Frozen(ValueNormalizer):
+    """Mean 0 and variance 1 for ever."""
+
+    def update(self, returns: npt.NDArray[np.floating]) -> Rescaling:
+        self._ever_updated = True
+        return Rescaling(1.0, 0.0)
+
+
+def test_off_leaves_everything_as_it_was() -> None:
+    off = make_model(normalize=False).learn(360)
+    assert off.policy.value_normalizer is None
+    assert not any("normalizer" in name for name in off.policy.state_dict())
+    neutral = make_model()
+    neutral.policy.value_normalizer = Frozen()
+    neutral.learn(360)
+    weights = neutral.policy.state_dict()
+    assert all(th.equal(value, weights[name]) for name, value in off.policy.state_dict().items())
+    default = make_policy(POLICIES[0])
+    assert not default.normalize_values
+
+
+def test_statistics_are_saved_and_loaded(tmp_path: Path) -> None:
+    model = make_model().learn(240)
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model", env=ToyTeams(), device="cpu")
+    assert equal_weights(model.policy, loaded.policy)
+    one, other = normalizer_of(model.policy), normalizer_of(loaded.policy)
+    assert (one.mean, one.var, one.count) == (other.mean, other.var, other.count) and int(one.count) == 240
+    obs = team_rows(VECTOR)
+    assert th.equal(loaded.policy.predict_values(obs), model.policy.predict_values(obs))
+    loaded.learn(120, reset_num_timesteps=False)
+    assert int(other.count) == 360
+    model.policy.save(str(tmp_path / "policy"))
+    alone = type(model.policy).load(str(tmp_path / "policy"), device="cpu")
+    assert th.equal(alone.predict_values(obs), model.policy.predict_values(obs))
+
+
+def test_statistics_are_no_parameters() -> None:
+    space = TeamSpaces.of(VECTOR, 3).to_dict_space()
+    policies = [
+        POLICIES[1](space, ToyTeams().action_space, lambda _: 1e-3, normalize_values=on) for on in (True, False)
+    ]
+    names = [[name for name, _ in policy.named_parameters()] for policy in policies]
+    assert names[0] == names[1]
+    added = policies[0].state_dict().keys() - policies[1].state_dict().keys()
+    assert added == {f"value_normalizer.{name}" for name in ("mean", "var", "count")}
