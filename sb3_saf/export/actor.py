@@ -129,9 +129,7 @@ class Actor:
         space = self.manifest.observation
         array = np.asarray(observation)
         if not _can_become(array, np.dtype(space.dtype)):
-            raise ValueError(
-                f"expected observations of {space.dtype}, got {array.dtype} with values that it cannot hold"
-            )
+            raise ValueError(f"expected observations of {space.dtype}, got {array.dtype} that does not fit into it")
         batch, is_batch = as_batch(array, self._observation)
         if batch.dtype.kind == "f" and not np.isfinite(batch).all():
             raise ValueError("an observation has NaN or infinity; repair the environment or the sensor it comes from")

@@ -37,7 +37,9 @@ class OnnxRuntime:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4
         try:
-            self.session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            self.session = onnxruntime.InferenceSession(
+                data, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
         except Exception as error:  # its errors have no common class but this
             raise ExportError(f"{ONNX_FILE} is not a valid ONNX file: {str(error)[:200]}") from error
         self.manifest = manifest
