@@ -1,39 +1,68 @@
-"""SAF, MAPPO and IPPO for Stable-Baselines3: importing this package registers their policies by name."""
+"""
+SAF, MAPPO and IPPO for Stable-Baselines3: importing this package registers their policies by name.
+
+Without Stable-Baselines3, which training needs, there is only :class:`Actor`, which runs exported actors.
+"""
 
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from typing import NoReturn
 
-from sb3_saf.common.buffers import TeamRolloutBuffer
-from sb3_saf.common.callbacks import TeamEvalCallback
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
-from sb3_saf.common.env import make_team_env
-from sb3_saf.common.evaluation import (
-    EvaluationResult,
-    RandomPolicy,
-    confidence_interval,
-    evaluate_policy,
-    evaluate_team,
-)
-from sb3_saf.common.monitor import TeamMonitor
-from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
-from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
-from sb3_saf.ippo.policies import IPPOPolicy
-from sb3_saf.mappo.policies import MAPPOPolicy
-from sb3_saf.registration import register_all
-from sb3_saf.saf.policies import SAFPolicy
+from sb3_saf.export.actor import Actor
+from sb3_saf.export.errors import ExportError
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ImportError:  # somebody forbids it
+        return False
+
+
+if _is_installed("stable_baselines3"):
+    from sb3_saf.common.buffers import TeamRolloutBuffer
+    from sb3_saf.common.callbacks import TeamEvalCallback
+    from sb3_saf.common.centralized import CentralizedValueWrapper
+    from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
+    from sb3_saf.common.env import make_team_env
+    from sb3_saf.common.evaluation import (
+        EvaluationResult,
+        RandomPolicy,
+        confidence_interval,
+        evaluate_policy,
+        evaluate_team,
+    )
+    from sb3_saf.common.monitor import TeamMonitor
+    from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
+    from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
+    from sb3_saf.export.weights import load_weights
+    from sb3_saf.export.writer import export_actors
+    from sb3_saf.ippo.policies import IPPOPolicy
+    from sb3_saf.mappo.policies import MAPPOPolicy
+    from sb3_saf.registration import register_all
+    from sb3_saf.saf.policies import SAFPolicy
+
+    register_all()
+else:
+
+    def __getattr__(name: str) -> NoReturn:
+        """Say what is missing."""
+        needs = "needs stable_baselines3, which is not installed" if name in __all__ else "does not exist"
+        raise AttributeError(f"sb3_saf.{name} {needs}")
+
 
 try:
     __version__ = version("sb3-saf")
 except PackageNotFoundError:  # run from a checkout that was never installed
     __version__ = "0+unknown"
 
-register_all()
-
 __all__ = [
+    "Actor",
     "CentralizedValueWrapper",
     "EvaluationResult",
+    "ExportError",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -54,5 +83,7 @@ __all__ = [
     "confidence_interval",
     "evaluate_policy",
     "evaluate_team",
+    "export_actors",
+    "load_weights",
     "make_team_env",
 ]

@@ -1,0 +1,198 @@
+"""
+An actor from files: one agent's part of a trained team.
+
+This module and what it imports use neither Stable-Baselines3 nor Gymnasium, so that ``sb3_saf.Actor`` also works where
+these are not installed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_saf.export.act import Draws, NumpyDraws, Outputs, as_batch, decide
+from sb3_saf.export.files import read_limited
+from sb3_saf.export.likelihood import log_prob
+from sb3_saf.export.manifest import MANIFEST_FILE, MAX_MANIFEST_BYTES, Manifest, SpaceRecord, bound_array
+
+Array = npt.NDArray[Any]
+RuntimeName = Literal["torch", "onnx"]
+
+
+class Runtime(Protocol):
+    """What computes the network."""
+
+    def __call__(self, observations: Array) -> Outputs:
+        """(K, *shape) own observations to the network's outputs."""
+
+    def draws(self, seed: int | None) -> Draws:
+        """Random numbers from a seed, or those that go on from the last call."""
+
+
+class Actor:
+    """
+    One agent's part of a trained team, read from the files of ``sb3_saf.export_actors``.
+
+    It sees the agent's own observation and nothing else, and acts as the trained model's ``predict`` does. Nothing is
+    unpickled, no code is imported by a name from the files, and the training environment is not needed.
+
+    Make one with :meth:`load`.
+
+    :param manifest: what the export says of itself
+    :param runtime: computes the network
+    :param agent: index of the agent in its team, if known
+    """
+
+    def __init__(self, manifest: Manifest, runtime: Runtime, agent: int | None = None):
+        self.manifest = manifest
+        self.agent = agent
+        self._runtime = runtime
+        self._observation = _plain(manifest.observation)
+        self._action = _plain(manifest.action)
+
+    @classmethod
+    def load(cls, folder: str | PathLike[str], agent: int | None = None, runtime: RuntimeName = "torch") -> Actor:
+        """
+        Read an export. Files may come from strangers: whatever is wrong with them is an :class:`ExportError`.
+
+        :param folder: written by ``sb3_saf.export_actors``
+        :param agent: index of the agent in its team; needed if every agent has a policy of its own
+        :param runtime: ``"torch"``, or ``"onnx"`` which needs onnxruntime and no torch
+        :raises ExportError: if the files are damaged, malformed or of an unknown format
+        """
+        if runtime not in get_args(RuntimeName):
+            raise ValueError(f"runtime must be 'torch' or 'onnx', got {runtime!r}")
+        path = Path(folder)
+        manifest = Manifest.from_json(read_limited(path / MANIFEST_FILE, MAX_MANIFEST_BYTES))
+        agent = _checked_agent(manifest, agent)
+        return cls(manifest, _make_runtime(runtime, path, manifest, agent), agent)
+
+    @property
+    def n_agents(self) -> int:
+        """N, the size of the team that was trained."""
+        return self.manifest.n_agents
+
+    def act(self, observation: Any, deterministic: bool = True, rng: int | np.random.Generator | None = None) -> Array:
+        """
+        Choose an action.
+
+        :param observation: one own observation as the environment gives it (pictures with channels first or last), or
+            a batch of them with one more axis
+        :param deterministic: whether to take the most likely action instead of drawing one
+        :param rng: where draws come from: a seed, or a NumPy generator. None goes on where the last call ended; with
+            torch that is torch's global generator, and the draws are those of the trained model's ``predict`` (for a
+            seed, those of ``predict`` after ``torch.manual_seed``)
+        :return: the action, or a batch of actions, as ``predict`` gives them
+        :raises ValueError: for observations that are not of the observation space's shape and kind, or not finite
+        """
+        batch, is_batch = self._batch(observation)
+        draws = None if deterministic else self._draws(rng)
+        actions = decide(self._action, self.manifest.selection, self._runtime(batch), draws)
+        return actions if is_batch else actions.squeeze(axis=0)
+
+    def probabilities(self, observation: Any) -> Array:
+        """
+        Probability of every action, for discrete actions.
+
+        :param observation: see :meth:`act`
+        :return: (A,), or (K, A) for a batch
+        """
+        outputs, is_batch = self._outputs(observation)
+        if outputs.log_probs is None:
+            raise ValueError(f"{self.manifest.action.kind} actions have no list of probabilities; use log_prob")
+        probabilities = np.exp(outputs.log_probs)
+        return probabilities if is_batch else probabilities[0]
+
+    def log_prob(self, observation: Any, action: Any) -> Array:
+        """
+        Log-likelihood of actions: that of drawing a policy of the pool by its weight, and the action from it.
+
+        :param observation: see :meth:`act`
+        :param action: one action, or as many as there are observations
+        :return: (), or (K,) for a batch
+        """
+        outputs, is_batch = self._outputs(observation)
+        actions = np.asarray(action).reshape(len(outputs.log_weights), -1)
+        result = log_prob(self._action, outputs, actions)
+        return result if is_batch else result[0]
+
+    def _outputs(self, observation: Any) -> tuple[Outputs, bool]:
+        batch, is_batch = self._batch(observation)
+        return self._runtime(batch), is_batch
+
+    def _batch(self, observation: Any) -> tuple[Array, bool]:
+        space = self.manifest.observation
+        array = np.asarray(observation)
+        if not _can_become(array, np.dtype(space.dtype)):
+            raise ValueError(f"expected observations of {space.dtype}, got {array.dtype} that does not fit into it")
+        batch, is_batch = as_batch(array, self._observation)
+        if batch.dtype.kind == "f" and not np.isfinite(batch).all():
+            raise ValueError("an observation has NaN or infinity; repair the environment or the sensor it comes from")
+        _check_codes(batch, space)
+        return batch, is_batch
+
+    def _draws(self, rng: int | np.random.Generator | None) -> Draws:
+        if isinstance(rng, np.random.Generator):
+            return NumpyDraws(rng)
+        if rng is not None and (isinstance(rng, bool) or not isinstance(rng, (int, np.integer))):
+            raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
+        return self._runtime.draws(None if rng is None else int(rng))
+
+
+def _make_runtime(name: RuntimeName, folder: Path, manifest: Manifest, agent: int | None) -> Runtime:
+    # Imported here: each needs a library that the other does without.
+    if name == "onnx":
+        from sb3_saf.export.onnx_runtime import OnnxRuntime
+
+        return OnnxRuntime(folder, manifest, agent)
+    from sb3_saf.export.torch_runtime import TorchRuntime
+
+    return TorchRuntime(folder, manifest, agent)
+
+
+def _checked_agent(manifest: Manifest, agent: int | None) -> int | None:
+    if agent is None:
+        if manifest.reads_agent:
+            raise ValueError(
+                "every agent of this team has a policy of its own: say which one acts, "
+                f"Actor.load(folder, agent=0) to {manifest.n_agents - 1}"
+            )
+        return None
+    if isinstance(agent, bool) or not isinstance(agent, (int, np.integer)) or not 0 <= agent < manifest.n_agents:
+        raise ValueError(f"agent must be a whole number in 0..{manifest.n_agents - 1}, got {agent!r}")
+    return int(agent)
+
+
+def _plain(space: SpaceRecord) -> dict[str, Any]:
+    """A space as ``act.py`` finds it in the file, with its bounds read once."""
+    bounds = {
+        side: bound_array(bound, space) for side in ("low", "high") if (bound := getattr(space, side)) is not None
+    }
+    return {**asdict(space), **bounds}
+
+
+def _can_become(array: Array, dtype: np.dtype[Any]) -> bool:
+    """Whether numbers keep their meaning: any number may become a float, others must stay the same."""
+    if array.dtype.kind not in "biuf":
+        return False
+    if dtype.kind == "f" or np.can_cast(array.dtype, dtype):
+        return True
+    with np.errstate(invalid="ignore"):
+        return bool((array.astype(dtype) == array).all())
+
+
+def _check_codes(batch: Array, space: SpaceRecord) -> None:
+    """Refuse codes and choices that do not exist."""
+    if space.atlas is not None:
+        limit = np.asarray(space.atlas[0])
+    elif space.is_one_hot:
+        limit = np.asarray(space.choices).reshape(space.shape)
+    else:
+        return
+    if ((batch < 0) | (batch >= limit)).any():
+        raise ValueError(f"observations must be at least 0 and below {limit.tolist()}, got {batch.tolist()}")

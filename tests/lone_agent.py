@@ -1,0 +1,55 @@
+"""
+One agent in a process of its own: ``python lone_agent.py FOLDER RUNTIME AGENT``.
+
+Reads own observations from standard input, answers with actions and probabilities. What training needs cannot be
+imported here, as if it were not installed.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import json
+import sys
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+TRAINING = {"stable_baselines3", "sb3_contrib", "gymnasium", "pettingzoo", "supersuit", "hecogrid_envs", "cloudpickle"}
+
+
+class Absent(importlib.abc.MetaPathFinder):
+    """Finds that some packages are not there."""
+
+    def __init__(self, names: set[str]):
+        self.names = names
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname.partition(".")[0] in self.names:
+            raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
+        return None
+
+
+def main(folder: str, runtime: str, agent: str) -> None:
+    """Act until there are no more observations."""
+    absent = TRAINING | ({"torch", "safetensors"} if runtime == "onnx" else {"onnxruntime"})
+    sys.meta_path.insert(0, Absent(absent))
+    import numpy as np
+
+    import sb3_saf
+
+    assert runtime in ("torch", "onnx")
+    actor = sb3_saf.Actor.load(folder, agent=int(agent), runtime="onnx" if runtime == "onnx" else "torch")
+    for line in sys.stdin:
+        question = json.loads(line)
+        observation = np.array(question["observation"], dtype=question["dtype"])
+        action, probabilities = actor.act(observation), actor.probabilities(observation)
+        loaded = sorted(absent & set(sys.modules))
+        print(
+            json.dumps({"action": int(action), "probabilities": probabilities.tolist(), "loaded": loaded}), flush=True
+        )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,785 @@
+"""Actors as files: what is written, who can read it, and what strangers can do with it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import random
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from safetensors.torch import load, save
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+import hecogrid_envs
+from sb3_saf import (
+    Actor,
+    ExportError,
+    IPPOPolicy,
+    LightEncoder,
+    MAPPOPolicy,
+    MLPEncoder,
+    PaperCNN,
+    SAFPolicy,
+    export_actors,
+    load_weights,
+    make_team_env,
+)
+from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.export import files as export_files
+from sb3_saf.export.manifest import DATA_FILES, MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, DataFile, Manifest
+from tests.lone_agent import TRAINING, Absent
+from tests.test_policies import ACTIONS, equal_weights, make_model, make_policy
+from tests.toy_teams import PICTURE, VECTOR, CodeSpace, samples
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+#: Every kind of actor.
+ACTORS: dict[str, tuple[type[TeamActorCriticPolicy], dict[str, Any]]] = {
+    "mixture": (SAFPolicy, {}),
+    "gumbel": (SAFPolicy, {"selection": "gumbel"}),
+    "one policy": (SAFPolicy, {"n_policies": 1}),
+    "shared": (MAPPOPolicy, {}),
+    "per agent": (IPPOPolicy, {"heads": "per_agent"}),
+}
+OWN: dict[str, spaces.Space[Any]] = {
+    "vector": VECTOR,
+    "picture": PICTURE,
+    "codes": CodeSpace(),
+    "discrete": spaces.Discrete(5),
+    "multi-discrete": spaces.MultiDiscrete([3, 4]),
+    "multi-binary": spaces.MultiBinary(4),
+    "small bytes": spaces.Box(0, 3, (3, 9, 9), np.uint8),
+    "float picture": spaces.Box(0.0, 1.0, (9, 9, 3), np.float64),
+}
+
+
+def exported(policy: TeamActorCriticPolicy | PPO, folder: Path, **kwargs: Any) -> Path:
+    """An export without ONNX, whose writing takes a second."""
+    return export_actors(policy, folder, **({"onnx": False} | kwargs))
+
+
+def predicted(policy: TeamActorCriticPolicy, obs: np.ndarray, agent: int, deterministic: bool = True) -> np.ndarray:
+    """What the trained model does, told nothing but an agent's own observation and index."""
+    return policy.predict({"obs": obs, "agent": np.full(len(obs), agent)}, deterministic=deterministic)[0]
+
+
+# --- the same actions -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("kind", ACTORS)
+def test_acts_as_the_model_predicts(kind: str, action: str, tmp_path: Path) -> None:
+    policy_class, kwargs = ACTORS[kind]
+    policy = make_policy(policy_class, action_space=ACTIONS[action], noise=0.6, **kwargs)
+    folder = exported(policy, tmp_path / "actor")
+    obs = samples(VECTOR, 40)
+    for agent in range(3):
+        actor = Actor.load(folder, agent=agent)
+        expected = predicted(policy, obs, agent)
+        np.testing.assert_array_equal(actor.act(obs), expected)
+        for own in obs[:10]:
+            found = actor.act(own)
+            wanted, _ = policy.predict({"obs": own, "agent": np.asarray(agent)}, deterministic=True)
+            np.testing.assert_allclose(found, wanted, atol=1e-6)
+            assert (type(found), found.dtype, found.shape) == (type(wanted), wanted.dtype, wanted.shape)
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("kind", ACTORS)
+def test_draws_as_the_model_does_after_the_same_torch_seed(kind: str, action: str, tmp_path: Path) -> None:
+    policy_class, kwargs = ACTORS[kind]
+    policy = make_policy(policy_class, action_space=ACTIONS[action], noise=0.6, **kwargs)
+    actor = Actor.load(exported(policy, tmp_path / "actor"), agent=1)
+    obs = samples(VECTOR, 20)
+    drawn = []
+    for seed, own in enumerate(obs):
+        th.manual_seed(seed)
+        expected = predicted(policy, own[np.newaxis], 1, deterministic=False)[0]
+        th.manual_seed(seed)
+        np.testing.assert_allclose(actor.act(own, deterministic=False), expected, atol=1e-5)
+        np.testing.assert_allclose(actor.act(own, deterministic=False, rng=seed), expected, atol=1e-5)
+        drawn.append(expected)
+    assert not np.array_equal(drawn, actor.act(obs))  # so that drawing is not the same as deciding
+
+
+@pytest.mark.parametrize("own", OWN)
+@pytest.mark.parametrize("encoder", [None, PaperCNN, LightEncoder, MLPEncoder])
+def test_every_encoder_reads_every_space_that_it_can(
+    own: str, encoder: type[BaseFeaturesExtractor] | None, tmp_path: Path
+) -> None:
+    space = OWN[own]
+    extractor: dict[str, Any] = {"features_dim": 12}
+    if encoder is LightEncoder and own in ("small bytes", "float picture"):
+        extractor["tile_size"] = 3
+    sizes: dict[str, Any] = {} if encoder is None else {"features_extractor_class": encoder}
+    try:
+        policy = make_policy(SAFPolicy, space, noise=0.6, features_extractor_kwargs=extractor, **sizes)
+    except ValueError:
+        assert encoder in (PaperCNN, LightEncoder)
+        return
+    actor = Actor.load(exported(policy, tmp_path / "actor"))
+    obs = samples(space, 30)
+    np.testing.assert_array_equal(actor.act(obs), predicted(policy, obs, 0))
+    with th.no_grad():
+        probs = cast(Any, policy.get_distribution(th.as_tensor(obs))).distribution.probs
+    np.testing.assert_allclose(actor.probabilities(obs), probs, atol=1e-6)
+    np.testing.assert_allclose([actor.probabilities(one) for one in obs], probs, atol=1e-6)
+
+
+@pytest.mark.parametrize("normalize_images", [True, False])
+def test_pictures_may_come_with_channels_last(normalize_images: bool, tmp_path: Path) -> None:
+    policy = make_policy(SAFPolicy, PICTURE, noise=0.6, normalize_images=normalize_images)
+    actor = Actor.load(exported(policy, tmp_path / "actor"))
+    obs = samples(PICTURE, 20)
+    last = np.moveaxis(obs, 1, -1)
+    expected = policy.predict(last, deterministic=True)[0]
+    assert len(set(expected.tolist())) > 1
+    np.testing.assert_array_equal(actor.act(last), expected)
+    np.testing.assert_array_equal([actor.act(one) for one in last], expected)
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("kind", ["mixture", "one policy"])
+def test_likelihoods_are_the_models(kind: str, action: str, tmp_path: Path) -> None:
+    policy_class, kwargs = ACTORS[kind]
+    policy = make_policy(policy_class, action_space=ACTIONS[action], noise=0.6, **kwargs)
+    actor = Actor.load(exported(policy, tmp_path / "actor"))
+    obs = samples(VECTOR, 30)
+    actions = samples(ACTIONS[action], 30)
+    with th.no_grad():
+        given = th.as_tensor(actions).float() if action == "multi-binary" else th.as_tensor(actions)
+        expected = policy.get_distribution(th.as_tensor(obs)).log_prob(given)
+    np.testing.assert_allclose(actor.log_prob(obs, actions), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(actor.log_prob(obs[3], actions[3]), expected[3], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["mixture", "gumbel", "one policy"])
+def test_numpys_draws_have_the_stated_probabilities(kind: str, tmp_path: Path) -> None:
+    policy_class, kwargs = ACTORS[kind]
+    actor = Actor.load(exported(make_policy(policy_class, noise=0.6, **kwargs), tmp_path / "actor"))
+    own = samples(VECTOR, 1)
+    n_draws = 40_000
+    actions = actor.act(np.repeat(own, n_draws, axis=0), deterministic=False, rng=np.random.default_rng(0))
+    probabilities = actor.probabilities(own[0])
+    deviation = 5 * np.sqrt(probabilities * (1 - probabilities) / n_draws)
+    assert (np.abs(np.bincount(actions, minlength=3) / n_draws - probabilities) < deviation).all()
+
+
+def test_nothing_of_the_critic_is_written(tmp_path: Path) -> None:
+    policy = make_policy(SAFPolicy)
+    folder = exported(policy, tmp_path / "actor")
+    before = (folder / WEIGHTS_FILE).read_bytes()
+    tensors = load(before)
+    assert {name.partition(".")[0] for name in tensors} == {"encoder", "actor"}
+    parts = (policy.features_extractor, policy.actor)
+    assert sum(tensor.numel() for tensor in tensors.values()) == sum(
+        parameter.numel() for part in parts for parameter in part.parameters()
+    )
+    with th.no_grad():
+        for parameter in policy.value_net.parameters():
+            parameter.add_(1.0)
+    assert (exported(policy, folder) / WEIGHTS_FILE).read_bytes() == before
+
+
+def test_a_saved_loaded_and_exported_model_predicts_the_same(tmp_path: Path) -> None:
+    model = make_model(n_steps=10)
+    model.learn(120)
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model", device="cpu")
+    actor = Actor.load(exported(loaded, tmp_path / "actor"))
+    obs = samples(VECTOR, 50)
+    np.testing.assert_array_equal(actor.act(obs), model.predict(obs, deterministic=True)[0])
+
+
+# --- ONNX -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[TeamActorCriticPolicy, Path]]:
+    """Exports with ONNX, one for each way in which graphs differ."""
+    cases: dict[str, tuple[str, spaces.Space[Any], str, dict[str, Any]]] = {
+        "mixture": ("codes", CodeSpace(), "discrete", {}),
+        "mixture of pairs": ("picture", PICTURE, "multi-discrete", {"features_extractor_class": LightEncoder}),
+        "gumbel": ("vector", VECTOR, "box", {}),
+        "per agent": ("multi-discrete", OWN["multi-discrete"], "multi-binary", {}),
+    }
+    made = {}
+    for name, (_, own, action, kwargs) in cases.items():
+        policy_class, sizes = ACTORS[name.partition(" of ")[0]]
+        policy = make_policy(policy_class, own, ACTIONS[action], noise=0.6, **sizes, **kwargs)
+        made[name] = policy, export_actors(policy, tmp_path_factory.mktemp("onnx") / "actor")
+    return made
+
+
+@pytest.mark.parametrize("name", ["mixture", "mixture of pairs", "gumbel", "per agent"])
+def test_onnx_gives_torchs_numbers(folders: dict[str, tuple[TeamActorCriticPolicy, Path]], name: str) -> None:
+    policy, folder = folders[name]
+    obs = samples(policy.team_spaces.own, 33)
+    torch_actor, onnx_actor = Actor.load(folder, agent=2), Actor.load(folder, agent=2, runtime="onnx")
+    for found, expected in zip(onnx_actor._outputs(obs)[0], torch_actor._outputs(obs)[0], strict=True):
+        if expected is not None and found is not None:
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(onnx_actor.act(obs), predicted(policy, obs, 2), atol=1e-5)
+    one = onnx_actor.act(obs[0], deterministic=False, rng=3)
+    np.testing.assert_array_equal(one, onnx_actor.act(obs[0], deterministic=False, rng=3))
+
+
+@pytest.mark.parametrize("name", ["mixture", "gumbel", "per agent"])
+def test_the_script_beside_the_graph_needs_nothing_else(
+    folders: dict[str, tuple[TeamActorCriticPolicy, Path]], name: str, tmp_path: Path
+) -> None:
+    policy, folder = folders[name]
+    obs = samples(policy.team_spaces.own, 7)
+    np.save(tmp_path / "obs.npy", obs)
+    absent = TRAINING | {"sb3_saf", "torch", "safetensors", "onnx"}
+    code = (
+        f"import sys, runpy; sys.path.insert(0, {str(ROOT / 'tests')!r}); from lone_agent import Absent; "
+        f"sys.meta_path.insert(0, Absent({absent!r})); sys.path.pop(0); "
+        f"sys.argv = ['act.py', {str(tmp_path / 'obs.npy')!r}, '--agent', '1']; "
+        f"runpy.run_path({str(folder / 'act.py')!r}, run_name='__main__')"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    np.testing.assert_allclose(json.loads(answer.stdout), predicted(policy, obs, 1), atol=1e-5)
+
+
+class OwnEncoder(BaseFeaturesExtractor):
+    """An encoder that no file can name."""
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 4):
+        super().__init__(observation_space, features_dim)
+        self.net = nn.Linear(5, features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.net(observations).sin()
+
+
+def test_encoders_of_ones_own_are_exported_as_onnx_alone(tmp_path: Path) -> None:
+    policy = make_policy(
+        SAFPolicy, noise=0.6, features_extractor_class=OwnEncoder, features_extractor_kwargs={"features_dim": 6}
+    )
+    with pytest.raises(ExportError, match="OwnEncoder with Tanh can be exported as ONNX only"):
+        exported(policy, tmp_path / "actor")
+    folder = export_actors(policy, tmp_path / "actor")
+    assert sorted(path.name for path in folder.iterdir()) == ["act.py", MANIFEST_FILE, ONNX_FILE]
+    with pytest.raises(ExportError, match='runtime="onnx"'):
+        Actor.load(folder)
+    obs = samples(VECTOR, 30)
+    np.testing.assert_array_equal(Actor.load(folder, runtime="onnx").act(obs), predicted(policy, obs, 0))
+
+
+def test_an_export_without_onnx_says_so(tmp_path: Path) -> None:
+    folder = exported(make_policy(MAPPOPolicy), tmp_path / "actor")
+    with pytest.raises(ExportError, match=r'without actor.onnx; load it with runtime="torch"'):
+        Actor.load(folder, runtime="onnx")
+
+
+# --- processes that see nothing but their own observation -------------------------------------------------------------
+
+
+class LoneAgent:
+    """A process with one agent in it, from which training's packages are hidden."""
+
+    def __init__(self, folder: Path, runtime: str, agent: int):
+        command = [sys.executable, str(ROOT / "tests" / "lone_agent.py"), str(folder), runtime, str(agent)]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+        )
+
+    def ask(self, observation: np.ndarray) -> None:
+        assert self.process.stdin
+        question = {"observation": observation.tolist(), "dtype": str(observation.dtype)}
+        self.process.stdin.write(json.dumps(question) + "\n")
+        self.process.stdin.flush()
+
+    def answer(self) -> dict[str, Any]:
+        assert self.process.stdout
+        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
+        return answer
+
+
+@pytest.mark.parametrize(
+    ("policy", "observation", "runtimes", "kwargs"),
+    [
+        ("SAFPolicy", "tiles", ["torch", "onnx", "torch"], {}),
+        ("MAPPOPolicy", "rgb", ["onnx", "onnx"], {"heads": "per_agent"}),
+    ],
+)
+def test_agents_in_processes_of_their_own_play_an_episode_as_the_model_would(
+    policy: str, observation: str, runtimes: list[str], kwargs: dict[str, Any], tmp_path: Path
+) -> None:
+    level: dict[str, Any] = {"n_agents": len(runtimes), "grid_size": 9, "n_treasures": 6, "observation": observation}
+    model = PPO(policy, make_team_env("TeamSupport", n_envs=1, **level), policy_kwargs=kwargs, seed=0, device="cpu")
+    with th.no_grad():
+        for parameter in model.policy.actor.parameters():  # type: ignore[union-attr]
+            parameter.add_(0.2 * th.randn_like(parameter))
+    folder = export_actors(model, tmp_path / "actor")
+    agents = [LoneAgent(folder, runtime, agent) for agent, runtime in enumerate(runtimes)]
+    env = hecogrid_envs.tasks.team_support.parallel_env(**level)
+    observations, _ = env.reset(seed=3)
+    seen: set[int] = set()
+    steps = 0
+    while env.agents:
+        own = np.stack([observations[name] for name in env.agents])
+        for agent, view in zip(agents, own, strict=True):
+            agent.ask(view)
+        team: dict[str, np.ndarray] = {"obs": own, "agent": np.arange(len(own))}
+        expected, _ = model.predict(team, deterministic=True)
+        tensors, _ = model.policy.obs_to_tensor(team)
+        with th.no_grad():
+            wanted = cast(Any, model.policy.get_distribution(tensors)).distribution.probs.numpy()
+        answers = [agent.answer() for agent in agents]
+        assert [answer["action"] for answer in answers] == expected.tolist()
+        np.testing.assert_allclose([answer["probabilities"] for answer in answers], wanted, atol=1e-6)
+        assert [answer["loaded"] for answer in answers] == [[] for _ in answers]
+        observations, *_ = env.step(dict(zip(env.agents, expected, strict=True)))
+        seen |= set(expected.tolist())
+        steps += 1
+    assert steps == 50
+    assert len(seen) > 1
+    for agent in agents:
+        agent.process.communicate(timeout=60)
+        assert agent.process.returncode == 0
+
+
+def test_without_stable_baselines_the_package_says_what_is_missing() -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(ROOT / 'tests')!r}); from lone_agent import Absent, TRAINING; "
+        "sys.meta_path.insert(0, Absent(TRAINING)); import sb3_saf; print(sb3_saf.Actor.__name__); sb3_saf.SAFPolicy"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT)
+    assert answer.stdout == "Actor\n"
+    assert "sb3_saf.SAFPolicy needs stable_baselines3, which is not installed" in answer.stderr
+
+
+def test_absent_packages_are_absent() -> None:
+    with pytest.raises(ModuleNotFoundError):
+        Absent({"some_package"}).find_spec("some_package.module", None)
+
+
+# --- what cannot be exported, and where not to ------------------------------------------------------------------------
+
+
+def test_other_policies_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"expected a model with SAFPolicy, .*, got ActorCriticPolicy"):
+        export_actors(PPO("MlpPolicy", "CartPole-v1", device="cpu"), tmp_path / "actor")
+    broken = make_policy(SAFPolicy)
+    with th.no_grad():
+        next(broken.actor.parameters()).fill_(float("nan"))
+    with pytest.raises(ExportError, match="has NaN or infinity"):
+        exported(broken, tmp_path / "actor")
+    with pytest.raises(ExportError, match="counting from 0"):
+        exported(make_policy(SAFPolicy, action_space=spaces.Discrete(3, start=1)), tmp_path / "actor")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_with_other_numbers_is_not_written(tmp_path: Path) -> None:
+    policy = make_policy(SAFPolicy)
+    extract = policy.extract_features
+    policy.extract_features = lambda *args: extract(*args) + 0.5  # type: ignore[method-assign]
+    with pytest.raises(ExportError, match="does more than its encoder and actor show"):
+        exported(policy, tmp_path / "actor")
+
+
+def test_folders_are_replaced_only_if_they_are_exports(tmp_path: Path) -> None:
+    one, other = make_policy(SAFPolicy), make_policy(SAFPolicy, seed=1)
+    folder = exported(one, tmp_path / "new" / "actor")
+    first = (folder / WEIGHTS_FILE).read_bytes()
+    exported(other, folder)
+    second = (folder / WEIGHTS_FILE).read_bytes()
+    assert first != second
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ExportError, match="has other files beside"):
+        exported(one, folder)
+    assert (folder / WEIGHTS_FILE).read_bytes() == second
+    exported(one, folder, overwrite=True)
+    assert sorted(path.name for path in folder.iterdir()) == [MANIFEST_FILE, WEIGHTS_FILE]
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    exported(one, foreign)  # an empty folder is free
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(ExportError, match="expected a folder to write to"):
+        exported(one, tmp_path / "file", overwrite=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "foreign", "new"]
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["actor"]
+
+
+def test_an_interrupted_export_leaves_the_earlier_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = exported(make_policy(SAFPolicy), tmp_path / "actor")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def full(path: Path, data: bytes) -> None:
+        path.write_bytes(data[: len(data) // 2])
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(export_files, "_write_durably", full)
+    with pytest.raises(OSError, match="No space left"):
+        exported(make_policy(SAFPolicy, seed=1), folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["actor"]
+
+
+# --- wrong use --------------------------------------------------------------------------------------------------------
+
+
+def test_agents_with_policies_of_their_own_must_be_named(tmp_path: Path) -> None:
+    folder = exported(make_policy(IPPOPolicy, heads="per_agent"), tmp_path / "actor")
+    with pytest.raises(ValueError, match=r"say which one acts, Actor.load\(folder, agent=0\) to 2"):
+        Actor.load(folder)
+    for agent in (3, -1, True, "0"):
+        with pytest.raises(ValueError, match=r"agent must be a whole number in 0\.\.2"):
+            Actor.load(folder, agent=cast(int, agent))
+
+
+@pytest.mark.parametrize(
+    ("own", "observation", "message"),
+    [
+        ("vector", np.zeros(4), "expected one own observation of shape"),
+        ("vector", np.zeros((2, 2, 5)), "expected one own observation of shape"),
+        ("vector", [np.nan] * 5, "has NaN or infinity"),
+        ("vector", ["a"] * 5, "does not fit"),
+        ("codes", np.full((3, 3), 20), "below 20"),
+        ("codes", np.full((3, 3), -1), "does not fit"),
+        ("codes", np.full((3, 3), 0.5), "does not fit"),
+        ("discrete", 5, "below 5"),
+        ("multi-discrete", [2, 4], r"below \[3, 4\]"),
+    ],
+)
+def test_observations_of_another_kind_are_refused(own: str, observation: Any, message: str, tmp_path: Path) -> None:
+    actor = Actor.load(exported(make_policy(SAFPolicy, OWN[own]), tmp_path / "actor"))
+    with pytest.raises(ValueError, match=message):
+        actor.act(observation)
+
+
+def test_whole_numbers_may_come_as_lists(tmp_path: Path) -> None:
+    actor = Actor.load(exported(make_policy(SAFPolicy, OWN["codes"]), tmp_path / "actor"))
+    codes = samples(OWN["codes"], 1)[0]
+    codes.flags.writeable = False
+    assert actor.act(codes) == actor.act(codes.tolist()) == actor.act(codes.astype(float))
+
+
+# --- files from strangers ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def export(tmp_path: Path) -> Path:
+    return exported(make_policy(SAFPolicy, CodeSpace(), features_extractor_class=LightEncoder), tmp_path / "actor")
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object], weights: bytes | None = None) -> None:
+    """Change the manifest as somebody would who knows how checksums are made."""
+    manifest = Manifest.from_json((folder / MANIFEST_FILE).read_bytes())
+    if weights is not None:
+        (folder / WEIGHTS_FILE).write_bytes(weights)
+        manifest = replace(manifest, files={WEIGHTS_FILE: DataFile.of(weights)})
+    entries = json.loads(manifest.to_json())
+    del entries["checksum"]
+    change(entries)
+    (folder / MANIFEST_FILE).write_text(with_checksum(entries))
+
+
+def with_checksum(entries: dict[str, Any]) -> str:
+    from sb3_saf.export.manifest import _checksum
+
+    return json.dumps({**entries, "checksum": _checksum(entries)})
+
+
+def test_nothing_is_unpickled(export: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*args: object, **kwargs: object) -> None:
+        raise AssertionError("unpickled")
+
+    for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (th, "load"), (np, "load")):
+        monkeypatch.setattr(module, name, forbidden)
+    assert Actor.load(export).act(np.zeros((3, 3), np.uint8)).shape == ()
+
+
+CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "format version 2": lambda m: m.update(format_version=2),
+    "is not of an exported actor": lambda m: m.update(format="pickle"),
+    "encoder.name must be one of": lambda m: m["encoder"].update(name="os.system"),
+    "actor.name must be one of": lambda m: m["actor"].update(name="builtins.eval"),
+    "activation must be one of": lambda m: m["actor"].update(activation="Module"),
+    "unknown entry": lambda m: m.update(extra=1),
+    "lacks 'n_agents'": lambda m: m.pop("n_agents"),
+    "unknown entry '../../etc/passwd'": lambda m: m["files"].update({"../../etc/passwd": m["files"][WEIGHTS_FILE]}),
+    "1..1048576, got 1048577": lambda m: m["encoder"].update(hidden=(1 << 20) + 1),
+    "of shape (1048576,)": lambda m: m["encoder"].update(hidden=1 << 20),
+    "describes at least 4": lambda m: m["actor"].update(n_policies=1 << 20),
+    "describes at least 32": lambda m: m["actor"].update(hidden=[1] * 4096),
+    "has 1099511627776 entries": lambda m: m["observation"].update(shape=[1 << 20, 1 << 20]),
+    "whole tiles": lambda m: m["encoder"].update(tile_size=5),
+    "without an entry in its atlas": lambda m: m["observation"].update(high=20),
+    "must be true or false": lambda m: m.update(reads_agent=1),
+    "dtype must be one of": lambda m: m["observation"].update(dtype="O"),
+    "or have the shape (3, 3)": lambda m: m["observation"].update(low=[[[]]] * 9),
+    "one number of uint8 or nested lists": lambda m: m["observation"].update(low={}),
+    "must be an object": lambda m: m.update(observation=[]),
+    "names neither": lambda m: m.update(files={}, encoder=None, actor=None),
+}
+
+
+@pytest.mark.parametrize("message", CHANGES)
+def test_malformed_manifests_are_refused(export: Path, message: str) -> None:
+    rewrite(export, CHANGES[message])
+    with pytest.raises(ExportError) as caught:
+        Actor.load(export)
+    assert message in str(caught.value)
+
+
+def test_damaged_files_are_recognised(export: Path) -> None:
+    weights = (export / WEIGHTS_FILE).read_bytes()
+    for damaged in (weights[:-1], weights + b"0", b"", bytes([weights[0] ^ 1]) + weights[1:]):
+        (export / WEIGHTS_FILE).write_bytes(damaged)
+        with pytest.raises(ExportError, match=r"length and checksum|more than"):
+            Actor.load(export)
+    (export / WEIGHTS_FILE).write_bytes(weights)
+    Actor.load(export)
+    text = (export / MANIFEST_FILE).read_text()
+    for wrong in (
+        text.replace('"Tanh"', '"ReLU"'),
+        "[" * 100_000,
+        "{}",
+        "",
+        '{"format": NaN}',
+        '{"a": 1, "a": 1}',
+        "\xff",
+    ):
+        (export / MANIFEST_FILE).write_bytes(wrong.encode("latin-1"))
+        with pytest.raises(ExportError):
+            Actor.load(export)
+
+
+def test_missing_files_and_pipes_do_not_hang(export: Path) -> None:
+    (export / WEIGHTS_FILE).unlink()
+    with pytest.raises(ExportError, match="cannot read"):
+        Actor.load(export)
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(export / WEIGHTS_FILE)
+        with pytest.raises(ExportError, match="not a regular file"):
+            Actor.load(export)
+    for name in ("nowhere", "with\0zero"):
+        with pytest.raises(ExportError, match="cannot read"):
+            Actor.load(export.parent / name)
+
+
+def huge_header() -> bytes:
+    header = json.dumps({"a": {"dtype": "F32", "shape": [1 << 40, 1 << 20], "data_offsets": [0, 1 << 62]}}).encode()
+    return len(header).to_bytes(8, "little") + header
+
+
+def test_weights_that_do_not_fit_are_refused(export: Path) -> None:
+    weights = (export / WEIGHTS_FILE).read_bytes()
+    tensors = load(weights)
+    name = "actor.signature_keys"
+    keys = tensors[name]
+    cases = {
+        "lacks the tensor 'actor.signature_keys'": save({n: t for n, t in tensors.items() if n != name} | {"x": keys}),
+        "does not have: 'extra'": save(tensors | {"extra": keys.clone()}),
+        "expected 'actor.signature_keys' of shape (4, 8)": save(tensors | {name: keys[:2].contiguous()}),
+        "torch.float64": save(tensors | {name: keys.double()}),
+        "NaN or infinity": save(tensors | {name: keys * float("inf")}),
+        "not a valid safetensors file": huge_header(),
+    }
+    cases["not a valid safetensors file: "] = (1 << 60).to_bytes(8, "little") + b"{}"
+    for message, content in cases.items():
+        rewrite(export, lambda manifest: None, content)
+        with pytest.raises(ExportError) as caught:
+            Actor.load(export)
+        assert message in str(caught.value)
+    rewrite(export, lambda manifest: None, weights)
+    Actor.load(export)
+
+
+def mutated(data: bytes, rng: random.Random) -> bytes:
+    """A few bytes changed, lost or doubled."""
+    result = bytearray(data)
+    for _ in range(rng.choice((1, 1, 3))):
+        place = rng.randrange(len(result))
+        change = rng.randrange(4)
+        if change == 0:
+            result[place] ^= 1 << rng.randrange(8)
+        elif change == 1:
+            result[place] = rng.randrange(256)
+        elif change == 2:
+            del result[place : place + rng.randrange(1, 30)]
+        else:
+            result[place:place] = result[place : place + 20]
+    return bytes(result)
+
+
+def walk(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Every place in nested containers."""
+    for key in list(value) if isinstance(value, dict) else range(len(value)):
+        yield value, key
+        if isinstance(value[key], (dict, list)):
+            yield from walk(value[key])
+
+
+ODD_VALUES: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    0,
+    1 << 20,
+    1 << 80,
+    0.5,
+    "",
+    "inf",
+    "../x",
+    [],
+    [1],
+    [[1, 2], [3]],
+    {},
+    {"a": 1},
+)
+
+
+def test_two_hundred_mutations_give_our_own_error_or_an_actor_that_works(export: Path) -> None:
+    originals = {name: (export / name).read_bytes() for name in (MANIFEST_FILE, WEIGHTS_FILE)}
+    observation = np.zeros((3, 3), np.uint8)
+    expected = Actor.load(export).probabilities(observation)
+    rng = random.Random(0)
+    refused = 0
+    for number in range(200):
+        for name, data in originals.items():
+            (export / name).write_bytes(data)
+        kind = number % 4
+        if kind == 0:  # damaged
+            name = rng.choice(list(originals))
+            (export / name).write_bytes(mutated(originals[name], rng))
+        elif kind == 1:  # weights changed on purpose
+            header = int.from_bytes(originals[WEIGHTS_FILE][:8], "little") + 8
+            weights = mutated(originals[WEIGHTS_FILE][:header], rng) + originals[WEIGHTS_FILE][header:]
+            rewrite(export, lambda manifest: None, weights)
+        else:  # the manifest changed on purpose
+
+            def change(manifest: dict[str, Any]) -> None:
+                container, key = rng.choice(list(walk(manifest)))
+                container[key] = rng.choice(ODD_VALUES)
+
+            rewrite(export, change)
+        try:
+            found = Actor.load(export).probabilities(observation)
+        except ExportError:
+            refused += 1
+        else:
+            assert kind > 0 or np.array_equal(found, expected)
+    assert refused > 150
+
+
+# --- weights of saved models ------------------------------------------------------------------------------------------
+
+
+def test_weights_come_out_of_a_saved_model_without_unpickling_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, other = make_model(), make_model(seed=1)
+    model.save(tmp_path / "model")
+    assert not equal_weights(model.policy, other.policy)
+
+    def forbidden(*args: object, **kwargs: object) -> None:
+        raise AssertionError("unpickled")
+
+    monkeypatch.setattr("cloudpickle.loads", forbidden)
+    monkeypatch.setattr(pickle, "loads", forbidden)
+    load_weights(other, tmp_path / "model")
+    assert equal_weights(model.policy, other.policy)
+    load_weights(make_policy(SAFPolicy), tmp_path / "model.zip")
+
+
+class Bomb:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+def zip_with(path: Path, entry: bytes, name: str = "policy.pth") -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, entry)
+    return path
+
+
+def saved(value: object) -> bytes:
+    buffer = io.BytesIO()
+    th.save(value, buffer)
+    return buffer.getvalue()
+
+
+def packed(entry: bytes) -> bytes:
+    """The same file of tensors, compressed."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(entry)) as old, zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new:
+        for info in old.infolist():
+            new.writestr(info.filename, old.read(info))
+    return buffer.getvalue()
+
+
+def test_hostile_models_change_nothing_and_run_nothing(tmp_path: Path) -> None:
+    policy = make_policy(SAFPolicy)
+    before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
+    name = next(iter(before))
+    cases = {
+        "does not hold tensors alone": saved({**before, name: Bomb(tmp_path / "ran")}),
+        "must map names": saved([1, 2]),
+        "lacks the weights": saved({n: t for n, t in before.items() if n != name}),
+        "unlike the model": saved({**before, "zzz": before[name]}),
+        "expected ": saved({**before, name: th.zeros(3)}),
+        "has NaN": saved({**before, name: before[name] * float("nan")}),
+        "no plain tensor": saved({**before, name: 3}),
+        "unpacks to more": packed(saved(before)),
+        "has more than": b"\0" * (1 << 24),
+        "alone": b"",
+    }
+    for message, entry in cases.items():
+        with pytest.raises(ExportError, match=message):
+            load_weights(policy, zip_with(tmp_path / "model.zip", entry))
+    with pytest.raises(ExportError, match="not a model saved by"):
+        load_weights(policy, zip_with(tmp_path / "model.zip", b"", "data"))
+    (tmp_path / "model.zip").write_bytes(b"no zip")
+    with pytest.raises(ExportError, match="not a model saved by"):
+        load_weights(policy, tmp_path / "model.zip")
+    with pytest.raises(ExportError, match="found no file"):
+        load_weights(policy, tmp_path / "nowhere")
+    assert not (tmp_path / "ran").exists()
+    assert all(th.equal(tensor, before[key]) for key, tensor in policy.state_dict().items())
+
+
+def test_mutated_models_give_our_own_error_or_their_weights(tmp_path: Path) -> None:
+    model = make_model()
+    model.save(tmp_path / "model.zip")
+    original = (tmp_path / "model.zip").read_bytes()
+    other = make_model(seed=1)
+    rng = random.Random(0)
+    refused = 0
+    for number in range(100):
+        if number % 2:
+            (tmp_path / "model.zip").write_bytes(mutated(original, rng))
+        else:  # inside the zip, where its checksum does not help
+            zip_with(tmp_path / "model.zip", mutated(saved(model.policy.state_dict()), rng))
+        try:
+            load_weights(other, tmp_path / "model.zip")
+        except ExportError:
+            refused += 1
+        assert all(bool(tensor.isfinite().all()) for tensor in other.policy.state_dict().values())
+    assert refused > 40
+
+
+def test_data_files_are_a_closed_list() -> None:
+    assert all(Path(name).name == name for name in DATA_FILES)
