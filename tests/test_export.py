@@ -516,7 +516,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
     "lacks 'n_agents'": lambda m: m.pop("n_agents"),
     "unknown entry '../../etc/passwd'": lambda m: m["files"].update({"../../etc/passwd": m["files"][WEIGHTS_FILE]}),
     "1..1048576, got 1048577": lambda m: m["encoder"].update(hidden=(1 << 20) + 1),
-    "of shape (1048576,)": lambda m: m["encoder"].update(hidden=1 << 20),
+    "of shape (1048576, 144)": lambda m: m["encoder"].update(hidden=1 << 20),
     "describes at least 4": lambda m: m["actor"].update(n_policies=1 << 20),
     "describes at least 32": lambda m: m["actor"].update(hidden=[1] * 4096),
     "has 1099511627776 entries": lambda m: m["observation"].update(shape=[1 << 20, 1 << 20]),

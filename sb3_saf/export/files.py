@@ -121,7 +121,8 @@ def _put_in_place(fresh: Path, target: Path) -> None:
         fresh.rename(target)
         return
     old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-    target.rename(old)  # onto the empty folder just made
+    old.rmdir()  # only its name was wanted; some systems do not rename onto a folder
+    target.rename(old)
     try:
         fresh.rename(target)
     except BaseException:

@@ -87,8 +87,8 @@ def _check_tensors(expected: dict[str, th.Tensor], found: dict[str, th.Tensor]) 
         raise ExportError(f"{WEIGHTS_FILE} lacks the tensor {missing[0]!r}")
     if unknown := sorted(found.keys() - expected.keys()):
         raise ExportError(f"{WEIGHTS_FILE} has a tensor that the actor does not have: {unknown[0][:80]!r}")
-    for name, tensor in found.items():
-        wanted = expected[name]
+    for name, wanted in expected.items():
+        tensor = found[name]
         if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
             raise ExportError(
                 f"{WEIGHTS_FILE}: expected {name!r} of shape {tuple(wanted.shape)} and {wanted.dtype}, got "
