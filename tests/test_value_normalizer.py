@@ -271,7 +271,9 @@ def test_a_buffer_that_never_updates_the_statistics_fails(load: bool, tmp_path: 
         assert int(normalizer_of(model.policy).count) == 120
     else:
         model = make_model(rollout_buffer_class=DictRolloutBuffer)
-    with pytest.raises(ValueError, match=r"values are being trained and none did; pass rollout_buffer_class=sb3_saf\.T"):
+    with pytest.raises(
+        ValueError, match=r"values are being trained and none did; pass rollout_buffer_class=sb3_saf\.T"
+    ):
         model.learn(120)
 
 
@@ -324,7 +326,9 @@ def test_statistics_are_saved_and_loaded(tmp_path: Path) -> None:
 
 def test_statistics_are_no_parameters() -> None:
     space = TeamSpaces.of(VECTOR, 3).to_dict_space()
-    policies = [POLICIES[1](space, ToyTeams().action_space, lambda _: 1e-3, normalize_values=on) for on in (True, False)]
+    policies = [
+        POLICIES[1](space, ToyTeams().action_space, lambda _: 1e-3, normalize_values=on) for on in (True, False)
+    ]
     names = [[name for name, _ in policy.named_parameters()] for policy in policies]
     assert names[0] == names[1]
     added = policies[0].state_dict().keys() - policies[1].state_dict().keys()
