@@ -11,8 +11,9 @@ agents, 8 x 8 cells, 8 treasures, coordination 2). Two scores of each run, both 
 
 Probes: the exact probability that an agent chooses right (a coin: 0.5). TeamSupport: team return, treasures of 8.
 
-The effect of a detail is the mean difference between the four combinations with it and the four without it, one number
-per seed; its 95 % interval is Student's over seeds. Where the interval contains 0, the experiment says nothing.
+The effect of a detail is the mean difference between the combinations with it and those without it, one number per
+seed; its 95 % interval is Student's over seeds. Where the interval contains 0, the experiment says nothing. Effects
+of identity and initialisation are given apart for runs with and without value normalisation.
 """
 
 from __future__ import annotations
@@ -153,23 +154,37 @@ def print_task(name: str, scores: Floats, combinations: list[dict[str, bool]]) -
         print(f"| {switches} | {interval(of_seeds[:, 0])} | {interval(of_seeds[:, 1])} |")
     print("\n| effect of | on whole | on end |")
     print("| --- | --- | --- |")
-    for detail in DETAILS:
-        is_on = np.array([details[detail] for details in combinations])
-        effects = scores[is_on].mean(axis=0) - scores[~is_on].mean(axis=0)
-        cells = [
-            interval(effect) + ("" if (low := confidence_interval(effect))[0] * low[1] > 0 else ", contains 0")
-            for effect in effects.T
-        ]
-        print(f"| {detail} | {cells[0]} | {cells[1]} |")
+    on = {detail: np.array([details[detail] for details in combinations]) for detail in DETAILS}
+    normalised, everywhere = on["normalize_values"], np.ones(len(combinations), dtype=bool)
+    print_effect("normalize_values", scores, normalised, everywhere)
+    for detail in DETAILS[1:]:
+        print_effect(f"{detail}, values normalised", scores, on[detail], normalised)
+        print_effect(f"{detail}, values raw", scores, on[detail], ~normalised)
+
+
+def print_effect(name: str, scores: Floats, is_on: npt.NDArray[np.bool_], among: npt.NDArray[np.bool_]) -> None:
+    """
+    One row of the table of effects.
+
+    :param scores: (combinations, seeds, 2)
+    :param is_on: (combinations,) which of them have the detail
+    :param among: (combinations,) which of them are compared
+    """
+    effects = scores[is_on & among].mean(axis=0) - scores[~is_on & among].mean(axis=0)
+    cells = []
+    for effect in effects.T:
+        low, high = confidence_interval(effect)
+        cells.append(interval(effect) + (", contains 0" if low <= 0 <= high else ""))
+    print(f"| {name} | {cells[0]} | {cells[1]} |")
 
 
 def main() -> None:
     """Run everything and print Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--probe-seeds", type=int, default=8)
+    parser.add_argument("--probe-seeds", type=int, default=8, help="0 for no probes")
     parser.add_argument("--probe-updates", type=int, default=15, help="rollouts of 128 game steps")
     parser.add_argument("--max-grad-norm", type=float, default=0.5, help="of the probes; 0.5 is SB3's default")
-    parser.add_argument("--game-seeds", type=int, default=5)
+    parser.add_argument("--game-seeds", type=int, default=5, help="0 for no games")
     parser.add_argument("--game-updates", type=int, default=10, help="rollouts of 1,600 game steps")
     args = parser.parse_args()
     th.set_num_threads(1)
@@ -191,6 +206,8 @@ def main() -> None:
     }
     start = time.process_time()
     for name, (n_seeds, run) in tasks.items():
+        if n_seeds == 0:
+            continue
         scores = [[run(seed, details) for seed in range(n_seeds)] for details in combinations]
         print_task(name, np.array(scores), combinations)
         print(f"\n({time.process_time() - start:.0f} s of one processor so far)", flush=True)
