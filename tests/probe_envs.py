@@ -40,6 +40,7 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
         self.render_mode = None
         self.length = length
         self.time = 0
+        self.bits: Floats = np.zeros((n_agents, self.n_bits))
         self._rng: np.random.Generator | None = None
         self._observation_space = spaces.Box(-1.0, 1.0, (self._n_numbers(),), np.float32)
         self._action_space = spaces.Discrete(2)
@@ -85,8 +86,9 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
             self._rng = np.random.default_rng(seed)
         self.agents = self.possible_agents[:]
         self.time = 0
-        self.bits = 2.0 * self._rng.integers(2, size=(len(self.agents), self.n_bits)) - 1.0
-        return self._by_agent(self.observe(self.bits, 0)), {agent: {} for agent in self.agents}
+        self.bits = np.where(self._rng.integers(2, size=(len(self.agents), self.n_bits)) == 1, 1.0, -1.0)
+        observations = dict(zip(self.agents, self.observe(self.bits, 0), strict=True))
+        return observations, {agent: {} for agent in self.agents}
 
     def step(
         self, actions: dict[str, Any]
@@ -96,19 +98,15 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
         rewards = self.rewards(self.bits, chosen, self.time)
         self.time += 1
         done = self.time == self.length
-        result = (
-            self._by_agent(self.observe(self.bits, self.time)),
-            {agent: float(reward) for agent, reward in zip(self.agents, rewards, strict=True)},
-            dict.fromkeys(self.agents, False),
-            dict.fromkeys(self.agents, done),
-            {agent: {} for agent in self.agents},
+        agents = self.agents
+        self.agents = [] if done else agents
+        return (
+            dict(zip(agents, self.observe(self.bits, self.time), strict=True)),
+            {agent: float(reward) for agent, reward in zip(agents, rewards, strict=True)},
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, done),
+            {agent: {} for agent in agents},
         )
-        if done:
-            self.agents = []
-        return result
-
-    def _by_agent(self, rows: npt.NDArray[Any]) -> dict[str, Any]:
-        return dict(zip(self.agents, rows, strict=True))
 
 
 class ConstantReward(Probe):
@@ -166,6 +164,17 @@ class JointAction(Probe):
         """See the class."""
         solved = float((actions == (bits[:, 0] > 0)).all())
         return np.full(len(bits), solved + self.noise * bits[:, 1].sum())
+
+
+class OwnActionInOthersNoise(JointAction):
+    """
+    Every agent has a reward of its own: 1 if it chose as in :class:`OwnAction`, plus ``noise`` times the second number
+    of the *next* agent. To predict that, a critic must see the team and know whose value it is asked for.
+    """
+
+    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
+        """See the class."""
+        return (actions == (bits[:, 0] > 0)) + self.noise * np.roll(bits[:, 1], -1)
 
 
 class ZoneAction(Probe):

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 import torch as th
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_saf.common.networks import Attention, orthogonal_init
 from sb3_saf.saf.critic import CriticInput, SAFCritic
@@ -160,6 +161,20 @@ def test_a_team_without_active_agents_gives_numbers(source: KnowledgeSource) -> 
     read.sum().backward()
     assert read.isfinite().all()
     assert messages.grad is not None and (messages.grad == 0).all()
+
+
+def test_cost_is_linear_in_the_number_of_agents() -> None:
+    """Multiply-adds, exactly; benchmarks/knowledge_source.py measures seconds, too."""
+
+    def cost(n_agents: int) -> int:
+        module = KnowledgeSource(n_agents, SIZE)
+        with FlopCounterMode(display=False) as counter:
+            module(random_team(n_agents), random_team(n_agents)).sum().backward()
+        return int(counter.get_total_flops())
+
+    fixed, per_agent = 2 * cost(5) - cost(10), (cost(10) - cost(5)) // 5
+    for n_agents in (1, 20, 320):
+        assert cost(n_agents) == fixed + per_agent * n_agents
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 17])

@@ -75,8 +75,8 @@ class ValueNormalizer(nn.Module):
         The gradient that arrives at v is divided by std². With returns R, SB3's loss sends back
         ``d/dv (R - v)² = -2 (R - v)``, and the chain rule through ``v = mean + std * n`` makes ``-2 std (R - v)`` of it
         at n. The loss of normalised numbers is ``((R - mean) / std - n)²`` with the gradient
-        ``-2 ((R - mean) / std - n) = -2 (R - v) / std`` at n: the same, divided by std². So SB3's ``vf_coef`` weighs the
-        normalised loss, while the ``train/value_loss`` that it logs and ``clip_range_vf`` stay on the raw scale.
+        ``-2 ((R - mean) / std - n) = -2 (R - v) / std`` at n: the same, divided by std². So SB3's ``vf_coef`` weighs
+        the normalised loss, while the ``train/value_loss`` that it logs and ``clip_range_vf`` stay on the raw scale.
 
         :param outputs: (B, ...) of the critic
         :return: (B, ...) values on the scale of returns, which carry a reference to this normaliser
