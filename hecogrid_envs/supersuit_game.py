@@ -9,12 +9,15 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import cloudpickle
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
+
+from hecogrid_envs.supersuit_signals import AskMasks, Signals, find_signals
 
 #: Key of the letters, in the options of a reset on its way down.
 LETTERS = "supersuit_bridge/letters"
@@ -73,6 +76,7 @@ class Blueprint:
     :param action_space: of every agent
     :param metadata: of the environment
     :param render_mode: of the environment
+    :param signals: what rows show beside observations
     """
 
     parcel: bytes
@@ -82,13 +86,24 @@ class Blueprint:
     action_space: spaces.Space[Any]
     metadata: dict[str, Any]
     render_mode: str | None
+    signals: Signals
+
+    @property
+    def row_space(self) -> spaces.Space[Any]:
+        """Observation space of a row."""
+        return self.signals.row_space()
 
     @classmethod
-    def of(cls, make_env: MakeEnv) -> Blueprint:
+    def of(
+        cls, make_env: MakeEnv, active: bool = False, action_masks: AskMasks | None = None, state: bool = False
+    ) -> Blueprint:
         """
         Draw the blueprint of an environment.
 
         :param make_env: an environment, or a function that makes one
+        :param active: whether rows tell who is active
+        :param action_masks: whether rows show action masks; None for observations as they are, masks and all
+        :param state: whether rows show the game's state
         :raises ValueError: if it is no ParallelEnv, cannot be copied, or its agents differ in their spaces
         """
         is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
@@ -96,14 +111,24 @@ class Blueprint:
         _check_is_parallel(example, is_factory)
         try:
             agents = tuple(example.possible_agents)
+            parcel = _pickled(make_env, is_factory)
+            observation_space = _checked_space("observation", agents, example.observation_space)
+            action_space = _checked_space("action", agents, example.action_space)
+            signals = Signals(observation_space, observation_space)
+            if active or action_masks is not None or state:
+                first_infos = partial(_first_infos, parcel, is_factory)
+                signals = find_signals(
+                    example, observation_space, action_space, active, action_masks, state, first_infos
+                )
             return cls(
-                _pickled(make_env, is_factory),
+                parcel,
                 is_factory,
                 agents,
-                _checked_space("observation", agents, example.observation_space),
-                _checked_space("action", agents, example.action_space),
+                observation_space,
+                action_space,
                 metadata=dict(getattr(example, "metadata", None) or {}),
                 render_mode=getattr(example, "render_mode", None),
+                signals=signals,
             )
         finally:
             if is_factory:
@@ -113,9 +138,23 @@ class Blueprint:
 
     def build(self) -> AnyParallelEnv:
         """Build a game."""
-        content = pickle.loads(self.parcel)
-        env: AnyParallelEnv = content() if self.is_factory else content
-        return env
+        return _build(self.parcel, self.is_factory)
+
+
+def _build(parcel: bytes, is_factory: bool) -> AnyParallelEnv:
+    content = pickle.loads(parcel)
+    env: AnyParallelEnv = content() if is_factory else content
+    return env
+
+
+def _first_infos(parcel: bytes, is_factory: bool) -> Mapping[Any, Info]:
+    """Infos of a reset, of a copy that is closed again."""
+    env = _build(parcel, is_factory)
+    try:
+        infos: Mapping[Any, Info] = env.reset(seed=0)[1]
+        return infos
+    finally:
+        env.close()
 
 
 def _check_is_parallel(env: Any, is_factory: bool) -> None:
@@ -263,7 +302,7 @@ class Game(ParallelEnv[Any, Any, Any]):
         self.metadata = blueprint.metadata
         self.render_mode = blueprint.render_mode
         self._blank = blank(blueprint.observation_space)
-        self._observations = dict.fromkeys(self.possible_agents, self._blank)
+        self._observations = dict.fromkeys(self.possible_agents, blank(blueprint.row_space))
 
     @property
     def env(self) -> AnyParallelEnv:
@@ -273,8 +312,8 @@ class Game(ParallelEnv[Any, Any, Any]):
         return self._env
 
     def observation_space(self, agent: Any) -> spaces.Space[Any]:
-        """Observation space of every agent."""
-        return self._blueprint.observation_space
+        """Observation space of every agent's row."""
+        return self._blueprint.row_space
 
     def action_space(self, agent: Any) -> spaces.Space[Any]:
         """Action space of every agent."""
@@ -342,9 +381,14 @@ class Game(ParallelEnv[Any, Any, Any]):
         self._ended |= ended
         self._playing = self._alive()
         over = not self._playing
+        truncated = {a: over and a in acted and bool(truncations.get(a, False)) for a in self.possible_agents}
+        terminated = {a: over and (not truncated[a] or bool(terminations.get(a, False))) for a in self.possible_agents}
         # An ended agent's last observation is not the input of a decision: it goes where SB3 looks for it, into
         # the info (MarkovVectorEnv does that when the team is done), and the row shows zeros.
-        self._show(observations, acted if over else self._playing)
+        if over:
+            self._show(observations, infos, acted, active={a for a in acted if not terminated[a]}, over=True)
+        else:
+            self._show(observations, infos, self._playing, active=self._playing)
         packed: dict[Any, Info] = {}
         for agent in self.possible_agents:
             info = dict(infos.get(agent) or {}) if agent in acted else INACTIVE
@@ -352,8 +396,6 @@ class Game(ParallelEnv[Any, Any, Any]):
                 info["terminal_observation"] = self._own(observations, agent)
             packed[agent] = {STEP_INFO: self._frozen(info, agent)} if info else {}
         rewards = {a: rewards.get(a, 0.0) if a in acted else 0.0 for a in self.possible_agents}
-        truncated = {a: over and a in acted and bool(truncations.get(a, False)) for a in self.possible_agents}
-        terminated = {a: over and (not truncated[a] or bool(terminations.get(a, False))) for a in self.possible_agents}
         # Copies, because the observations outlive the reset that follows, and games may reuse their arrays.
         return deepcopy(self._observations) if over else self._observations, rewards, terminated, truncated, packed
 
@@ -385,11 +427,21 @@ class Game(ParallelEnv[Any, Any, Any]):
             return self._blank
         return fitted(self._blueprint.observation_space, observations[agent], str(agent))
 
-    def _show(self, observations: Mapping[Any, Any], agents: Container[Any]) -> None:
-        """Set the rows of these agents to their observations and all others to zeros."""
-        self._observations = {
-            agent: self._own(observations, agent) if agent in agents else self._blank for agent in self.possible_agents
-        }
+    def _show(
+        self,
+        observations: Mapping[Any, Any],
+        infos: Mapping[Any, Any],
+        agents: Container[Any],
+        active: Container[Any],
+        over: bool = False,
+    ) -> None:
+        """Set the rows of ``agents`` to their observations and all others to zeros; all show the signals."""
+        own = {a: self._own(observations, a) if a in agents else self._blank for a in self.possible_agents}
+        signals = self._blueprint.signals
+        if signals.shown:
+            state = None if signals.state is None else fitted(signals.state, self.env.state(), "the state")
+            own = {a: signals.row(own[a], infos.get(a) or {}, state, str(a), a in active, over) for a in own}
+        self._observations = own
 
     # ---- what letters say
 
@@ -404,7 +456,7 @@ class Game(ParallelEnv[Any, Any, Any]):
         observations, infos = self.env.reset(seed=seed, options=options)
         self._ended.clear()
         self._playing = self._alive()
-        self._show(observations, self._playing)
+        self._show(observations, infos, self._playing, active=self._playing)
         return [
             deepcopy(infos.get(agent) or {}) if agent in self._playing else dict(INACTIVE)
             for agent in self.possible_agents
