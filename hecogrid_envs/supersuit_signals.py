@@ -176,6 +176,6 @@ def _state_space(example: Any) -> spaces.Space[Any]:
             return space
     raise ValueError(
         f"state=True needs an environment with state() and a state_space of Box, Discrete, MultiDiscrete or "
-        f"MultiBinary, got {example} with {getattr(example, 'state_space', 'no state_space')}; leave state out, or give "
-        "the environment both"
+        f"MultiBinary, got {example} with {getattr(example, 'state_space', 'no state_space')}; leave state out, or "
+        "give the environment both"
     )

@@ -15,7 +15,7 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_saf.common.distributions import distribution_of, n_action_parameters
+from sb3_saf.common.distributions import distribution_of, n_action_parameters, only_legal
 from sb3_saf.common.networks import AgentHeads, mlp
 
 #: Orthogonal gain of the last layer: first policies are close to uniform.
@@ -77,12 +77,15 @@ class Actor(nn.Module, ABC):
         self.reads_agent = reads_agent
 
     @abstractmethod
-    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+    def forward(
+        self, features: th.Tensor, agent: th.Tensor | None = None, action_mask: th.Tensor | None = None
+    ) -> th.Tensor:
         """
         Everything that the action distribution depends on, as one vector per row.
 
         :param features: (K, d) features of own observations
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :param action_mask: (K, A) bool, legal actions (Discrete only); all if None
         :return: (K, P')
         """
 
@@ -123,10 +126,12 @@ class SinglePolicy(Actor):
 
         self.head: ActionHead | AgentHeads = make_head() if n_agents is None else AgentHeads(make_head, n_agents)
 
-    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+    def forward(
+        self, features: th.Tensor, agent: th.Tensor | None = None, action_mask: th.Tensor | None = None
+    ) -> th.Tensor:
         """See :class:`Actor`; (K, d) to (K, P)."""
         result: th.Tensor = self.head(features, agent) if self.reads_agent else self.head(features)
-        return result
+        return only_legal(result, action_mask)
 
     def distribution(self, parameters: th.Tensor) -> Distribution:
         """See :class:`Actor`; SB3's own distribution for the action space."""

@@ -138,8 +138,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         rows = np.asarray(obs[key])
         if rows.shape != expected or not np.can_cast(rows.dtype, stored.dtype, "same_kind"):
             raise ValueError(
-                f"expected {key!r} of shape {expected} and dtype {stored.dtype}, got {rows.shape} and {rows.dtype}; fill "
-                "the buffer from the environment that it was made for"
+                f"expected {key!r} of shape {expected} and dtype {stored.dtype}, got {rows.shape} and {rows.dtype}; "
+                "fill the buffer from the environment that it was made for"
             )
         by_game = rows.reshape(self.n_games, self.n_agents, *stored.shape[2:])
         differs = by_game[:, 0] != by_game[:, self.pos % self.n_agents]
@@ -228,8 +228,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         playing = np.flatnonzero(self.active.any(axis=2))
         if not len(playing):
             raise ValueError(
-                f"expected agents that take part, got none in {self.buffer_size} steps of {self.n_games} games; there is "
-                f"nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or collect longer rollouts"
+                f"expected agents that take part, got none in {self.buffer_size} steps of {self.n_games} games; there "
+                f"is nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or collect longer rollouts"
             )
         return playing
 

@@ -28,6 +28,8 @@ from torch.utils.checkpoint import checkpoint
 
 #: Up to this many joint actions, a pool's entropy and most likely action are found by enumeration.
 MAX_ENUMERATED_ACTIONS: Final = 4096
+#: Logit of an illegal action: its probability is exactly zero, and no gradient is NaN as with -inf.
+ILLEGAL_LOGIT: Final = -1e8
 #: Numbers held at once while enumerating; more rows are done in parts that backpropagation computes again.
 _ENUMERATED_AT_ONCE: Final = 1 << 22
 
@@ -60,6 +62,16 @@ def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> D
     else:
         distribution.proba_distribution(action_logits=parameters)
     return cast(Distribution, distribution)
+
+
+def only_legal(logits: th.Tensor, action_mask: th.Tensor | None) -> th.Tensor:
+    """
+    Take illegal actions out of categorical policies: likelihood, entropy and gradient then are those over legal ones.
+
+    :param logits: (B, A)
+    :param action_mask: (B, A) bool, legal actions; None if all are
+    """
+    return logits if action_mask is None else logits.masked_fill(~action_mask, ILLEGAL_LOGIT)
 
 
 def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:

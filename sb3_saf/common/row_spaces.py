@@ -77,7 +77,11 @@ class RowSpaces(NamedTuple):
         """
         if not self.is_dict:
             return {OBS_KEY: obs}
-        told = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.n_masked_actions is not None, STATE_KEY: self.state is not None}
+        told = {
+            ACTIVE_KEY: self.active,
+            ACTION_MASK_KEY: self.n_masked_actions is not None,
+            STATE_KEY: self.state is not None,
+        }
         keys = [OBS_KEY, *(key for key, is_told in told.items() if is_told)]
         if not isinstance(obs, Mapping) or not set(keys) <= set(obs):
             got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__

@@ -124,7 +124,9 @@ class TeamSpaces(NamedTuple):
         active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
         if active is not None and active != spaces.MultiBinary(n_agents):
             raise ValueError(_not_a_team_space(f"its {ACTIVE_KEY!r} must be MultiBinary({n_agents}), got {active}"))
-        if action_mask is not None and not (isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1):
+        if action_mask is not None and not (
+            isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
+        ):
             raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
         if state is not None:
             _checked_state(state)

@@ -22,6 +22,7 @@ from sb3_saf.common.distributions import (
     mixture_log_probs,
     mixture_of,
     n_action_parameters,
+    only_legal,
     policy_parameters,
 )
 from sb3_saf.common.networks import mlp
@@ -87,25 +88,30 @@ class PolicyPool(Actor):
             ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init) for _ in range(n_policies)
         )
 
-    def evaluate(self, features: th.Tensor) -> PoolOutput:
+    def evaluate(self, features: th.Tensor, action_mask: th.Tensor | None = None) -> PoolOutput:
         """
         Ask every policy and weigh them.
 
         :param features: (K, d)
+        :param action_mask: (K, A) bool, legal actions, to which every policy keeps; all if None
         :return: log weights (K, U) and action parameters (K, U, P)
         """
         logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
-        return PoolOutput(logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1))
+        actions = [only_legal(policy(features), action_mask) for policy in self.policies]
+        return PoolOutput(logits.log_softmax(dim=1), th.stack(actions, dim=1))
 
-    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+    def forward(
+        self, features: th.Tensor, agent: th.Tensor | None = None, action_mask: th.Tensor | None = None
+    ) -> th.Tensor:
         """
         See :class:`Actor`.
 
         :param features: (K, d)
         :param agent: not read
+        :param action_mask: see :meth:`evaluate`
         :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
         """
-        log_weights, actions = self.evaluate(features)
+        log_weights, actions = self.evaluate(features, action_mask)
         if self._is_categorical_mixture:
             return mixture_log_probs(log_weights, actions)
         return th.cat([log_weights, actions.flatten(1)], dim=1)
