@@ -40,7 +40,8 @@ class Turns(BaseParallelWrapper[Any, Any, Any]):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin a game."""
-        observations, infos = super().reset(seed, options)
+        # The seeds of games have 63 bits, OpenSpiel's 31.
+        observations, infos = super().reset(None if seed is None else seed % 2**31, options)
         return self._with_waiting(observations), infos
 
     def step(self, actions: dict[Any, Any]) -> Any:
@@ -104,14 +105,14 @@ PPO_SETTINGS: dict[str, Any] = {
     "rollout_buffer_class": TeamRolloutBuffer,
 }
 
-WALKERS = {"terminate_on_fall": False, "remove_on_fall": True, "max_cycles": 200}
+WALKERS = {"terminate_on_fall": False, "remove_on_fall": True, "shared_reward": False, "max_cycles": 200}
 ENVIRONMENTS: dict[str, Example] = {
-    "simple_spread": Example(partial(module_env, "mpe2.simple_spread_v3")),
+    "simple_spread": Example(partial(module_env, "mpe2.simple_spread_v3"), n_steps=50),
     "simple_spread_continuous": Example(
-        partial(module_env, "mpe2.simple_spread_v3"), {"continuous_actions": True}, ppo={"ent_coef": 0.0}
+        partial(module_env, "mpe2.simple_spread_v3"), {"continuous_actions": True}, n_steps=50, ppo={"ent_coef": 0.0}
     ),
     # A speaker that cannot move and a listener that cannot speak: unequal spaces, padded.
-    "speaker_listener": Example(partial(padded, "mpe2.simple_speaker_listener_v4")),
+    "speaker_listener": Example(partial(padded, "mpe2.simple_speaker_listener_v4"), n_steps=50),
     "pursuit": Example(partial(module_env, "pettingzoo.sisl.pursuit_v5"), {"max_cycles": 200}, n_games=8),
     # Walkers that fall are out of the game, the others go on.
     "multiwalker": Example(
