@@ -9,7 +9,8 @@ import torch as th
 from torch import nn
 
 from sb3_saf.common.networks import Attention, orthogonal_init
-from sb3_saf.saf.critic import CriticInput, SAFCritic
+from sb3_saf.common.parts import CriticInput
+from sb3_saf.saf.critic import SAFCritic
 from sb3_saf.saf.knowledge_source import KnowledgeSource
 
 Array = npt.NDArray[np.float64]
