@@ -71,12 +71,12 @@ def padded(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
     import supersuit
 
     env = supersuit.pad_observations_v0(import_module(module).parallel_env(**params))
-    return supersuit.pad_action_space_v0(env)  # type: ignore[no-any-return]
+    return supersuit.pad_action_space_v0(env)
 
 
 def module_env(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
     """An environment that is a module with ``parallel_env``."""
-    return import_module(module).parallel_env(**params)  # type: ignore[no-any-return]
+    return import_module(module).parallel_env(**params)
 
 
 class Example(NamedTuple):

@@ -107,7 +107,7 @@ def test_agents_that_join_in_an_environment_without_masks() -> None:
 
 def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
     names = {"obs", "team", "agent"}
-    small = {"n_agents": 2, "grid_size": 10, "n_treasures": 5, "view_size": 5}
+    small: dict[str, Any] = {"n_agents": 2, "grid_size": 10, "n_treasures": 5, "view_size": 5}
     assert set(make_team_env("TeamSupport", **small).observation_space.spaces) == names  # type: ignore[attr-defined]
     plain = make_team_env(TellingEnv, active=False, action_masks=False, **LIVES)
     assert set(plain.observation_space.spaces) == names  # type: ignore[attr-defined]
@@ -178,7 +178,7 @@ def test_random_teams_take_legal_actions_each_as_often() -> None:
     env = telling_env(1)
     obs: Any = env.reset()
     policy = RandomPolicy(env.action_space, seed=0)
-    counts = sum(np.eye(N_ACTIONS)[policy.predict(obs)[0]] for _ in range(2000))
+    counts = np.sum([np.eye(N_ACTIONS)[policy.predict(obs)[0]] for _ in range(2000)], axis=0)
     assert counts[1].tolist() == [2000, 0, 0, 0]  # takes no part
     assert counts[0] == pytest.approx([1000, 0, 1000, 0], abs=100)
     assert evaluate_team(policy, env, 3).lengths == [5, 5, 5]
@@ -384,7 +384,7 @@ def enumerated(policy: Any, obs: dict[str, th.Tensor]) -> th.Tensor:
         weights = (actor.query_net(features) @ keys.t() / keys.shape[1] ** 0.5).double().softmax(dim=1)
         logits = [head(features) for head in actor.policies]
     by_policy = [one.double().exp() * mask for one in logits]
-    return sum(w.unsqueeze(1) * p / p.sum(dim=1, keepdim=True) for w, p in zip(weights.t(), by_policy, strict=True))  # type: ignore[return-value]
+    return sum(w.unsqueeze(1) * p / p.sum(dim=1, keepdim=True) for w, p in zip(weights.t(), by_policy, strict=True))
 
 
 @pytest.mark.parametrize("kind", POLICIES)
