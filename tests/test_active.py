@@ -88,6 +88,14 @@ def test_rows_tell_who_is_active_what_is_legal_and_the_state(masks: str, n_cpus:
     env.close()
 
 
+def test_whoever_ends_with_the_last_step_is_not_active_after_it() -> None:
+    env = telling_env(1, deaths={0: 5}, joins={}, time_limit="bootstrap")
+    obs: Any = env.reset()
+    for _ in range(5):
+        obs, _, _, infos = env.step(first_legal(obs))
+    assert [info["terminal_observation"]["active"].tolist() for info in infos] == [[0, 1, 1]] * 3
+
+
 def test_agents_that_join_in_an_environment_without_masks() -> None:
     env = make_team_env(LateEnv, seed=0, n_agents=2)
     obs: Any = env.reset()
