@@ -6,12 +6,15 @@ import pickle
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import cloudpickle
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
+
+from hecogrid_envs.supersuit_signals import AskMasks, Signals, find_signals
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
@@ -31,6 +34,7 @@ class Blueprint:
     :param action_space: of every agent
     :param metadata: of the environment
     :param render_mode: of the environment
+    :param signals: what rows show beside observations
     """
 
     parcel: bytes
@@ -40,13 +44,24 @@ class Blueprint:
     action_space: spaces.Space[Any]
     metadata: dict[str, Any]
     render_mode: str | None
+    signals: Signals
+
+    @property
+    def row_space(self) -> spaces.Space[Any]:
+        """Observation space of a row."""
+        return self.signals.row_space()
 
     @classmethod
-    def of(cls, make_env: MakeEnv) -> Blueprint:
+    def of(
+        cls, make_env: MakeEnv, active: bool = False, action_masks: AskMasks | None = None, state: bool = False
+    ) -> Blueprint:
         """
         Draw the blueprint of an environment.
 
         :param make_env: an environment, or a function that makes one
+        :param active: whether rows tell who is active
+        :param action_masks: whether rows show action masks; None for observations as they are, masks and all
+        :param state: whether rows show the game's state
         :raises ValueError: if it is no ParallelEnv, cannot be copied, or its agents differ in their spaces
         """
         is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
@@ -54,14 +69,24 @@ class Blueprint:
         _check_is_parallel(example, is_factory)
         try:
             agents = tuple(example.possible_agents)
+            parcel = _pickled(make_env, is_factory)
+            observation_space = _checked_space("observation", agents, example.observation_space)
+            action_space = _checked_space("action", agents, example.action_space)
+            signals = Signals(observation_space, observation_space)
+            if active or action_masks is not None or state:
+                first_infos = partial(_first_infos, parcel, is_factory)
+                signals = find_signals(
+                    example, observation_space, action_space, active, action_masks, state, first_infos
+                )
             return cls(
-                _pickled(make_env, is_factory),
+                parcel,
                 is_factory,
                 agents,
-                _checked_space("observation", agents, example.observation_space),
-                _checked_space("action", agents, example.action_space),
+                observation_space,
+                action_space,
                 metadata=dict(getattr(example, "metadata", None) or {}),
                 render_mode=getattr(example, "render_mode", None),
+                signals=signals,
             )
         finally:
             if is_factory:
@@ -71,9 +96,23 @@ class Blueprint:
 
     def build(self) -> AnyParallelEnv:
         """Build a game."""
-        content = pickle.loads(self.parcel)
-        env: AnyParallelEnv = content() if self.is_factory else content
-        return env
+        return _build(self.parcel, self.is_factory)
+
+
+def _build(parcel: bytes, is_factory: bool) -> AnyParallelEnv:
+    content = pickle.loads(parcel)
+    env: AnyParallelEnv = content() if is_factory else content
+    return env
+
+
+def _first_infos(parcel: bytes, is_factory: bool) -> Mapping[Any, dict[str, Any]]:
+    """Infos of a reset, of a copy that is closed again."""
+    env = _build(parcel, is_factory)
+    try:
+        infos: Mapping[Any, dict[str, Any]] = env.reset(seed=0)[1]
+        return infos
+    finally:
+        env.close()
 
 
 def _check_is_parallel(env: Any, is_factory: bool) -> None:

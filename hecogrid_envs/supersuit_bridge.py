@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 from hecogrid_envs.seeding import game_seeds
 from hecogrid_envs.supersuit_blueprint import Blueprint, MakeEnv
 from hecogrid_envs.supersuit_game import FAILED_STEP, REPLY, RESET_INFOS, STEP_INFO, Game, Info, Letter
+from hecogrid_envs.supersuit_signals import AskMasks
 from hecogrid_envs.supersuit_stack import build_stack, no_reply
 
 
@@ -43,6 +44,9 @@ class SuperSuitVecEnv(VecEnv):
     for a method that changes the game use :meth:`game_method`. ``action_masks`` is the exception, for sb3-contrib:
     each game is asked once, and if it answers with a dict by agent, each row gets its own agent's mask.
 
+    On request rows carry signals. The observation of a row is then a Dict of ``"obs"``, the agent's own observation,
+    and ``"active"``, ``"action_mask"``, ``"state"``; see :class:`~hecogrid_envs.supersuit_signals.Signals`.
+
     An exception in a game comes out of the bridge as it is, also from a worker process; afterwards call ``reset``.
 
     :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it,
@@ -50,13 +54,28 @@ class SuperSuitVecEnv(VecEnv):
     :param n_games: E, number of games
     :param seed: of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
-    :raises ValueError: if the environment is no ParallelEnv, cannot be copied, or its agents differ in their spaces
+    :param active: whether rows tell if their agent takes part
+    :param action_masks: None leaves observations as they are. ``"auto"`` shows masks in rows if the game gives any, in
+        observations of the form {"observation", "action_mask"} or in ``infos[agent]["action_mask"]``, True insists on
+        them, False shows none; all three take observations out of that form
+    :param state: whether rows show the game's ``state()``
+    :raises ValueError: if the environment is no ParallelEnv, cannot be copied, its agents differ in their spaces, or
+        it does not give the signals
     """
 
-    def __init__(self, make_env: MakeEnv, n_games: int, seed: int | None = None, n_cpus: int = 1):
+    def __init__(
+        self,
+        make_env: MakeEnv,
+        n_games: int,
+        seed: int | None = None,
+        n_cpus: int = 1,
+        active: bool = False,
+        action_masks: AskMasks | None = None,
+        state: bool = False,
+    ):
         _check_count("n_games", n_games)
         _check_count("n_cpus", n_cpus)
-        blueprint = Blueprint.of(make_env)
+        blueprint = Blueprint.of(make_env, active, action_masks, state)
         self.possible_agents = list(blueprint.agents)
         self.n_agents = len(self.possible_agents)
         self.n_games = int(n_games)
@@ -65,7 +84,7 @@ class SuperSuitVecEnv(VecEnv):
         self._stack = build_stack(blueprint, self.n_games, int(n_cpus))
         try:
             self._check_games_differ()
-            super().__init__(self.n_games * self.n_agents, blueprint.observation_space, blueprint.action_space)
+            super().__init__(self.n_games * self.n_agents, blueprint.row_space, blueprint.action_space)
             self.seed(seed)
         except BaseException:
             self.close()
@@ -319,7 +338,15 @@ class SuperSuitVecEnv(VecEnv):
         return tile_images(cast(Any, pictures)) if self.render_mode == "rgb_array" else None
 
 
-def supersuit_vec_env(make_env: MakeEnv, n_games: int, seed: int | None = None, n_cpus: int = 1) -> SuperSuitVecEnv:
+def supersuit_vec_env(
+    make_env: MakeEnv,
+    n_games: int,
+    seed: int | None = None,
+    n_cpus: int = 1,
+    active: bool = False,
+    action_masks: AskMasks | None = None,
+    state: bool = False,
+) -> SuperSuitVecEnv:
     """
     Flatten games of a PettingZoo ParallelEnv into the rows of one VecEnv.
 
@@ -327,8 +354,11 @@ def supersuit_vec_env(make_env: MakeEnv, n_games: int, seed: int | None = None, 
     :param n_games: E, number of games
     :param seed: of the games
     :param n_cpus: number of worker processes; 1 keeps all games in this process
+    :param active: see :class:`SuperSuitVecEnv`
+    :param action_masks: see :class:`SuperSuitVecEnv`
+    :param state: see :class:`SuperSuitVecEnv`
     """
-    return SuperSuitVecEnv(make_env, n_games, seed=seed, n_cpus=n_cpus)
+    return SuperSuitVecEnv(make_env, n_games, seed, n_cpus, active, action_masks, state)
 
 
 def _check_count(name: str, value: Any) -> None:

@@ -85,7 +85,7 @@ class Game(ParallelEnv[Any, Any, Any]):
         self.metadata = blueprint.metadata
         self.render_mode = blueprint.render_mode
         self._blank = blank(blueprint.observation_space)
-        self._observations = dict.fromkeys(self.possible_agents, self._blank)
+        self._observations = dict.fromkeys(self.possible_agents, blank(blueprint.row_space))
 
     @property
     def env(self) -> AnyParallelEnv:
@@ -95,8 +95,8 @@ class Game(ParallelEnv[Any, Any, Any]):
         return self._env
 
     def observation_space(self, agent: Any) -> spaces.Space[Any]:
-        """Observation space of every agent."""
-        return self._blueprint.observation_space
+        """Observation space of every agent's row."""
+        return self._blueprint.row_space
 
     def action_space(self, agent: Any) -> spaces.Space[Any]:
         """Action space of every agent."""
@@ -164,9 +164,14 @@ class Game(ParallelEnv[Any, Any, Any]):
         self._ended |= ended
         self._playing = self._alive()
         over = not self._playing
+        truncated = {a: over and a in acted and bool(truncations.get(a, False)) for a in self.possible_agents}
+        terminated = {a: over and (not truncated[a] or bool(terminations.get(a, False))) for a in self.possible_agents}
         # An ended agent's last observation is not the input of a decision: it goes where SB3 looks for it, into
         # the info (MarkovVectorEnv does that when the team is done), and the row shows zeros.
-        self._show(observations, acted if over else self._playing)
+        if over:
+            self._show(observations, infos, acted, active={a for a in acted if not terminated[a]}, over=True)
+        else:
+            self._show(observations, infos, self._playing, active=self._playing)
         packed: dict[Any, Info] = {}
         for agent in self.possible_agents:
             info = dict(infos.get(agent) or {}) if agent in acted else INACTIVE
@@ -174,8 +179,6 @@ class Game(ParallelEnv[Any, Any, Any]):
                 info["terminal_observation"] = self._own(observations, agent)
             packed[agent] = {STEP_INFO: self._frozen(info, agent)} if info else {}
         rewards = {a: rewards.get(a, 0.0) if a in acted else 0.0 for a in self.possible_agents}
-        truncated = {a: over and a in acted and bool(truncations.get(a, False)) for a in self.possible_agents}
-        terminated = {a: over and (not truncated[a] or bool(terminations.get(a, False))) for a in self.possible_agents}
         # Copies, because the observations outlive the reset that follows, and games may reuse their arrays.
         return deepcopy(self._observations) if over else self._observations, rewards, terminated, truncated, packed
 
@@ -207,11 +210,21 @@ class Game(ParallelEnv[Any, Any, Any]):
             return self._blank
         return fitted(self._blueprint.observation_space, observations[agent], str(agent))
 
-    def _show(self, observations: Mapping[Any, Any], agents: Container[Any]) -> None:
-        """Set the rows of these agents to their observations and all others to zeros."""
-        self._observations = {
-            agent: self._own(observations, agent) if agent in agents else self._blank for agent in self.possible_agents
-        }
+    def _show(
+        self,
+        observations: Mapping[Any, Any],
+        infos: Mapping[Any, Any],
+        agents: Container[Any],
+        active: Container[Any],
+        over: bool = False,
+    ) -> None:
+        """Set the rows of ``agents`` to their observations and all others to zeros; all show the signals."""
+        own = {a: self._own(observations, a) if a in agents else self._blank for a in self.possible_agents}
+        signals = self._blueprint.signals
+        if signals.shown:
+            state = None if signals.state is None else fitted(signals.state, self.env.state(), "the state")
+            own = {a: signals.row(own[a], infos.get(a) or {}, state, str(a), a in active, over) for a in own}
+        self._observations = own
 
     # ---- what letters say
 
@@ -226,7 +239,7 @@ class Game(ParallelEnv[Any, Any, Any]):
         observations, infos = self.env.reset(seed=seed, options=options)
         self._ended.clear()
         self._playing = self._alive()
-        self._show(observations, self._playing)
+        self._show(observations, infos, self._playing, active=self._playing)
         return [
             deepcopy(infos.get(agent) or {}) if agent in self._playing else dict(INACTIVE)
             for agent in self.possible_agents

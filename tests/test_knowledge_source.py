@@ -10,7 +10,8 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_saf.common.networks import Attention, orthogonal_init
-from sb3_saf.saf.critic import CriticInput, SAFCritic
+from sb3_saf.common.parts import CriticInput
+from sb3_saf.saf.critic import SAFCritic
 from sb3_saf.saf.knowledge_source import KnowledgeSource
 
 Array = npt.NDArray[np.float64]

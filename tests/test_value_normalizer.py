@@ -231,7 +231,7 @@ def test_forgetting_to_denormalise_breaks_advantages(
     """
     right = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages.copy()
     with monkeypatch.context() as patch:
-        patch.setattr(ValueNormalizer, "forward", lambda self, outputs: outputs)
+        patch.setattr(ValueNormalizer, "forward", lambda self, outputs, active=None: outputs)
         wrong = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages
     assert abs(wrong - right).max() == pytest.approx(error, abs=0.1)
     assert abs(right).max() > 1.0

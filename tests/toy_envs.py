@@ -251,6 +251,67 @@ class LateEnv(CounterEnv):
         return (observations, *rest)
 
 
+class TellingEnv(CounterEnv):
+    """
+    Agents join and die, have action masks, and there is a state: everything that rows may tell.
+
+    Agent ``i`` may do action ``a`` at step ``t`` if ``a + i + t`` is even; anything else ends the test. The state is
+    ``[step, number of agents]``.
+
+    :param joins: agent's index to the step after which it is there
+    :param masks: where masks are: "observation", "info" or nowhere
+    :param stuck: step at which agent 0 may do nothing
+    """
+
+    def __init__(
+        self,
+        joins: Mapping[int, int] | None = None,
+        masks: str | None = "observation",
+        stuck: int | None = None,
+        **kwargs: Any,
+    ):
+        self.joins = dict(joins or {})
+        self.masks = masks
+        self.stuck = stuck
+        self.state_space = spaces.Box(0.0, 100.0, (2,), np.float32)
+        super().__init__(**kwargs)
+
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        own = super()._make_observation_space()
+        mask = spaces.Box(0, 1, (4,), np.int8)
+        return spaces.Dict({"observation": own, "action_mask": mask}) if self.masks == "observation" else own
+
+    def mask(self, index: int) -> npt.NDArray[np.int8]:
+        legal = (np.arange(4) + index + self.steps) % 2 == 0
+        return (legal & (self.steps != self.stuck or index > 0)).astype(np.int8)
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        own = super()._observation(index, draw)
+        return {"observation": own, "action_mask": self.mask(index)} if self.masks == "observation" else own
+
+    def _with_masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        if self.masks != "info":
+            return infos
+        return {a: {**infos.get(a, {}), "action_mask": self.mask(self._index(a))} for a in {*infos, *self.agents}}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        _, infos = super().reset(seed, options)
+        self.agents = [a for a in self.agents if not self.joins.get(self._index(a))]
+        return self._observe(), self._with_masks({a: infos[a] for a in self.agents})
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        if self.masks is not None:
+            assert all(self.mask(self._index(agent))[action] for agent, action in actions.items()), actions
+        observations, *rest, infos = super().step(actions)
+        joined = [a for a in self.possible_agents if self.joins.get(self._index(a)) == self.steps]
+        self.agents = [a for a in self.possible_agents if a in self.agents or a in joined]
+        observations |= {a: self._observe()[a] for a in joined}
+        return (observations, *rest, self._with_masks(infos))
+
+    def state(self) -> npt.NDArray[Any]:
+        return np.array([self.steps, len(self.agents)], np.float32)
+
+
 class OddError(BaseException):
     """Not an Exception."""
 

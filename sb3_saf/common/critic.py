@@ -85,6 +85,19 @@ class JointStates(TeamStates):
         return th.cat([joint, th.eye(n_agents, device=joint.device).expand(n_teams, -1, -1)], dim=2)
 
 
+class StateCritic(nn.Module, ABC):
+    """Base of critics that read the state of the game and nothing else."""
+
+    @abstractmethod
+    def forward(self, states: th.Tensor) -> th.Tensor:
+        """
+        Value of every agent of every game.
+
+        :param states: (G, *state) states, as SB3 preprocesses observations
+        :return: (G, N)
+        """
+
+
 class OwnValueHead(nn.Module):
     """
     Value of an agent from its own features.
@@ -144,6 +157,7 @@ class JointValueHead(nn.Module):
     :param activation_fn: activation of the hidden layers
     :param heads: one head for all agents, or one for each
     :param agent_identity: whether a shared head reads the agent's identity
+    :param joint_dim: size of the joint features where they are not N times d
     """
 
     def __init__(
@@ -154,11 +168,14 @@ class JointValueHead(nn.Module):
         activation_fn: type[nn.Module],
         heads: Heads,
         agent_identity: bool,
+        joint_dim: int | None = None,
     ):
         super().__init__()
+        self.n_agents = n_agents
         self.per_agent = heads == "per_agent"
         self.agent_identity = agent_identity and not self.per_agent
-        n_inputs = features_dim * n_agents + (n_agents if self.agent_identity else 0)
+        n_joint = features_dim * n_agents if joint_dim is None else joint_dim
+        n_inputs = n_joint + (n_agents if self.agent_identity else 0)
         n_heads = n_agents if self.per_agent else 1
         self.heads = nn.ModuleList(mlp([n_inputs, *hidden, 1], activation_fn) for _ in range(n_heads))
 
@@ -166,14 +183,14 @@ class JointValueHead(nn.Module):
         """
         Values of whole teams.
 
-        :param features: (G, N, d)
+        :param features: (G, N, d), or joint features of any other form (G, ...)
         :return: (G, N)
         """
         joint = features.flatten(1)
         if self.agent_identity:
-            return self._with_identity(joint, features.shape[1])
+            return self._with_identity(joint, self.n_agents)
         values = th.cat([head(joint) for head in self.heads], dim=1)
-        return values.expand(-1, features.shape[1])
+        return values.expand(-1, self.n_agents)
 
     def _with_identity(self, joint: th.Tensor, n_agents: int) -> th.Tensor:
         """(G, N) values of [joint features, one-hot agent]; the first layer reads the joint part once per team."""

@@ -33,7 +33,7 @@ from torch.utils.checkpoint import checkpoint
 MAX_ENUMERATED_ACTIONS: Final = 4096
 #: Numbers held at once while enumerating; more rows are done in parts that backpropagation computes again.
 _ENUMERATED_AT_ONCE: Final = 1 << 22
-#: Logit of what a mask forbids: its probability is zero to the last bit, and all sums stay finite.
+#: Logit of what a mask forbids: its probability is zero to the last bit, and no sum or gradient is NaN as with -inf.
 _FORBIDDEN: Final = -1e8
 
 

@@ -16,6 +16,8 @@ from sb3_saf.common.teams import check_count
 
 Backend = Literal["native", "supersuit"]
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+#: Whether to look for action masks: where there are any, always, never.
+AskMasks: TypeAlias = Literal["auto"] | bool
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 EnvFactory: TypeAlias = "Callable[..., AnyParallelEnv]"
@@ -29,6 +31,10 @@ def make_team_env(
     time_limit: TimeLimit = "terminal",
     monitor_dir: str | None = None,
     n_cpus: int = 1,
+    *,
+    active: bool | None = None,
+    action_masks: AskMasks = "auto",
+    state: bool = False,
     **params: Any,
 ) -> CentralizedValueWrapper:
     """
@@ -38,6 +44,14 @@ def make_team_env(
 
     HECOGrid tasks give ``observation="tiles"`` here unless told otherwise: the same views as one code per cell, from
     which the encoder makes the same pixels, in 48 times less memory than ``observation="rgb"``.
+
+    Environments of others may have agents that die or join, action masks, and a state:
+
+    - An agent that has ended, or not joined yet, keeps its row, which shows zeros; ``"active"`` tells the critics, and
+      ``TeamRolloutBuffer`` keeps such rows out of the loss.
+    - Masks come from observations of the form {"observation", "action_mask"}, which are taken apart, or from
+      ``infos[agent]["action_mask"]``. Policies of this package take legal actions only.
+    - The environment's ``state()`` can be the input of MAPPO's critic, ``policy_kwargs={"critic_input": "state"}``.
 
     :param env: a HECOGrid task ("TeamTogether", or its id "hecogrid/TeamTogether-v0"), a PettingZoo ParallelEnv whose
         agents have equal spaces, or a factory that returns one (``simple_spread_v3.parallel_env``). Of a ParallelEnv,
@@ -50,6 +64,11 @@ def make_team_env(
     :param time_limit: ``"terminal"`` treats a time limit as a true end, ``"bootstrap"`` adds the value of what follows
     :param monitor_dir: folder for a ``monitor.csv`` with one line per team episode; None for none
     :param n_cpus: processes among which ``"supersuit"`` divides the games
+    :param active: whether observations tell which agents take part; None for "yes" but for HECOGrid, whose agents
+        always do
+    :param action_masks: ``"auto"`` for masks where the environment gives any (for infos, those of its first reset
+        decide), True to insist on them, False for none
+    :param state: whether observations have the environment's ``state()``
     :param params: of the task or the factory, for instance ``n_agents=5``
     :raises ValueError: if the arguments do not fit together, with what to do
     """
@@ -57,9 +76,11 @@ def make_team_env(
     check_count("n_cpus", n_cpus)
     _check_backend(backend)
     if isinstance(env, str):
+        _refuse_signals(active, action_masks, state)
         venv = _hecogrid(env, n_envs, seed, backend or "native", n_cpus, params)
     else:
-        venv = _foreign(env, n_envs, seed, backend or "supersuit", n_cpus, params)
+        signals = {"active": active is not False, "action_masks": action_masks, "state": state}
+        venv = _foreign(env, n_envs, seed, backend or "supersuit", n_cpus, params, signals)
     if monitor_dir is not None:
         os.makedirs(monitor_dir, exist_ok=True)
     return CentralizedValueWrapper(TeamMonitor(venv, filename=monitor_dir), time_limit=time_limit)
@@ -68,6 +89,17 @@ def make_team_env(
 def _check_backend(backend: Backend | None) -> None:
     if backend is not None and backend not in BACKENDS:
         raise ValueError(f"backend must be {', '.join(map(repr, BACKENDS))} or None, got {backend!r}")
+
+
+def _refuse_signals(active: bool | None, action_masks: AskMasks, state: bool) -> None:
+    asked = {"active=True": active, "action_masks=True": action_masks is True, "state=True": state}
+    for argument, is_asked in asked.items():
+        if is_asked:
+            raise ValueError(
+                f"{argument} goes through SuperSuit, and a HECOGrid task named by a string does not ask for it: its "
+                "agents always take part and may do anything. Leave it out, or pass a factory for env, for instance "
+                "hecogrid_envs.tasks.team_support.parallel_env"
+            )
 
 
 def _hecogrid(
@@ -101,6 +133,7 @@ def _foreign(
     backend: Backend,
     n_cpus: int,
     params: dict[str, Any],
+    signals: dict[str, Any],
 ) -> VecEnv:
     """Any ParallelEnv, through SuperSuit."""
     from hecogrid_envs.supersuit_bridge import supersuit_vec_env
@@ -110,7 +143,7 @@ def _foreign(
             f"backend='native' is the compiled core of HECOGrid, got it with {_name(env)}; leave backend out or use "
             "backend='supersuit'"
         )
-    return supersuit_vec_env(_bound(env, params), n_envs, seed, n_cpus)
+    return supersuit_vec_env(_bound(env, params), n_envs, seed, n_cpus, **signals)
 
 
 def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:

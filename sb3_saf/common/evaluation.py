@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wr
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.common.monitor import TeamMonitor
-from sb3_saf.common.teams import AGENT_KEY, Array, check_count, find_n_agents, team_dones
+from sb3_saf.common.teams import ACTION_MASK_KEY, AGENT_KEY, Array, check_count, find_n_agents, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -126,7 +126,8 @@ def _probability_within(theta: float, degrees: int) -> float:
 
 class RandomPolicy:
     """
-    The baseline that every learner has to beat: actions uniform over the action space.
+    The baseline that every learner has to beat: actions uniform over the action space, or over the legal ones where
+    observations have an ``action_mask``.
 
     :param action_space: one agent's action space; a Box must be bounded
     :param seed: of its own generator; None for a fresh one
@@ -153,14 +154,22 @@ class RandomPolicy:
         """
         Draw an action for each row; see SB3's ``predict``.
 
-        :param observation: observations of B rows, read for their number alone
+        :param observation: observations of B rows, read for their number and masks alone
         :param state: returned as it is
         :param episode_start: unused
         :param deterministic: unused, a random policy has no most likely action
         :return: (B, ...) actions, and ``state``
         """
+        if isinstance(observation, dict) and ACTION_MASK_KEY in observation:
+            return self._draw_legal(observation[ACTION_MASK_KEY]), state
         rows = observation[AGENT_KEY] if isinstance(observation, dict) else observation
         return self._draw(len(rows)), state
+
+    def _draw_legal(self, masks: Array) -> Array:
+        """(B,) actions of Discrete(A) spaces, each uniform over the ones in its row: (B, A)."""
+        assert isinstance(self.action_space, spaces.Discrete)
+        keys = np.where(masks, self._rng.random(masks.shape), -1.0)
+        return keys.argmax(axis=1) + self.action_space.start
 
     def _draw(self, n_rows: int) -> Array:
         space, rng = self.action_space, self._rng

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from gymnasium import spaces
 from torch import nn
 
 from sb3_saf.common.actor import Actor, SinglePolicy
-from sb3_saf.common.critic import Heads, OwnValueHead, TeamCritic, TeamStates
+from sb3_saf.common.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
+
+#: What a critic may read: the agent's own part, the whole team's, or the state of the game.
+CriticInput = Literal["own", "team", "state"]
 
 
 class NetworkSpec(NamedTuple):
@@ -29,6 +32,7 @@ class NetworkSpec(NamedTuple):
     :param value_hidden: sizes of the hidden layers of each value head
     :param activation_fn: activation of hidden layers
     :param log_std_init: first log standard deviation, Box actions only
+    :param state_space: space of the game's state where rows have it
     """
 
     features_dim: int
@@ -38,6 +42,7 @@ class NetworkSpec(NamedTuple):
     value_hidden: list[int]
     activation_fn: type[nn.Module]
     log_std_init: float
+    state_space: spaces.Space[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ class TeamParts(ABC):
         )
 
     @abstractmethod
-    def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic:
+    def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """Make the critic."""
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:

@@ -8,8 +8,9 @@ agents.
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from functools import partial
 from typing import Any, ClassVar, Final
@@ -25,11 +26,19 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.common.actor import ActionHead, Actor
-from sb3_saf.common.critic import OwnValueHead, TeamCritic
+from sb3_saf.common.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.common.encoders import ObservationEncoder
 from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one
-from sb3_saf.common.teams import AGENT_KEY, OBS_KEY, TEAM_KEY, TEAM_KEYS, TeamSpaces
+from sb3_saf.common.teams import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    TEAM_KEY,
+    TeamSpaces,
+)
 from sb3_saf.common.value_normalizer import ValueNormalizer
 from sb3_saf.common.views import OwnViews, ViewEncoder
 
@@ -49,9 +58,13 @@ class TeamPolicy(BasePolicy):
     ``obs`` alone: what other agents see cannot change an action's probability by a bit. Each distinct observation of
     a batch is encoded once, so extractors must treat views one by one (no batch normalisation).
 
+    Where observations have ``action_mask``, illegal actions have probability zero: in every policy of a pool, so also
+    in their mixture; entropies are over legal actions. ``predict`` then needs the mask beside ``obs``. Where they have
+    ``active``, critics leave out agents that take no part, and the value of such an agent is exactly zero.
+
     Beside these arguments, a policy takes the fields of its ``parts_class`` by keyword.
 
-    :param observation_space: Dict of ``obs``, ``team`` and ``agent``
+    :param observation_space: Dict of ``obs``, ``team``, ``agent``, and perhaps ``active``, ``action_mask``, ``state``
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
@@ -72,7 +85,7 @@ class TeamPolicy(BasePolicy):
     parts_class: ClassVar[type[TeamParts]]
 
     actor: Actor
-    value_net: OwnValueHead | TeamCritic
+    value_net: OwnValueHead | TeamCritic | StateCritic
     value_normalizer: ValueNormalizer | None
     features_dim: int
     net_arch: NetArch
@@ -102,6 +115,8 @@ class TeamPolicy(BasePolicy):
         if chunk_size is not None:
             check_at_least_one("chunk_size", chunk_size)
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
+        _check_masks(self.team_spaces, action_space)
+        self._warned_of_idle_rows = False
         self.parts = self.parts_class(**_taken(kwargs, {field.name for field in fields(self.parts_class)}))
         self.chunk_size = chunk_size
         self.distinct = distinct
@@ -153,7 +168,7 @@ class TeamPolicy(BasePolicy):
     def _make_actor(self) -> Actor:
         return self.parts.actor(self._network_spec())
 
-    def _make_critic(self) -> OwnValueHead | TeamCritic:
+    def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic:
         return self.parts.critic(self._network_spec())
 
     def _network_spec(self) -> NetworkSpec:
@@ -166,6 +181,7 @@ class TeamPolicy(BasePolicy):
             value_hidden,
             self.activation_fn,
             self.log_std_init,
+            self.team_spaces.state,
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -216,11 +232,10 @@ class TeamPolicy(BasePolicy):
         :return: dict of tensors with a batch axis, and whether the observation was a batch
         """
         entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
-        unknown = [key for key in entries if key not in TEAM_KEYS]
+        keys = self.team_spaces.keys
+        unknown = [key for key in entries if key not in keys]
         if unknown:
-            raise ValueError(
-                f"expected observations with the keys {', '.join(map(repr, TEAM_KEYS))}, got {unknown[0]!r}"
-            )
+            raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
         arrays = {key: np.asarray(value) for key, value in entries.items()}
         if AGENT_KEY in arrays:
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
@@ -246,6 +261,53 @@ class TeamPolicy(BasePolicy):
         """(B,) agents' indices; buffers give them as (B, 1), some as floats."""
         return _entry(obs, AGENT_KEY, "a critic or head that depends on the agent").reshape(-1).long()
 
+    def _active(self, obs: PyTorchObs) -> th.Tensor | None:
+        """(B, N) bool, agents of the rows' teams that take part; None if all always do."""
+        if self.team_spaces.active is None:
+            return None
+        return _entry(obs, ACTIVE_KEY, "the critic").reshape(-1, self.team_spaces.n_agents) != 0
+
+    def _action_mask(self, obs: PyTorchObs, padded: bool = False) -> th.Tensor | None:
+        """(B, A) bool, the rows' legal actions; None if all always are. Only rows of a padding may have none."""
+        if self.team_spaces.action_mask is None:
+            return None
+        if isinstance(obs, th.Tensor) or ACTION_MASK_KEY not in obs:
+            raise ValueError(
+                f"expected {ACTION_MASK_KEY!r} beside {OBS_KEY!r}, because this policy was made for an environment "
+                f"with action masks; pass {{{OBS_KEY!r}: ..., {ACTION_MASK_KEY!r}: ...}}, one mask of "
+                f"{self.team_spaces.action_mask.n} zeros and ones per row"
+            )
+        mask = obs[ACTION_MASK_KEY].reshape(-1, *self.team_spaces.action_mask.shape) != 0
+        stuck = ~mask.any(dim=1)
+        if not padded and stuck.any():
+            raise ValueError(
+                f"expected at least one legal action in each {ACTION_MASK_KEY!r}, got none in row "
+                f"{int(stuck.nonzero()[0])} of {len(mask)}"
+            )
+        return mask
+
+    def _warn_of_idle_rows(self, obs: PyTorchObs) -> None:
+        """Rows of agents that take no part come from buffers that do not leave them out."""
+        if self.team_spaces.active is None or self._warned_of_idle_rows:
+            return
+        active = self._active(obs)
+        assert active is not None
+        takes_part = active.gather(1, self._agent(obs).unsqueeze(1)).squeeze(1)
+        if (active.any(dim=1) & ~takes_part).any():  # rows of a padding have no team
+            self._warned_of_idle_rows = True
+            advice = (
+                "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which leaves them out."
+                if self.normalizes_values
+                else f"The buffers of {type(self).__name__}'s algorithms cannot leave them out; PPO with "
+                "sb3_saf.TeamRolloutBuffer can."
+            )
+            warnings.warn(
+                "The minibatch has rows of agents that take no part (dead, or not joined yet); they enter the loss, "
+                f"the entropy and the normalisation of advantages. {advice}",
+                UserWarning,
+                stacklevel=3,
+            )
+
     def _checked_agent(self, agent: np.ndarray) -> np.ndarray:
         n_agents = self.team_spaces.n_agents
         agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
@@ -255,31 +317,60 @@ class TeamPolicy(BasePolicy):
 
     def _encode(self, observations: th.Tensor) -> th.Tensor:
         """(K, d) features of own observations (K, *shape)."""
+        return self._in_chunks(self.features_extractor, observations, self.team_spaces.own)
+
+    def _in_chunks(
+        self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
+    ) -> th.Tensor:
+        """(K, ...) what a module makes of preprocessed observations (K, *shape)."""
         on_cpu = observations.device.type == "cpu"
         parts = th.split(observations, self.chunk_size if self.chunk_size and on_cpu else max(1, len(observations)))
-        own_space, extractor = self.team_spaces.own, self.features_extractor
-        features = [extractor(preprocess_obs(part, own_space, self.normalize_images)) for part in parts]
-        return features[0] if len(features) == 1 else th.cat(features)
+        results = [module(preprocess_obs(part, space, self.normalize_images)) for part in parts]
+        return results[0] if len(results) == 1 else th.cat(results)
 
     def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
         """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
         return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
 
-    def _distribution(self, obs: PyTorchObs, own: OwnViews) -> Distribution:
+    def _distribution(self, obs: PyTorchObs, own: OwnViews, action_masks: th.Tensor | None = None) -> Distribution:
+        """Over actions that both the rows' own masks and ``action_masks``, (B, M) bool, allow."""
         agent = self._agent(obs) if self.actor.reads_agent else None
-        return self.actor.distribution(self.views.per_agent(self.actor, own, agent))
+        masks = self._action_mask(obs)
+        if action_masks is not None:
+            masks = action_masks if masks is None else masks & action_masks
+        if masks is None:
+            return self.actor.distribution(self.views.per_agent(self.actor, own, agent))
+        return self.actor.masked_distribution(self.views.per_agent(self.actor.unmixed, own, agent), masks)
 
     def _values(self, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
         """(B, 1) values; ``own`` are the rows' own views if they were encoded before."""
-        critic = self.value_net
+        critic, active = self.value_net, self._active(obs)
         if isinstance(critic, TeamCritic):
-            views = self.views.teams(self._team(obs), own)
-            values: th.Tensor = critic(views.features, views.teams)[views.rows, self._agent(obs)]
+            views = self.views.teams(self._team(obs), own, active)
+            values: th.Tensor = critic(views.features, views.teams, views.active)[views.rows, self._agent(obs)]
+        elif isinstance(critic, StateCritic):
+            values = self._values_of_states(obs, critic)
         else:
             own = self.views.own(self._own(obs)) if own is None else own
             values = self.views.per_agent(critic, own, self._agent(obs) if critic.reads_agent else None)
-        values = values.unsqueeze(1)
-        return values if self.value_normalizer is None else self.value_normalizer(values)
+        return self._raw_values(obs, values)
+
+    def _raw_values(self, obs: PyTorchObs, outputs: th.Tensor) -> th.Tensor:
+        """(B, 1) values on the raw scale, of the critic's outputs (B,)."""
+        values, active = outputs.unsqueeze(1), self._active(obs)
+        # Whoever takes no part expects nothing: an agent's own end is the end of its return.
+        takes_part = None if active is None else active.gather(1, self._agent(obs).unsqueeze(1))
+        if self.value_normalizer is not None:
+            return self.value_normalizer(values, takes_part)
+        return values if takes_part is None else values * takes_part
+
+    def _values_of_states(self, obs: PyTorchObs, critic: StateCritic) -> th.Tensor:
+        """(B,) values, each distinct state encoded once."""
+        space = self.team_spaces.state
+        assert space is not None
+        states = _entry(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
+        found = self.views.find(states)
+        return self._in_chunks(critic, states[found.index], space)[found.inverse, self._agent(obs)]
 
 
 class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc]  # value_net, log_std: ours
@@ -314,6 +405,7 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
         :param actions: (B, ...) actions
         :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
         """
+        self._warn_of_idle_rows(obs)
         own = self.views.own(self._own(obs))
         distribution = self._distribution(obs, own)
         return self._values(obs, own), distribution.log_prob(actions), distribution.entropy()
@@ -325,6 +417,15 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
         :param obs: rows, or own observations alone (B, ...)
         """
         return self._distribution(obs, self.views.own(self._own(obs)))
+
+
+def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:
+    mask = team.action_mask
+    if mask is not None and not (isinstance(action_space, spaces.Discrete) and mask.n == action_space.n):
+        raise ValueError(
+            f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A) where actions are Discrete(A), got {mask} for "
+            f"{action_space}"
+        )
 
 
 def _entry(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:

@@ -26,6 +26,18 @@ TEAM_KEY: Final = "team"
 AGENT_KEY: Final = "agent"
 TEAM_KEYS: Final[tuple[TeamKey, ...]] = get_args(TeamKey)
 
+OptionalKey = Literal["active", "action_mask", "state"]
+
+#: Which agents of the row's team take part, in index order.
+ACTIVE_KEY: Final = "active"
+#: The row's own legal actions.
+ACTION_MASK_KEY: Final = "action_mask"
+#: The state of the row's game, for critics.
+STATE_KEY: Final = "state"
+#: Only observations of environments that give them have these.
+OPTIONAL_KEYS: Final[tuple[OptionalKey, ...]] = get_args(OptionalKey)
+ALL_KEYS: Final[frozenset[str]] = frozenset(TEAM_KEYS + OPTIONAL_KEYS)
+
 Array = npt.NDArray[Any]
 
 #: Attributes by which a vector environment of flattened teams tells its shape.
@@ -40,20 +52,36 @@ class TeamSpaces(NamedTuple):
     :param team: Box of all own observations of a team (key ``"team"``), shape ``(N, *shape)``, dtype as in ``own``
     :param agent: Discrete(N), the agent's index (key ``"agent"``)
     :param n_agents: N
+    :param active: MultiBinary(N), which agents of the team take part (key ``"active"``); None if all always do
+    :param action_mask: MultiBinary(A), the row's legal actions (key ``"action_mask"``); None if all always are
+    :param state: space of the game's state (key ``"state"``), or None
     """
 
     own: spaces.Space[Any]
     team: spaces.Box
     agent: spaces.Discrete
     n_agents: int
+    active: spaces.MultiBinary | None = None
+    action_mask: spaces.MultiBinary | None = None
+    state: spaces.Space[Any] | None = None
 
     @classmethod
-    def of(cls, own: spaces.Space[Any], n_agents: int) -> TeamSpaces:
+    def of(
+        cls,
+        own: spaces.Space[Any],
+        n_agents: int,
+        active: bool = False,
+        n_masked_actions: int | None = None,
+        state: spaces.Space[Any] | None = None,
+    ) -> TeamSpaces:
         """
         Spaces of a team whose agents all have one observation space.
 
         :param own: Box, Discrete, MultiDiscrete or MultiBinary
         :param n_agents: N
+        :param active: whether rows tell which agents take part
+        :param n_masked_actions: A if rows have action masks
+        :param state: space of the game's state if rows have it
         :raises ValueError: if ``own`` is of another kind
         """
         low, high = _bounds(own)
@@ -62,7 +90,15 @@ class TeamSpaces(NamedTuple):
             np.repeat(high[np.newaxis], n_agents, axis=0),
             dtype=low.dtype.type,
         )
-        return cls(own, team, spaces.Discrete(n_agents), n_agents)
+        return cls(
+            own,
+            team,
+            spaces.Discrete(n_agents),
+            n_agents,
+            spaces.MultiBinary(n_agents) if active else None,
+            None if n_masked_actions is None else spaces.MultiBinary(n_masked_actions),
+            None if state is None else _checked_state(state),
+        )
 
     @classmethod
     def from_observation_space(cls, space: spaces.Space[Any]) -> TeamSpaces:
@@ -72,7 +108,7 @@ class TeamSpaces(NamedTuple):
         :param space: the observation space that an algorithm, a policy or a buffer was given
         :raises ValueError: if the space is not that of a team, with what to do
         """
-        if not isinstance(space, spaces.Dict) or set(space.spaces) != set(TEAM_KEYS):
+        if not isinstance(space, spaces.Dict) or not set(TEAM_KEYS) <= set(space.spaces) <= ALL_KEYS:
             raise ValueError(_not_a_team_space(f"got {space}"))
         own, team, agent = (space.spaces[key] for key in TEAM_KEYS)
         if not isinstance(agent, spaces.Discrete) or agent.start != 0:
@@ -85,7 +121,22 @@ class TeamSpaces(NamedTuple):
                     f"its {TEAM_KEY!r} must be a Box of shape {expected} and dtype {own.dtype}, got {team}"
                 )
             )
-        return cls(own, team, agent, n_agents)
+        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
+        if active is not None and active != spaces.MultiBinary(n_agents):
+            raise ValueError(_not_a_team_space(f"its {ACTIVE_KEY!r} must be MultiBinary({n_agents}), got {active}"))
+        if action_mask is not None and not (
+            isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
+        ):
+            raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
+        if state is not None:
+            _checked_state(state)
+        return cls(own, team, agent, n_agents, active, action_mask, state)  # type: ignore[arg-type]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of a row's observation."""
+        optional = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
+        return (*TEAM_KEYS, *(key for key, space in optional.items() if space is not None))
 
     @property
     def own_shape(self) -> tuple[int, ...]:
@@ -94,7 +145,23 @@ class TeamSpaces(NamedTuple):
 
     def to_dict_space(self) -> spaces.Dict:
         """Observation space of one row; ``own`` stays the same object."""
-        return spaces.Dict({OBS_KEY: self.own, TEAM_KEY: self.team, AGENT_KEY: self.agent})
+        parts: dict[str, spaces.Space[Any] | None] = {
+            OBS_KEY: self.own,
+            TEAM_KEY: self.team,
+            AGENT_KEY: self.agent,
+            ACTIVE_KEY: self.active,
+            ACTION_MASK_KEY: self.action_mask,
+            STATE_KEY: self.state,
+        }
+        return spaces.Dict({key: part for key, part in parts.items() if part is not None})
+
+
+def _checked_state(state: spaces.Space[Any]) -> spaces.Space[Any]:
+    if isinstance(state, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+        return state
+    raise ValueError(
+        f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {state}; flatten it first"
+    )
 
 
 def _bounds(own: spaces.Space[Any]) -> tuple[Array, Array]:

@@ -68,7 +68,7 @@ class ValueNormalizer(nn.Module):
         """() standard deviation that values are scaled by."""
         return self.var.sqrt().clamp_min(MIN_STD)
 
-    def forward(self, outputs: th.Tensor) -> th.Tensor:
+    def forward(self, outputs: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """
         De-normalise: ``v = mean + std * n`` for the critic's outputs n.
 
@@ -79,6 +79,7 @@ class ValueNormalizer(nn.Module):
         the normalised loss, while the ``train/value_loss`` that it logs and ``clip_range_vf`` stay on the raw scale.
 
         :param outputs: (B, ...) of the critic
+        :param active: (B, ...) bool, rows that take part; the values of others are exactly zero. All do if None
         :return: (B, ...) values on the scale of returns, which carry a reference to this normaliser
         :raises ValueError: in backward, if the module is in training mode and the statistics were never updated
         """
@@ -86,6 +87,8 @@ class ValueNormalizer(nn.Module):
         values = self.mean + std * outputs
         if values.requires_grad:
             values.register_hook(self._rescaled_by(std**-2))
+        if active is not None:
+            values = values * active
         setattr(values, _CARRIED, self)
         return values
 

@@ -38,11 +38,13 @@ class TeamViews(NamedTuple):
     :param features: (K, d) features of distinct views
     :param teams: (G, N) which view each agent of each distinct team has
     :param rows: (B,) which team each row belongs to
+    :param active: (G, N) bool, agents of each distinct team that take part; None if all do
     """
 
     features: th.Tensor
     teams: th.Tensor
     rows: th.Tensor
+    active: th.Tensor | None = None
 
 
 class ViewEncoder:
@@ -67,14 +69,19 @@ class ViewEncoder:
         views = observations[found.index]
         return OwnViews(views, self.encode(views), found.inverse)
 
-    def teams(self, observations: th.Tensor, known: OwnViews | None = None) -> TeamViews:
+    def teams(
+        self, observations: th.Tensor, known: OwnViews | None = None, active: th.Tensor | None = None
+    ) -> TeamViews:
         """
         Encode teams, taking over the features of views that are already known.
 
         :param observations: (B, N, *shape) joint observations
         :param known: own views of the same forward pass, if they were encoded before
+        :param active: (B, N) bool, agents that take part; teams that differ in it are distinct
         """
         found = self.find(observations)
+        if active is not None:
+            found = self.find(th.cat([found.inverse.unsqueeze(1), active.long()], dim=1))
         joint = observations[found.index]
         members, features, n_known = joint.flatten(0, 1), None, 0
         if known is not None:
@@ -87,7 +94,8 @@ class ViewEncoder:
             features = self.encode(missing)
         elif len(missing):
             features = th.cat([features, self.encode(missing)])
-        return TeamViews(features, views.inverse[n_known:].view(joint.shape[:2]), found.inverse)
+        teams = views.inverse[n_known:].view(joint.shape[:2])
+        return TeamViews(features, teams, found.inverse, None if active is None else active[found.index])
 
     def per_agent(
         self, module: Callable[[th.Tensor, th.Tensor | None], th.Tensor], views: OwnViews, agent: th.Tensor | None

@@ -32,6 +32,7 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
     Masks are (B, M): one flag per choice of an action, those of each dimension in turn (of a MultiBinary: off, on).
     The actions of each policy of a pool are masked before they are mixed: likelihood and entropy are exactly those of
     drawing a policy and then one of its allowed actions. A mask that allows nothing leaves the actions equally likely.
+    Where observations have masks, too, an action must be allowed by both.
     """
 
     #: There are no masks for Box actions, so nothing reads it.
@@ -65,6 +66,7 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
         :param action_masks: (B, M); None allows everything
         :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
         """
+        self._warn_of_idle_rows(obs)
         own = self.views.own(self._own(obs))
         distribution = self._masked_distribution(obs, own, action_masks)
         return self._values(obs, own), self._likelihood(distribution, actions), distribution.entropy()
@@ -83,10 +85,8 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
     def _masked_distribution(self, obs: PyTorchObs, own: OwnViews, action_masks: Masks | None) -> Distribution:
         if action_masks is None:
             return self._distribution(obs, own)
-        agent = self._agent(obs) if self.actor.reads_agent else None
-        parameters = self.views.per_agent(self.actor.unmixed, own, agent)
-        masks = th.as_tensor(action_masks, dtype=th.bool, device=parameters.device)
-        return self.actor.masked_distribution(parameters, masks.reshape(len(parameters), -1))
+        masks = th.as_tensor(action_masks, dtype=th.bool, device=own.rows.device)
+        return self._distribution(obs, own, masks.reshape(len(own.rows), -1))
 
 
 class IPPOMaskablePolicy(TeamMaskablePolicy):

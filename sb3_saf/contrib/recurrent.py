@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.common.actor import Actor
-from sb3_saf.common.critic import OwnValueHead, TeamCritic, TeamStates
+from sb3_saf.common.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.common.parts import TeamParts, check_at_least_one
 from sb3_saf.common.policies import NetArch, TeamPolicy
 from sb3_saf.common.views import OwnViews
@@ -74,7 +74,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     :param kwargs: those of :class:`TeamPolicy`
     """
 
-    value_net: OwnValueHead | TeamCritic | RecurrentCritic  # type: ignore[assignment]
+    value_net: OwnValueHead | TeamCritic | StateCritic | RecurrentCritic  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     def _make_actor(self) -> Actor:
         return self.parts.actor(self._network_spec()._replace(features_dim=self.lstm_output_dim))
 
-    def _make_critic(self) -> OwnValueHead | TeamCritic | RecurrentCritic:  # type: ignore[override]
+    def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic | RecurrentCritic:  # type: ignore[override]
         if not self.enable_critic_lstm:
             return super()._make_critic()
         spec = self._network_spec()
@@ -179,6 +179,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         :param episode_starts: (B,)
         :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
         """
+        self._warn_of_idle_rows(obs)
         own = self.views.own(self._own(obs))
         distribution, _ = self._recall_distribution(obs, own, lstm_states.pi, episode_starts)
         values, _ = self._recall_values(obs, own, lstm_states.vf, episode_starts)
@@ -217,7 +218,10 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     ) -> tuple[Distribution, LstmStates]:
         latent, states = self._process(own.features[own.rows], lstm_states, episode_starts, self.lstm_actor)
         agent = self._agent(obs) if self.actor.reads_agent else None
-        return self.actor.distribution(self.actor(latent, agent)), states
+        masks = self._action_mask(obs, padded=True)
+        if masks is None:
+            return self.actor.distribution(self.actor(latent, agent)), states
+        return self.actor.masked_distribution(self.actor.unmixed(latent, agent), masks), states
 
     def _recall_values(
         self, obs: PyTorchObs, own: OwnViews | None, lstm_states: LstmStates, episode_starts: th.Tensor
@@ -227,16 +231,15 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
             return self._values(obs, own), lstm_states
         latent, states = self._process(self._critic_inputs(critic, obs, own), lstm_states, episode_starts, critic.lstm)
         agent = self._agent(obs) if critic.head.reads_agent else None
-        values: th.Tensor = critic.head(latent, agent)
-        return values.unsqueeze(1), states
+        return self._raw_values(obs, critic.head(latent, agent)), states
 
     def _critic_inputs(self, critic: RecurrentCritic, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
         """(B, S)"""
         if critic.team_states is None:
             own = self.views.own(self._own(obs)) if own is None else own
             return own.features[own.rows]
-        views = self.views.teams(self._team(obs), own)
-        return critic.team_states.states(views.features, views.teams)[views.rows, self._agent(obs)]
+        views = self.views.teams(self._team(obs), own, self._active(obs))
+        return critic.team_states.states(views.features, views.teams, views.active)[views.rows, self._agent(obs)]
 
     def _process(
         self, inputs: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor, lstm: nn.LSTM

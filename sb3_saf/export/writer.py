@@ -107,6 +107,12 @@ def _checked_policy(model: object) -> TeamActorCriticPolicy:
             f"expected a model with SAFPolicy, MAPPOPolicy or IPPOPolicy, got {type(policy).__name__}; policies of "
             "Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
+    if policy.team_spaces.action_mask is not None:
+        raise ExportError(
+            "an exported actor reads its own observation and nothing else, so it would not keep to the action masks of "
+            "this model's environment; act with model.predict, or train without masks: "
+            "make_team_env(..., action_masks=False)"
+        )
     if hasattr(policy, "lstm_actor"):
         raise ExportError("recurrent policies cannot be exported yet: their actors carry a hidden state")
     if type(policy.actor) not in (SinglePolicy, PolicyPool):

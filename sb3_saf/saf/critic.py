@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch as th
 from torch import nn
 
 from sb3_saf.common.critic import Heads, JointValueHead, OwnValueHead, TeamCritic, TeamStates
 from sb3_saf.common.networks import mlp
+from sb3_saf.common.parts import CriticInput
 from sb3_saf.saf.knowledge_source import KnowledgeSource
-
-#: What the value head reads: the agent's own s^SAF, or those of the whole team.
-CriticInput = Literal["own", "team"]
 
 
 class SAFStates(TeamStates):
@@ -63,7 +60,7 @@ class SAFCritic(SAFStates, TeamCritic):
     :param hidden: sizes of the hidden layers of the value head
     :param activation_fn: activation of all MLPs
     :param heads: one value head for all agents, or one for each
-    :param critic_input: what the value head reads
+    :param critic_input: whether the value head reads the agent's ``"own"`` s^SAF or those of the whole ``"team"``
     :param agent_identity: whether a shared head on the whole team reads whose value is asked
     :param n_slots: L
     :param latent_dim: d, size of messages, states and slots

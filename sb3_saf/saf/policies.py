@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, get_args
 
 from sb3_saf.common.actor import Actor
-from sb3_saf.common.critic import OwnValueHead, TeamCritic, TeamStates
-from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one, check_choice
+from sb3_saf.common.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
+from sb3_saf.common.parts import CriticInput, NetworkSpec, TeamParts, check_at_least_one, check_choice
 from sb3_saf.common.policies import TeamActorCriticPolicy
 from sb3_saf.mappo.policies import MAPPOParts
-from sb3_saf.saf.critic import CriticInput, SAFCritic, SAFStates
+from sb3_saf.saf.critic import SAFCritic, SAFStates
 from sb3_saf.saf.policy_pool import PolicyPool, Selection
 
 
@@ -25,7 +25,9 @@ class SAFParts(MAPPOParts):
     :param n_policies: U, size of the pool; 1 is the ablation without pool
     :param selection: ``"mixture"`` (exact likelihood) or ``"gumbel"`` (one policy, drawn at every evaluation)
     :param knowledge_source: False is the ablation without knowledge source: MAPPO's critic
-    :param critic_input: whether the critic reads the agent's ``"own"`` s^SAF or those of the whole ``"team"``
+    :param critic_input: whether the critic reads the agent's ``"own"`` s^SAF or those of the whole ``"team"``; without
+        knowledge source it is MAPPO's, on the team. SAF's critic does not read the ``"state"`` of the game: what it
+        knows of the game comes through the knowledge source
     :param n_slots: L, slots of the knowledge source
     :param latent_dim: d, size of messages, states, slots, queries and signature keys
     :param projection_arch: hidden sizes of g_theta, g_omega, g_phi and g_psel
@@ -39,10 +41,11 @@ class SAFParts(MAPPOParts):
     latent_dim: int = 64
     projection_arch: tuple[int, ...] = (128, 128)
 
+    critic_inputs: ClassVar[tuple[CriticInput, ...]] = ("own", "team")
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("selection", self.selection, get_args(Selection))
-        check_choice("critic_input", self.critic_input, get_args(CriticInput))
         for name in ("n_policies", "n_slots", "latent_dim"):
             check_at_least_one(name, getattr(self, name))
         # Saved models may bring a list.
@@ -64,7 +67,7 @@ class SAFParts(MAPPOParts):
             log_std_init=spec.log_std_init,
         )
 
-    def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic:
+    def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """V_i from s_i^SAF."""
         if not self.knowledge_source:
             return super().critic(spec)

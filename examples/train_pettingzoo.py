@@ -1,0 +1,199 @@
+"""
+Train a team on a PettingZoo environment and compare it with a random one.
+
+    python examples/train_pettingzoo.py --env simple_spread --algo SAF --game-steps 300000
+
+The environments and what is asked of each are in ``ENVIRONMENTS`` below; the results are in README.md beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_saf import RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.evaluation import EvaluationResult
+
+#: Evaluation games are seeded apart from training's.
+EVALUATION_SEED = 10_000
+
+
+class Turns(BaseParallelWrapper[Any, Any, Any]):
+    """
+    A turn-based game in parallel form: whoever has to wait may do action 0 only, which does nothing.
+
+    :param env: from ``turn_based_aec_to_parallel``, with observations of the form {"observation", "action_mask"}
+    """
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin a game."""
+        # The seeds of games have 63 bits, OpenSpiel's 31.
+        observations, infos = super().reset(None if seed is None else seed % 2**31, options)
+        return self._with_waiting(observations), infos
+
+    def step(self, actions: dict[Any, Any]) -> Any:
+        """Let the agent move whose turn it is."""
+        observations, *rest = super().step(actions)
+        return (self._with_waiting(observations), *rest)
+
+    def _with_waiting(self, observations: dict[Any, Any]) -> dict[Any, Any]:
+        for agent, observation in observations.items():
+            mask = np.asarray(observation["action_mask"])
+            if not mask.any():
+                wait = (np.arange(len(mask)) == 0).astype(mask.dtype)
+                observations[agent] = {**observation, "action_mask": wait}
+        return observations
+
+
+def hanabi(**params: Any) -> ParallelEnv[Any, Any, Any]:
+    """Hanabi, whose players take turns, in parallel form."""
+    from pettingzoo.classic import hanabi_v5
+    from pettingzoo.utils.conversions import turn_based_aec_to_parallel
+
+    return Turns(turn_based_aec_to_parallel(hanabi_v5.env(**params)))
+
+
+def padded(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
+    """An environment whose agents differ in their spaces, which SuperSuit makes equal."""
+    import supersuit
+
+    env = supersuit.pad_observations_v0(import_module(module).parallel_env(**params))
+    return supersuit.pad_action_space_v0(env)
+
+
+def module_env(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
+    """An environment that is a module with ``parallel_env``."""
+    return import_module(module).parallel_env(**params)
+
+
+class Example(NamedTuple):
+    """
+    An environment and what is asked of it.
+
+    :param make: its factory
+    :param params: the factory's arguments
+    :param n_games: games played at once
+    :param n_steps: game steps per rollout
+    :param ppo: what differs from :data:`PPO_SETTINGS`
+    """
+
+    make: Callable[..., ParallelEnv[Any, Any, Any]]
+    params: dict[str, Any] = {}
+    n_games: int = 16
+    n_steps: int = 100
+    ppo: dict[str, Any] = {}
+
+
+PPO_SETTINGS: dict[str, Any] = {
+    "n_epochs": 5,
+    "learning_rate": 5e-4,
+    "ent_coef": 0.01,
+    "gae_lambda": 0.95,
+    "rollout_buffer_class": TeamRolloutBuffer,
+}
+
+WALKERS = {"terminate_on_fall": False, "remove_on_fall": True, "shared_reward": False, "max_cycles": 200}
+ENVIRONMENTS: dict[str, Example] = {
+    "simple_spread": Example(partial(module_env, "mpe2.simple_spread_v3"), n_steps=50),
+    "simple_spread_continuous": Example(
+        partial(module_env, "mpe2.simple_spread_v3"), {"continuous_actions": True}, n_steps=50, ppo={"ent_coef": 0.0}
+    ),
+    # A speaker that cannot move and a listener that cannot speak: unequal spaces, padded.
+    "speaker_listener": Example(partial(padded, "mpe2.simple_speaker_listener_v4"), n_steps=50),
+    "pursuit": Example(partial(module_env, "pettingzoo.sisl.pursuit_v5"), {"max_cycles": 200}, n_games=8),
+    # Walkers that fall are out of the game, the others go on.
+    "multiwalker": Example(
+        partial(module_env, "pettingzoo.sisl.multiwalker_v9"), WALKERS, n_games=8, ppo={"ent_coef": 0.0}
+    ),
+    "hanabi": Example(
+        hanabi, {"colors": 2, "ranks": 5, "players": 2, "hand_size": 2, "max_information_tokens": 3}, n_games=16
+    ),
+}
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument("--env", choices=ENVIRONMENTS, default="simple_spread")
+    parser.add_argument("--algo", choices=("SAF", "MAPPO", "IPPO"), default="MAPPO")
+    parser.add_argument("--state", action="store_true", help="the environment's state() as the input of MAPPO's critic")
+    parser.add_argument("--game-steps", type=int, default=200_000, help="steps of the game, not of its agents")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=int, default=100, help="episodes of each evaluation")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--output", type=Path, help="file for the model")
+    options = parser.parse_args(arguments)
+    if options.state and options.algo != "MAPPO":
+        parser.error("--state is for --algo MAPPO")
+    return options
+
+
+def make_env(options: argparse.Namespace, n_games: int, seed: int) -> CentralizedValueWrapper:
+    """Make the games."""
+    example = ENVIRONMENTS[options.env]
+    return make_team_env(example.make, n_games, seed, state=options.state, **example.params)
+
+
+def train(options: argparse.Namespace) -> PPO:
+    """Train with normalised rewards; evaluations count the environment's own."""
+    example = ENVIRONMENTS[options.env]
+    env = make_env(options, example.n_games, options.seed)
+    settings = {"batch_size": example.n_games * example.n_steps * env.n_agents // 4, **PPO_SETTINGS, **example.ppo}
+    settings["batch_size"] -= settings["batch_size"] % env.n_agents
+    policy_kwargs = {"critic_input": "state"} if options.state else {}
+    model = PPO(
+        f"{options.algo}Policy",
+        VecNormalize(env, norm_obs=False, gamma=0.99),
+        n_steps=example.n_steps,
+        seed=options.seed,
+        device="cpu",
+        policy_kwargs=policy_kwargs,
+        **settings,
+    )
+    # SB3 counts every agent's step.
+    model.learn(options.game_steps * env.n_agents)
+    model.get_env().close()  # type: ignore[union-attr]
+    return model
+
+
+def evaluate(options: argparse.Namespace, model: Any) -> EvaluationResult:
+    """Team returns of games that were not trained on, the same for every model."""
+    env = make_env(options, min(options.episodes, 20), EVALUATION_SEED + options.seed)
+    result = evaluate_team(model, env, options.episodes, deterministic=False)
+    env.close()
+    return result
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Train, evaluate, compare."""
+    options = parse(arguments)
+    th.set_num_threads(options.threads)
+    start = time.perf_counter()
+    model = train(options)
+    seconds = time.perf_counter() - start
+    if options.output is not None:
+        model.save(options.output)
+    trained = evaluate(options, model)
+    random = evaluate(options, RandomPolicy(model.action_space, seed=options.seed))
+    print(f"{options.env}, {options.algo}{' on the state' if options.state else ''}, seed {options.seed}")
+    print(f"{options.game_steps:,} game steps in {seconds:.0f} s on {options.threads} thread(s)")
+    print("team return (sum over agents and steps), actions sampled")
+    print(f"  trained  {trained}")
+    print(f"  random   {random}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,555 @@
+"""Agents that die or join, action masks and states: from the environment to the loss."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import supersuit
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import DictRolloutBuffer
+
+from sb3_saf import IPPOPolicy, MAPPOPolicy, RandomPolicy, SAFPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.distributions import masked_parameters
+from sb3_saf.common.row_spaces import RowSpaces
+from sb3_saf.common.teams import TeamSpaces
+from tests.team_venv import Array
+from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv, UnequalEnv
+
+N_AGENTS, N_ACTIONS = 3, 4
+#: Agent 0 is there for steps 1 to 3, agent 1 from the observation after step 2, agent 2 until a time limit.
+LIVES: dict[str, Any] = {"n_agents": N_AGENTS, "max_cycles": 5, "deaths": {0: 3}, "joins": {1: 2}}
+#: Who is active in the observation after 0, 1, ... steps.
+ACTIVE = [[1, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [0, 1, 1]]
+POLICIES: list[type[Any]] = [SAFPolicy, MAPPOPolicy, IPPOPolicy]
+
+
+def legal(agent: int, step: int) -> list[int]:
+    return [int((action + agent + step) % 2 == 0) for action in range(N_ACTIONS)]
+
+
+def expected_masks(step: int) -> list[list[int]]:
+    """Agents that take no part have action 0."""
+    return [legal(i, step) if ACTIVE[step][i] else [1, 0, 0, 0] for i in range(N_AGENTS)]
+
+
+def first_legal(obs: dict[str, Array]) -> Array:
+    return np.argmax(obs["action_mask"], axis=1)
+
+
+def telling_env(n_envs: int = 2, **kwargs: Any) -> CentralizedValueWrapper:
+    return make_team_env(TellingEnv, n_envs, seed=0, state=True, **{**LIVES, **kwargs})
+
+
+# --- what rows tell ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_cpus", [1, 2])
+@pytest.mark.parametrize("masks", ["observation", "info"])
+def test_rows_tell_who_is_active_what_is_legal_and_the_state(masks: str, n_cpus: int) -> None:
+    env = telling_env(masks=masks, n_cpus=n_cpus, time_limit="bootstrap")
+    assert (
+        env.observation_space
+        == TeamSpaces.of(
+            spaces.Box(0, np.inf, (3,)), N_AGENTS, True, N_ACTIONS, spaces.Box(0, 100, (2,))
+        ).to_dict_space()
+    )
+    obs: Any = env.reset()
+    for step in range(5):
+        assert obs["active"].tolist() == [ACTIVE[step]] * 6
+        assert obs["action_mask"].tolist() == expected_masks(step) * 2
+        assert obs["state"].tolist() == [[step, sum(ACTIVE[step])]] * 6
+        # Who takes no part sees zeros, and so do the others in its place.
+        shown = [[step, i] if ACTIVE[step][i] else [0, 0] for i in range(N_AGENTS)]
+        assert obs["obs"][:, :2].tolist() == shown * 2
+        np.testing.assert_array_equal(obs["team"][0], obs["obs"][:3])
+        assert all(value[0] in env.observation_space[key] for key, value in obs.items())  # type: ignore[index]
+        obs, rewards, dones, infos = env.step(first_legal(obs))
+        acted = ACTIVE[step]
+        gained = [(10 * (step + 1) + i + (i + step) % 2) * acted[i] for i in range(N_AGENTS)]
+        assert rewards.tolist() == gained * 2
+    assert dones.all()
+    assert obs["active"].tolist() == [ACTIVE[0]] * 6, "a new episode begins"
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, True, True] * 2
+    last = infos[4]["terminal_observation"]
+    assert last["active"].tolist() == [0, 1, 1], "those whom the time limit stopped"
+    assert last["action_mask"].tolist() == legal(1, 5)
+    assert infos[0]["terminal_observation"]["action_mask"].tolist() == [1, 0, 0, 0]
+    assert last["state"].tolist() == [5, 0]
+    assert last["team"][:, :2].tolist() == [[0, 0], [5, 1], [5, 2]]
+    env.close()
+
+
+def test_whoever_ends_with_the_last_step_is_not_active_after_it() -> None:
+    env = telling_env(1, deaths={0: 5}, joins={}, time_limit="bootstrap")
+    obs: Any = env.reset()
+    for _ in range(5):
+        obs, _, _, infos = env.step(first_legal(obs))
+    assert [info["terminal_observation"]["active"].tolist() for info in infos] == [[0, 1, 1]] * 3
+
+
+def test_agents_that_join_in_an_environment_without_masks() -> None:
+    env = make_team_env(LateEnv, seed=0, n_agents=2)
+    obs: Any = env.reset()
+    assert set(obs) == {"obs", "team", "agent", "active"}
+    assert obs["active"].tolist() == [[1, 0]] * 2
+    obs, *_ = env.step(np.zeros(2, dtype=int))
+    assert obs["active"].tolist() == [[1, 1]] * 2
+
+
+def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
+    names = {"obs", "team", "agent"}
+    small: dict[str, Any] = {"n_agents": 2, "grid_size": 10, "n_treasures": 5, "view_size": 5}
+    assert set(make_team_env("TeamSupport", **small).observation_space.spaces) == names  # type: ignore[attr-defined]
+    plain = make_team_env(TellingEnv, active=False, action_masks=False, **LIVES)
+    assert set(plain.observation_space.spaces) == names  # type: ignore[attr-defined]
+    assert plain.team_spaces.own == spaces.Box(0, np.inf, (3,)), "the observation without the mask"
+    assert set(make_team_env(CounterEnv).reset()) == {*names, "active"}
+    assert set(make_team_env(TellingEnv, action_masks=True, masks="info").reset()) == {*names, "active", "action_mask"}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: make_team_env(CounterEnv, state=True),
+            r"state=True needs an environment with state\(\) and a state_space .* leave state out",
+        ),
+        (
+            lambda: make_team_env(CounterEnv, action_masks=True).reset(),
+            r"expected 'action_mask' in the info of agent_0, 4 zeros and ones .* got None",
+        ),
+        (
+            lambda: make_team_env(DictEnv, action_masks=True),
+            r"action masks are for Discrete actions, got the action space Box\(.*pass action_masks=False",
+        ),
+        (
+            lambda: telling_env(stuck=0).reset(),
+            "at least one legal action .* got none at step 0 for agent 0 of game 0; give agents that have to wait",
+        ),
+        (lambda: make_team_env("TeamTogether", state=True), "state=True goes through SuperSuit"),
+        (lambda: make_team_env("TeamTogether", active=True), "active=True goes through SuperSuit"),
+        (
+            lambda: make_team_env(UnequalEnv, kind="observation"),
+            "expected one observation space for all agents.*make them equal with supersuit.pad_observations_v0",
+        ),
+        (
+            lambda: make_team_env(UnequalEnv, kind="action"),
+            "expected one action space for all agents.*make them equal with supersuit.pad_action_space_v0",
+        ),
+        (
+            lambda: RowSpaces.of(spaces.Dict(obs=spaces.Discrete(3), active=spaces.Discrete(3)), spaces.Discrete(2)),
+            r"expected 'active' of a row to be Discrete\(2\), got Discrete\(3\)",
+        ),
+        (
+            lambda: RowSpaces.of(
+                spaces.Dict(obs=spaces.Discrete(3), action_mask=spaces.MultiBinary(3)), spaces.Discrete(2)
+            ),
+            r"expected 'action_mask' of a row to be MultiBinary\(A\) where actions are Discrete\(A\)",
+        ),
+        (
+            lambda: MAPPOPolicy(telling_spaces(state=None), spaces.Discrete(4), lambda _: 0.0, critic_input="state"),
+            r"critic_input='state' needs observations with 'state'.*make_team_env\(..., state=True\)",
+        ),
+        (
+            lambda: SAFPolicy(telling_spaces(), spaces.Discrete(4), lambda _: 0.0, critic_input="state"),
+            "critic_input must be one of 'own', 'team', got 'state'",
+        ),
+        (
+            lambda: IPPOPolicy(telling_spaces(), spaces.Discrete(5), lambda _: 0.0),
+            r"expected 'action_mask' to be MultiBinary\(A\) where actions are Discrete\(A\), got MultiBinary\(4\)",
+        ),
+    ],
+)
+def test_wrong_calls(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_random_teams_take_legal_actions_each_as_often() -> None:
+    env = telling_env(1)
+    obs: Any = env.reset()
+    policy = RandomPolicy(env.action_space, seed=0)
+    counts = np.sum([np.eye(N_ACTIONS)[policy.predict(obs)[0]] for _ in range(2000)], axis=0)
+    assert counts[1].tolist() == [2000, 0, 0, 0]  # takes no part
+    assert counts[0] == pytest.approx([1000, 0, 1000, 0], abs=100)
+    assert evaluate_team(policy, env, 3).lengths == [5, 5, 5]
+
+
+# --- the rollout buffer -----------------------------------------------------------------------------------------------
+
+
+def telling_spaces(n_agents: int = N_AGENTS, state: Any = spaces.Box(0, 100, (2,))) -> spaces.Dict:  # noqa: B008
+    return TeamSpaces.of(spaces.Box(-1, 1, (3,)), n_agents, True, N_ACTIONS, state).to_dict_space()
+
+
+def fill(buffers: list[Any], env: CentralizedValueWrapper, n_steps: int, zero_values: bool) -> tuple[Array, Array]:
+    """Play first legal actions with made-up values; return active rows (T + 1, B) and values (T + 1, B)."""
+    rng = np.random.default_rng(0)
+    obs: Any = env.reset()
+    starts = np.ones(env.num_envs, dtype=bool)
+    active, values = [], []
+    for step in range(n_steps + 1):
+        rows = obs["active"][np.arange(env.num_envs), obs["agent"]]
+        active.append(rows)
+        values.append(rng.normal(size=env.num_envs) * (rows if zero_values or step == n_steps else 1))
+        if step == n_steps:
+            break
+        actions = first_legal(obs)
+        new_obs, rewards, dones, _ = env.step(actions)
+        for buffer in buffers:
+            value = th.tensor(values[-1], dtype=th.float32)
+            buffer.add(dict(obs), actions.reshape(-1, 1), rewards, starts, value, th.zeros(env.num_envs))
+        obs, starts = new_obs, dones
+    for buffer in buffers:
+        buffer.compute_returns_and_advantage(th.tensor(values[-1], dtype=th.float32), starts)
+    return np.array(active), np.array(values)
+
+
+def make_buffer(env: CentralizedValueWrapper, n_steps: int, kind: Any = TeamRolloutBuffer) -> Any:
+    space, n_rows = env.observation_space, env.num_envs
+    return kind(n_steps, space, env.action_space, device="cpu", gae_lambda=0.9, gamma=0.97, n_envs=n_rows)
+
+
+@pytest.mark.parametrize("n_steps", [3, 5, 8, 13])
+def test_advantages_end_with_the_agent(n_steps: int) -> None:
+    """Against a loop over each life of each agent, which knows nothing of masks; n_steps=3 ends with a death."""
+    env = telling_env()
+    buffer = make_buffer(env, n_steps)
+    active, values = fill([buffer], env, n_steps, zero_values=False)
+    for row in range(env.num_envs):
+        agent = row % N_AGENTS
+        for start in range(0, n_steps, 5):
+            life = [t for t in range(start, min(start + 5, n_steps)) if active[t, row]]
+            rewards = [10 * (t - start + 1) + agent + (agent + t - start) % 2 for t in life]
+            cut = bool(life) and life[-1] == n_steps - 1 and n_steps % 5 != 0 and active[n_steps, row]
+            after = [*(values[t, row] for t in life[1:]), values[n_steps, row] if cut else 0.0]
+            errors = [r + 0.97 * v - values[t, row] for r, v, t in zip(rewards, after, life, strict=True)]
+            for k, t in enumerate(life):
+                advantage = sum((0.97 * 0.9) ** (j - k) * errors[j] for j in range(k, len(life)))
+                assert buffer.advantages[t, row] == pytest.approx(advantage, rel=1e-4, abs=1e-4)
+                assert buffer.returns[t, row] == pytest.approx(advantage + values[t, row], rel=1e-4, abs=1e-4)
+
+
+def test_minibatches_leave_out_who_takes_no_part_and_keep_the_rest() -> None:
+    env = telling_env()
+    team, stock = make_buffer(env, 8), make_buffer(env, 8, DictRolloutBuffer)
+    active, _ = fill([team, stock], env, 8, zero_values=True)
+    # Where values of idle rows are zero, as our policies give them, SB3's recursion gives the same.
+    rows = active[:8] == 1
+    np.testing.assert_array_equal(team.advantages[rows], stock.advantages[rows])
+
+    def by_row(buffer: Any) -> list[Any]:
+        found = []
+        for sample in buffer.get(6):
+            keys = sorted(sample.observations)
+            parts = [*(sample.observations[key] for key in keys), *sample[1:]]
+            flags = sample.observations["active"].numpy()[np.arange(len(parts[0])), sample.observations["agent"][:, 0]]
+            found += [
+                row for row, flag in zip(zip(*(p.tolist() for p in parts), strict=True), flags, strict=True) if flag
+            ]
+        return sorted(found)
+
+    assert by_row(team) == by_row(stock)
+    samples = list(team.get(6))
+    assert sum(len(sample.actions) for sample in samples) == rows.sum() < 8 * 6
+    for sample in samples:
+        assert len(sample.actions) <= 6
+        seen = sample.observations
+        assert seen["active"].gather(1, seen["agent"]).all()
+        # Teams stay together: as many rows of a team as there are active agents in it.
+        for joint in seen["team"].unique(dim=0):
+            members = (seen["team"] == joint).flatten(1).all(dim=1)
+            assert members.sum() == seen["active"][members][0].sum()
+    assert {key: value.dtype for key, value in samples[0].observations.items()} == {
+        key: value.dtype for key, value in next(stock.get(6)).observations.items()
+    }
+
+
+def test_states_are_stored_once_per_game() -> None:
+    env = telling_env()
+    team, stock = make_buffer(env, 8), make_buffer(env, 8, DictRolloutBuffer)
+    fill([team], env, 8, zero_values=True)
+    assert team.states.shape == (8, 2, 2)
+    assert team.active.shape == (8, 2, N_AGENTS)
+    assert team.nbytes < sum(array.nbytes for array in stock.observations.values()) + 7 * stock.values.nbytes
+
+
+def test_minibatches_without_anybody_are_skipped() -> None:
+    class Nobody(CentralizedValueWrapper):
+        """Nobody takes part in game 0."""
+
+        def _joint_view(self, obs: Any) -> Any:
+            joint = super()._joint_view(obs)
+            joint["active"][:N_AGENTS] = 0
+            return joint
+
+    env = Nobody(telling_env().venv)
+    buffer = make_buffer(env, 5)
+    fill([buffer], env, 5, zero_values=True)
+    assert all(len(sample.actions) for sample in buffer.get(3))
+    buffer.active[:] = 0
+    with pytest.raises(ValueError, match="expected agents that take part, got none in 5 steps of 2 games"):
+        next(buffer.get(3))
+
+
+@pytest.mark.parametrize("key", ["active", "state"])
+def test_rows_of_a_game_that_disagree_are_refused(key: str) -> None:
+    env = telling_env()
+    buffer = make_buffer(env, 5)
+    obs: Any = env.reset()
+    zeros = np.zeros(6, np.float32)
+    buffer.add(obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
+    obs[key][4, 0] += 1
+    with pytest.raises(ValueError, match=f"expected one '{key}' for all rows of a game, but the rows of game 1 differ"):
+        buffer.add(obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
+
+
+# --- policies ---------------------------------------------------------------------------------------------------------
+
+
+def make_policy(kind: type[Any], **kwargs: Any) -> Any:
+    th.manual_seed(0)
+    policy = kind(telling_spaces(), spaces.Discrete(N_ACTIONS), lambda _: 1e-3, net_arch=[8], **kwargs)
+    for parameter in policy.parameters():  # the small last layer of actors would hide differences
+        th.nn.init.normal_(parameter, std=0.5)
+    return policy
+
+
+def random_rows(n_games: int = 6) -> dict[str, th.Tensor]:
+    """Rows of teams some of whose agents take no part; the first two games differ in nothing else."""
+    generator = th.Generator().manual_seed(1)
+    own = th.rand(n_games, N_AGENTS, 3, generator=generator) * 2 - 1
+    own[1] = own[0]
+    active = th.rand(n_games, N_AGENTS, generator=generator) < 0.6
+    active[:2] = th.tensor([[True, True, True], [True, True, False]])
+    mask = th.rand(n_games * N_AGENTS, N_ACTIONS, generator=generator) < 0.5
+    mask[:, 2] |= ~mask.any(dim=1)
+    return {
+        "obs": own.flatten(0, 1),
+        "team": own.repeat_interleave(N_AGENTS, dim=0),
+        "agent": th.arange(N_AGENTS).repeat(n_games),
+        "active": active.to(th.int8).repeat_interleave(N_AGENTS, dim=0),
+        "action_mask": mask.to(th.int8),
+        "state": th.rand(n_games, 2, generator=generator).repeat_interleave(N_AGENTS, dim=0),
+    }
+
+
+def is_active(obs: dict[str, th.Tensor]) -> th.Tensor:
+    return obs["active"].gather(1, obs["agent"].unsqueeze(1)).squeeze(1) == 1
+
+
+@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("heads", ["shared", "per_agent"])
+def test_values_do_not_depend_on_what_idle_agents_see_and_theirs_are_zero(kind: Any, heads: str) -> None:
+    policy = make_policy(kind, heads=heads)
+    obs = random_rows()
+    values = policy.predict_values(obs)
+    idle = ~is_active(obs)
+    assert (values[idle] == 0).all()
+    assert (values[~idle] != 0).all()
+    other = {**obs, "team": th.where(obs["active"].unsqueeze(2) == 1, obs["team"], 0.77)}
+    other["obs"] = th.where(idle.unsqueeze(1), 0.77, obs["obs"])
+    th.testing.assert_close(policy.predict_values(other), values, rtol=0, atol=1e-6)
+    th.testing.assert_close(policy.forward(other)[1], values, rtol=0, atol=1e-6)
+    slow = make_policy(kind, heads=heads, distinct=False)
+    th.testing.assert_close(slow.predict_values(obs), values, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [SAFPolicy, MAPPOPolicy])
+def test_equal_views_with_other_agents_active_are_other_teams(kind: Any) -> None:
+    obs = random_rows()
+    values = make_policy(kind).predict_values(obs).squeeze(1)
+    assert (obs["team"][0] == obs["team"][3]).all()
+    assert not th.isclose(values[:2], values[3:5], atol=1e-4).any()
+
+
+def enumerated(policy: Any, obs: dict[str, th.Tensor]) -> th.Tensor:
+    """(B, A) probabilities, by arithmetic on what the networks give."""
+    features = policy.extract_features(obs)
+    mask = obs["action_mask"].double()
+    actor = policy.actor
+    if not hasattr(actor, "policies"):
+        weights, logits = th.ones(len(mask), 1).double(), [actor.head(features)]
+    else:
+        keys = actor.signature_keys
+        weights = (actor.query_net(features) @ keys.t() / keys.shape[1] ** 0.5).double().softmax(dim=1)
+        logits = [head(features) for head in actor.policies]
+    by_policy = [one.double().exp() * mask for one in logits]
+    return sum(w.unsqueeze(1) * p / p.sum(dim=1, keepdim=True) for w, p in zip(weights.t(), by_policy, strict=True))
+
+
+@pytest.mark.parametrize("kind", POLICIES)
+def test_likelihood_and_entropy_under_masks_against_enumeration(kind: Any) -> None:
+    policy = make_policy(kind)
+    obs = random_rows()
+    probabilities = enumerated(policy, obs)
+    distribution = policy.get_distribution(obs)
+    found = th.stack([distribution.log_prob(th.full((18,), a)) for a in range(N_ACTIONS)], dim=1)
+    allowed = obs["action_mask"] == 1
+    assert (found.exp()[~allowed] == 0).all(), "exactly zero"
+    th.testing.assert_close(found.double().exp(), probabilities, rtol=1e-4, atol=1e-6)
+    entropy = -th.special.xlogy(probabilities, probabilities).sum(dim=1)
+    th.testing.assert_close(distribution.entropy().double(), entropy, rtol=1e-4, atol=1e-5)
+    actions, _, log_prob = policy.forward(obs)
+    assert allowed.gather(1, actions.unsqueeze(1)).all()
+    th.testing.assert_close(log_prob, found.gather(1, actions.unsqueeze(1)).squeeze(1))
+    assert (policy.get_distribution(obs).mode() == probabilities.argmax(dim=1)).all()
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"selection": "gumbel"}, {"n_policies": 1, "heads": "per_agent"}, {"n_policies": 2}]
+)
+def test_other_actors_keep_to_legal_actions_with_finite_gradients(kwargs: dict[str, Any]) -> None:
+    policy = make_policy(SAFPolicy, **kwargs)
+    obs = random_rows()
+    allowed = obs["action_mask"] == 1
+    for _ in range(20):
+        assert allowed.gather(1, policy.forward(obs)[0].unsqueeze(1)).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        _, log_prob, entropy = policy.evaluate_actions(obs, policy.forward(obs)[0])
+    (log_prob.mean() + entropy.mean()).backward()
+    gradients = [p.grad for p in policy.actor.parameters() if p.grad is not None]
+    assert gradients
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_a_mask_that_allows_everything_changes_nothing() -> None:
+    logits = th.randn(5, 4)
+    assert th.equal(masked_parameters(spaces.Discrete(4), logits, th.ones(5, 4, dtype=th.bool)), logits)
+    policy = make_policy(SAFPolicy)
+    obs = random_rows()
+    obs["action_mask"][:] = 1
+    own = policy.views.own(obs["obs"])
+    unmasked = policy.actor.distribution(policy.views.per_agent(policy.actor, own, None))
+    masked = policy.get_distribution(obs)
+    th.testing.assert_close(masked.distribution.logits, unmasked.distribution.logits)
+
+
+def test_predict_needs_the_mask_and_at_least_one_legal_action() -> None:
+    policy = make_policy(MAPPOPolicy)
+    obs = {key: value.numpy() for key, value in random_rows().items()}
+    own = {"obs": obs["obs"], "action_mask": obs["action_mask"]}
+    actions, _ = policy.predict(own, deterministic=True)
+    np.testing.assert_array_equal(actions, policy.predict(obs, deterministic=True)[0])
+    single, _ = policy.predict({key: value[4] for key, value in own.items()}, deterministic=True)
+    assert single == actions[4]
+    for incomplete in (obs["obs"], {"obs": obs["obs"]}):
+        with pytest.raises(ValueError, match=r"expected 'action_mask' beside 'obs'.*pass \{'obs': ..., 'action_mask'"):
+            policy.predict(incomplete)
+    own["action_mask"][5] = 0
+    with pytest.raises(ValueError, match="at least one legal action in each 'action_mask', got none in row 5 of 18"):
+        policy.predict(own)
+
+
+def test_mappos_critic_on_the_state_reads_the_state_alone() -> None:
+    policy = make_policy(MAPPOPolicy, critic_input="state")
+    obs = random_rows()
+    values = policy.predict_values(obs)
+    assert len(values.unique()) == int(is_active(obs).sum()) + 1, "one for each game and agent, and zero"
+    others = {key: value for key, value in obs.items() if key not in ("obs", "team")}
+    th.testing.assert_close(policy.predict_values({**others, "obs": -obs["obs"], "team": -obs["team"]}), values)
+    assert not th.allclose(policy.predict_values({**obs, "state": obs["state"] + 1}), values)
+    assert not [
+        name
+        for name, _ in policy.named_parameters()
+        if "encoder" in name and not name.startswith(("value_net", "features_extractor", "pi_features", "vf_features"))
+    ]
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def make_model(policy: str = "SAFPolicy", env: Any = None, **kwargs: Any) -> PPO:
+    settings = {"n_steps": 10, "batch_size": 30, "n_epochs": 2, "rollout_buffer_class": TeamRolloutBuffer, **kwargs}
+    return PPO(policy, env or telling_env(), seed=3, device="cpu", **settings)
+
+
+@pytest.mark.parametrize(
+    ("policy", "policy_kwargs"),
+    [("SAFPolicy", {}), ("MAPPOPolicy", {}), ("MAPPOPolicy", {"critic_input": "state"}), ("IPPOPolicy", {})],
+)
+@pytest.mark.parametrize("time_limit", ["terminal", "bootstrap"])
+def test_ppo_trains_saves_and_loads(policy: str, policy_kwargs: Any, time_limit: str, tmp_path: Path) -> None:
+    """The environment stops the test at the first illegal action; warnings of idle rows are errors."""
+    model = make_model(policy, telling_env(time_limit=time_limit), policy_kwargs=policy_kwargs).learn(120)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model", env=telling_env(), device="cpu")
+    obs: Any = telling_env().reset()
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    assert evaluate_team(loaded, telling_env(), 4).lengths == [5] * 4
+    loaded.learn(60, reset_num_timesteps=False)
+
+
+def test_idle_rows_do_not_touch_the_loss() -> None:
+    def after_training(spoil: bool) -> list[th.Tensor]:
+        model = make_model()
+        callback = model._setup_learn(60)[1]
+        assert model.env is not None
+        model.collect_rollouts(model.env, callback, model.rollout_buffer, 10)
+        buffer: Any = model.rollout_buffer
+        idle = buffer.active.reshape(10, 6) == 0
+        assert 0 < idle.sum() < 60
+        if spoil:
+            for name in ("advantages", "returns", "values", "log_probs"):
+                getattr(buffer, name)[idle] = 1e6
+        np.random.seed(0)  # noqa: NPY002 - the order of minibatches
+        model.train()
+        return list(model.policy.parameters())
+
+    for clean, spoiled in zip(after_training(False), after_training(True), strict=True):
+        th.testing.assert_close(clean, spoiled, rtol=0, atol=0)
+
+
+def test_sb3s_buffer_warns_once_that_idle_rows_enter_the_loss() -> None:
+    model = make_model(rollout_buffer_class=DictRolloutBuffer)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(120)
+    told = [str(w.message) for w in caught if "take no part" in str(w.message)]
+    assert len(told) == 1
+    assert "rollout_buffer_class=sb3_saf.TeamRolloutBuffer" in told[0]
+
+
+def test_a_padded_environment_trains() -> None:
+    class Both(UnequalEnv):
+        """Agent 1 sees more and can do more."""
+
+        def action_space(self, agent: str) -> spaces.Space[Any]:
+            return spaces.Discrete(7) if agent == "agent_1" else spaces.Discrete(4)
+
+        def _observation(self, index: int, draw: np.float32) -> Any:
+            own = super()._observation(index, draw)
+            return np.append(own, [0.5, 0.5]).astype(np.float32) if index == 1 else own
+
+        def observation_space(self, agent: str) -> spaces.Space[Any]:
+            return spaces.Box(0.0, 100.0, (5 if agent == "agent_1" else 3,), np.float32)
+
+    def make() -> Any:
+        return supersuit.pad_action_space_v0(supersuit.pad_observations_v0(Both("both", n_agents=2, deaths={0: 2})))
+
+    env = make_team_env(make, 2, seed=0)
+    assert env.team_spaces.own.shape == (5,)
+    assert env.action_space == spaces.Discrete(7)
+    model = make_model("MAPPOPolicy", env, batch_size=20).learn(80)
+    assert evaluate_team(model, env, 2).lengths == [3, 3]
+
+
+def test_worker_processes_give_the_same_numbers() -> None:
+    def rollout(n_cpus: int) -> list[Any]:
+        model = make_model("MAPPOPolicy", telling_env(3, n_cpus=n_cpus, masks="info"), batch_size=90).learn(90)
+        model.get_env().close()  # type: ignore[union-attr]
+        return [parameter.detach() for parameter in model.policy.parameters()]
+
+    for one, two in zip(*map(partial(rollout), (1, 2)), strict=True):
+        th.testing.assert_close(one, two, rtol=0, atol=0)
