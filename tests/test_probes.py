@@ -83,6 +83,7 @@ def rows_of(probe: Probe, time: int = 0) -> dict[str, th.Tensor]:
         "obs": th.as_tensor(own).flatten(0, 1),
         "team": th.as_tensor(np.repeat(own, n_agents, axis=0)),
         "agent": th.arange(n_agents).repeat(n_contexts),
+        "active": th.ones(len(own) * n_agents, n_agents, dtype=th.int8),
     }
 
 
@@ -240,8 +241,8 @@ def test_joint_action_where_advantages_are_made_of_normalised_values(monkeypatch
     """
     denormalise = ValueNormalizer.forward
 
-    def forget(self: ValueNormalizer, outputs: th.Tensor) -> th.Tensor:
-        values = denormalise(self, outputs)
+    def forget(self: ValueNormalizer, outputs: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        values = denormalise(self, outputs, active)
         return values if th.is_grad_enabled() else values.sub_(self.mean).div_(self.std)
 
     monkeypatch.setattr(ValueNormalizer, "forward", forget)
