@@ -195,7 +195,8 @@ def main(arguments: list[str] | None = None) -> None:
     random = evaluate(options, RandomPolicy(model.action_space, seed=options.seed))
     print(f"{options.env}, {options.algo}{' on the state' if options.state else ''}, seed {options.seed}")
     print(
-        f"{options.game_steps:,} game steps in {seconds:.0f} s ({cpu_seconds:.0f} s of CPU time, {options.threads} thread(s))"
+        f"{options.game_steps:,} game steps in {seconds:.0f} s ({cpu_seconds:.0f} s of CPU time, "
+        f"{options.threads} thread(s))"
     )
     print("team return (sum over agents and steps), actions sampled")
     print(f"  trained  {trained}")
