@@ -1,5 +1,5 @@
 """
-Does the knowledge source cost linearly in the number of agents? ``python benchmarks/knowledge_source.py``
+Does the knowledge source cost linearly in the number of agents? ``python -m benchmarks.knowledge_source``
 
 Writing and reading, forward and backward, for N = 5 to 320 agents, beside plain attention among the agents, where every
 agent attends to every agent. Two measures: multiply-adds (counted by PyTorch, exact) and seconds of one processor
