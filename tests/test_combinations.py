@@ -89,9 +89,12 @@ def test_rollouts_of_memory_with_masks_are_evaluated_alike() -> None:
     )
     learn(model, 60)
     n_rows = 0
-    for batch in model.rollout_buffer.get(30):
+    policy, batches = model.policy, model.rollout_buffer.get(30)
+    assert isinstance(policy, SAFLstmPolicy)
+    batch: Any  # sb3-contrib's samples, which its own annotations do not name
+    for batch in batches:
         actions = batch.actions.long().flatten()
-        values, log_prob, _ = model.policy.evaluate_actions(
+        values, log_prob, _ = policy.evaluate_actions(
             batch.observations, actions, batch.lstm_states, batch.episode_starts
         )
         real = batch.mask > 1e-8
@@ -117,13 +120,13 @@ def test_an_action_must_be_allowed_by_both_masks() -> None:
     buffer = model.rollout_buffer
     taken = buffer.actions.reshape(-1).astype(int)
     assert (taken >= 2).all(), "the environment's action_masks() forbid 0 and 1"
-    shown = buffer.observations["action_mask"].reshape(-1, N_ACTIONS)  # type: ignore[index,call-overload]
+    shown = buffer.observations["action_mask"].reshape(-1, N_ACTIONS)
     assert shown[np.arange(len(taken)), taken].all()
     assert len(np.unique(taken)) == 2
 
     policy = model.policy
     assert isinstance(policy, SAFMaskablePolicy)
-    rows, _ = policy.obs_to_tensor(env.reset())  # type: ignore[arg-type]
+    rows, _ = policy.obs_to_tensor(env.reset())
     assert isinstance(rows, dict)
     asked = th.tensor([[False, False, True, True]]).expand(6, -1)
     distribution = policy.get_distribution(rows, asked)
