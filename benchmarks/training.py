@@ -48,9 +48,11 @@ class RandomViews(VecEnvWrapper):
         return self._rng.integers(0, self._n_codes, size=like.shape, dtype=like.dtype)
 
     def reset(self) -> VecEnvObs:
+        """Random views of the first step."""
         return self._draw(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
+        """The game's step with random views."""
         obs, rewards, dones, infos = self.venv.step_wait()
         return self._draw(obs), rewards, dones, infos
 
