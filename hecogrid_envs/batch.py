@@ -136,10 +136,13 @@ class GameBatch:
         if self.n_threads == 1:
             work(0, self.n_games)
             return
-        edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int)
+        edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int).tolist()
         if self._threads is None:
-            self._threads = ThreadPoolExecutor(self.n_threads, thread_name_prefix="hecogrid")
-        for done in [self._threads.submit(work, int(a), int(b)) for a, b in pairwise(edges)]:
+            self._threads = ThreadPoolExecutor(self.n_threads - 1, thread_name_prefix="hecogrid")
+        *others, own = pairwise(edges)
+        pending = [self._threads.submit(work, first, last) for first, last in others]
+        work(*own)  # the calling thread takes a share, too: handing work over costs as much as stepping a dozen games
+        for done in pending:
             done.result()
 
     @property
