@@ -70,6 +70,7 @@ def _finish(figure: Figure, axes: Sequence[Axes], title: str | None, n_entries: 
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(axis="y", alpha=0.3)
+        ax.set_axisbelow(True)
     handles, labels = axes[0].get_legend_handles_labels()
     for ax in axes[1:]:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
@@ -169,6 +170,7 @@ def draw_aggregates(
         left.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color="black", linewidth=1.5)
     left.set_yticks(range(len(methods)), methods)
     left.invert_yaxis()
+    left.use_sticky_edges = False  # bars end inside the axes
     left.set(xlabel=x_label, title="interquartile mean")
     top = max(float(runs.max()) for runs in scores.values())
     thresholds = np.linspace(0, top if top > 0 else 1, 101)
