@@ -54,6 +54,7 @@ class Request:
     :param save_freq: game steps between checkpoints; 0 or less for none
     :param deterministic_eval: whether evaluation takes the most likely actions
     :param trial: number of the trial to train again, or ``"best"``
+    :param options: all options as given, to be kept
     :param command: the command, to be kept
     """
 
@@ -68,6 +69,7 @@ class Request:
     save_freq: int = -1
     deterministic_eval: bool = False
     trial: int | str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
     command: str = ""
 
     def settings(self, sampled: Mapping[str, Any] | None = None, *, evaluation: bool = False) -> Settings:
@@ -80,13 +82,6 @@ class Request:
         env_kwargs = {**self.env_kwargs, **(self.eval_env_kwargs if evaluation else {})}
         overrides = merge(sampled or {}, self.overrides)
         return load_settings(self.algo, self.env_id, self.size, env_kwargs, overrides, self.config)
-
-    def as_dict(self) -> dict[str, Any]:
-        """As given, as plain data."""
-        given = {"size": self.size, "env_kwargs": dict(self.env_kwargs), "overrides": dict(self.overrides)}
-        others = {"eval_env_kwargs": dict(self.eval_env_kwargs), "trial": self.trial}
-        config = None if self.config is None else str(self.config)
-        return {"algo": self.algo, "env": self.env_id, "config": config, **given, **others}
 
 
 class TeamExperimentManager(ExperimentManager):
@@ -236,12 +231,12 @@ class TeamExperimentManager(ExperimentManager):
             self.callbacks.append(evaluation)
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        """Keep what was used and asked for; RL-Zoo3's ``args.yml`` and command would be those it was called with."""
         super()._save_config(saved_hyperparams)
         folder = Path(self.params_path)
-        # RL-Zoo3 writes the command of the interpreter, which is not ours when training is called from Python.
-        (folder / "command.txt").write_text(self.request.command + "\n", encoding="utf-8")
-        for name, content in {"given.yml": self.request.as_dict(), "versions.yml": software_versions()}.items():
+        for name, content in {"args.yml": dict(self.request.options), "versions.yml": software_versions()}.items():
             (folder / name).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        (folder / "command.txt").write_text(self.request.command + "\n", encoding="utf-8")
 
     # --- tuning -----------------------------------------------------------------------------------------------------
 

@@ -155,6 +155,7 @@ def train(arguments: Sequence[str] | None = None) -> None:
         save_freq=options.save_freq,
         deterministic_eval=options.deterministic_eval,
         trial=options.trial_id,
+        options={key: str(value) if isinstance(value, Path) else value for key, value in vars(options).items()},
         command=shlex.join([*PROGRAM.split(), *given]),
     )
     with user_errors():
