@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -114,6 +115,8 @@ class TeamExperimentManager(ExperimentManager):
         self.deterministic_eval = request.deterministic_eval
         # RL-Zoo3 would divide these by the number of games.
         self.eval_freq = self.save_freq = -1
+        self._envs: list[VecEnv] = []
+        self._has_folder = False
         HYPERPARAMS_SAMPLER[algo] = self._sample
         HYPERPARAMS_CONVERTER[algo] = to_overrides  # type: ignore[assignment]  # their dict is typed by its first entry
 
@@ -127,6 +130,11 @@ class TeamExperimentManager(ExperimentManager):
         """
         self.settings = self.request.settings(self._trial_overrides())
         self._eval_settings = self.request.settings(self._trial_overrides(), evaluation=True)
+        if self._eval_settings.n_agents != self.settings.n_agents:
+            raise ValueError(
+                f"evaluation needs the {self.settings.n_agents} agents of training, got "
+                f"n_agents={self._eval_settings.n_agents}; leave n_agents out of --eval-env-kwargs"
+            )
         print(yaml.safe_dump(self.settings.as_dict(), sort_keys=False), end="")
         return self._arguments(self.settings), {**self.settings.as_dict(), "seed": self.seed}
 
@@ -164,14 +172,36 @@ class TeamExperimentManager(ExperimentManager):
     # --- one run ----------------------------------------------------------------------------------------------------
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """Make folder, environments, callbacks and model."""
-        with user_errors(AssertionError, TypeError):  # SB3's checks of what it is given
-            prepared = super().setup_experiment()
+        """Make folder, environments, callbacks and model; if that fails, nothing is left."""
+        try:
+            with user_errors(AssertionError, TypeError):  # SB3's checks of what it is given
+                prepared = super().setup_experiment()
+        except CommandError:
+            self._close_envs()
+            if self._has_folder:
+                shutil.rmtree(self.save_path)  # it would pass for the latest run
+            raise
         if prepared is not None:
             model, _ = prepared
             # SB3 would call every run PPO.
             model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
         return prepared
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        Train.
+
+        :param model: from :meth:`setup_experiment`
+        """
+        try:
+            super().learn(model)
+        finally:
+            self._close_envs()
+
+    def _close_envs(self) -> None:
+        """Close those of training again, which does no harm, and those of evaluation, which RL-Zoo3 leaves open."""
+        while self._envs:
+            self._envs.pop().close()
 
     def create_log_folder(self) -> None:
         """Take a folder of our own; tuning leaves none, which would pass for the latest run."""
@@ -180,6 +210,7 @@ class TeamExperimentManager(ExperimentManager):
         while True:
             try:
                 Path(self.save_path).mkdir(parents=True)
+                self._has_folder = True
                 break
             except FileExistsError:  # another process was faster
                 number = get_latest_run_id(self.log_path, self.env_name) + 1
@@ -200,11 +231,8 @@ class TeamExperimentManager(ExperimentManager):
         env = settings.make_env(
             self.seed, evaluation=eval_env, monitor_dir=None if quiet else self.save_path, n_envs=n_envs
         )
-        if eval_env and self._eval_settings.n_agents != self.settings.n_agents:
-            raise ValueError(
-                f"evaluation needs the {self.settings.n_agents} agents of training, got "
-                f"n_agents={self._eval_settings.n_agents}; leave n_agents out of --eval-env-kwargs"
-            )
+        if not self.optimize_hyperparameters:  # a trial closes its own
+            self._envs.append(env)
         return env
 
     def create_callbacks(self) -> None:
