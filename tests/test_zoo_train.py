@@ -27,10 +27,10 @@ ENV = "TeamTogether-v0"
 
 def train(folder: Path, *options: str, algo: str = "saf") -> Path:
     """Train at smoke size with seed 3; returns the run's folder."""
-    before = {path for path in folder.glob("*/*") if path.is_dir()}
+    before = {path.parent for path in folder.glob("*/*/monitor.csv")}
     given = ("--size", "smoke", "--seed", "3", "--eval-episodes", "4", "--env", ENV, "-f", str(folder))
     zoo_train.main(["--algo", algo, *given, *options])
-    (run,) = {path for path in folder.glob("*/*") if path.is_dir()} - before
+    (run,) = {path.parent for path in folder.glob("*/*/monitor.csv")} - before
     return run
 
 
