@@ -111,9 +111,9 @@ def test_seeds_without_spread_have_an_interval_without_width() -> None:
 def test_bootstraps_repeat_and_leave_the_global_generator_alone() -> None:
     scores = {"saf": np.random.default_rng(0).normal(size=(5, 3))}
     first = interquartile_means(scores)
-    before = np.random.get_state()[1].copy()  # type: ignore[index, union-attr]  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
     assert interquartile_means(scores) == first
-    assert np.array_equal(np.random.get_state()[1], before)  # type: ignore[index, arg-type]  # noqa: NPY002
+    assert np.array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
 
 
 def test_performance_profiles_are_shares_above_thresholds() -> None:

@@ -14,6 +14,7 @@ import yaml
 pytest.importorskip("rl_zoo3.train")
 
 import optuna
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from sb3_saf import LightEncoder
@@ -37,7 +38,7 @@ def tune(folder: Path, *options: str) -> optuna.Study:
 
 def load_study(storage: str) -> optuna.Study:
     if storage.endswith(".log"):
-        journal = optuna.storages.journal.JournalFileBackend(storage)
+        journal = JournalFileBackend(storage)
         return optuna.load_study(study_name="s", storage=optuna.storages.JournalStorage(journal))
     return optuna.load_study(study_name="s", storage=storage)
 
@@ -140,9 +141,7 @@ def test_unknown_studies_and_trials_are_one_line(
     options: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     storage = str(tmp_path / "study.log")
-    optuna.create_study(
-        study_name="s", storage=optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(storage))
-    )
+    optuna.create_study(study_name="s", storage=optuna.storages.JournalStorage(JournalFileBackend(storage)))
     with pytest.raises(SystemExit) as exit_:
         zoo_train.main([*SMOKE, "--storage", storage, "-f", str(tmp_path), *options])
     assert exit_.value.code == 2

@@ -304,3 +304,6 @@ def _resolved_policy_kwargs(spec: AlgorithmSpec, given: Mapping[str, Any]) -> di
         if key not in hints:
             raise unknown_name(f"argument of {spec.policy}", key, hints)
     return {key: resolve(key, value, hints[key]) for key, value in given.items()}
+
+
+__all__ = ["ALGOS", "ENV_IDS", "SIZES", "TASK_OF_ENV", "Settings", "Size", "load_settings", "saved_settings"]
