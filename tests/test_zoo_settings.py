@@ -52,7 +52,13 @@ def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: floa
     assert settings.time_limit == "terminal"
     # Constructors of the model see exactly this; the rest is their default, which is the paper's.
     arguments = {**_defaults(PPO), **settings.hyperparams}
-    table = {"learning_rate": 7e-4, "n_steps": 50, "n_epochs": 10, "batch_size": 128 * 50 * 10, "gamma": 0.99}
+    table: dict[str, Any] = {
+        "learning_rate": 7e-4,
+        "n_steps": 50,
+        "n_epochs": 10,
+        "batch_size": 128 * 50 * 10,
+        "gamma": 0.99,
+    }
     table |= {"gae_lambda": gae_lambda, "clip_range": 0.2, "clip_range_vf": 0.2, "normalize_advantage": True}
     table |= {"ent_coef": 0.01, "vf_coef": 0.25, "max_grad_norm": max_grad_norm, "target_kl": None}
     assert {key: arguments[key] for key in table} == table

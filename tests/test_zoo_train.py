@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import yaml
 from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
+from sb3_saf import SAFPolicy
 from sb3_saf.zoo import train as zoo_train
 from sb3_saf.zoo.callbacks import own_generators
 from sb3_saf.zoo.settings import ENV_IDS, load_settings
@@ -27,10 +29,10 @@ ENV = "TeamTogether-v0"
 
 def train(folder: Path, *options: str, algo: str = "saf") -> Path:
     """Train at smoke size with seed 3; returns the run's folder."""
-    before = {path for path in folder.glob("*/*") if path.is_dir()}
+    before = {path.parent for path in folder.glob("*/*/monitor.csv")}
     given = ("--size", "smoke", "--seed", "3", "--eval-episodes", "4", "--env", ENV, "-f", str(folder))
     zoo_train.main(["--algo", algo, *given, *options])
-    (run,) = {path for path in folder.glob("*/*") if path.is_dir()} - before
+    (run,) = {path.parent for path in folder.glob("*/*/monitor.csv")} - before
     return run
 
 
@@ -121,7 +123,9 @@ def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
     assert command.startswith("python -m sb3_saf.train --algo saf-no-pool --size smoke")
     assert "'policy_kwargs:{n_slots: 3}'" in command
     assert list((tmp_path / "tb" / ENV / "saf-no-pool_1").glob("events.*"))
-    assert PPO.load(run / f"{ENV}.zip").policy.parts.n_slots == 3
+    policy = PPO.load(run / f"{ENV}.zip").policy
+    assert isinstance(policy, SAFPolicy)
+    assert asdict(policy.parts)["n_slots"] == 3
 
 
 def test_runs_are_numbered_and_never_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

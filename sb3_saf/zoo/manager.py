@@ -12,8 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,57 +30,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_saf.zoo.algorithms import ALGOS
 from sb3_saf.zoo.callbacks import CheckpointInGameSteps, TrialCallback, ZooEvalCallback
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
+from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
-from sb3_saf.zoo.settings import Settings, load_settings
+from sb3_saf.zoo.settings import Settings
 from sb3_saf.zoo.storage import open_storage
 from sb3_saf.zoo.versions import software_versions
-from sb3_saf.zoo.yaml_files import Size, merge
-
-
-@dataclass(frozen=True)
-class Request:
-    """
-    What the user asked for and RL-Zoo3 has no words for.
-
-    :param algo: name in ``ALGOS``
-    :param env_id: the environment
-    :param size: the size
-    :param env_kwargs: parameters of the level
-    :param eval_env_kwargs: what differs in the level of evaluation
-    :param overrides: settings that win over the files
-    :param config: a file in place of the algorithm's
-    :param eval_freq: game steps between evaluations; 0 or less for none, None for 20 in a run
-    :param save_freq: game steps between checkpoints; 0 or less for none
-    :param deterministic_eval: whether evaluation takes the most likely actions
-    :param trial: number of the trial to train again, or ``"best"``
-    :param options: all options as given, to be kept
-    :param command: the command, to be kept
-    """
-
-    algo: str
-    env_id: str
-    size: Size = "paper"
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    eval_env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    config: Path | None = None
-    eval_freq: int | None = None
-    save_freq: int = -1
-    deterministic_eval: bool = False
-    trial: int | str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-    command: str = ""
-
-    def settings(self, sampled: Mapping[str, Any] | None = None, *, evaluation: bool = False) -> Settings:
-        """
-        The settings asked for.
-
-        :param sampled: settings of a trial; what the user gave wins over them
-        :param evaluation: with the level of evaluation
-        """
-        env_kwargs = {**self.env_kwargs, **(self.eval_env_kwargs if evaluation else {})}
-        overrides = merge(sampled or {}, self.overrides)
-        return load_settings(self.algo, self.env_id, self.size, env_kwargs, overrides, self.config)
 
 
 class TeamExperimentManager(ExperimentManager):
