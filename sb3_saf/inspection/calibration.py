@@ -108,9 +108,7 @@ def reliability(values: Floats, returns: Floats, n_bins: int = 10) -> list[Bin]:
     """
     order = np.argsort(values, kind="stable")
     parts = np.array_split(order, min(n_bins, len(order)))
-    return [
-        Bin(float(values[part].mean()), float(returns[part].mean()), float(returns[part].std())) for part in parts
-    ]
+    return [Bin(float(values[part].mean()), float(returns[part].mean()), float(returns[part].std())) for part in parts]
 
 
 def rmse(values: Floats, returns: Floats) -> float:

@@ -144,9 +144,7 @@ class Insides:
         space = self.policy.action_space
         return np.clip(array, space.low, space.high) if hasattr(space, "low") else array
 
-    def _pool_view(
-        self, obs: Tensors, latent: th.Tensor, action_masks: npt.NDArray[np.bool_] | None
-    ) -> PoolView:
+    def _pool_view(self, obs: Tensors, latent: th.Tensor, action_masks: npt.NDArray[np.bool_] | None) -> PoolView:
         assert self.pool is not None
         log_weights, actions = self.pool.evaluate(latent)
         legal = self.policy._action_mask(obs)
@@ -205,7 +203,7 @@ class RecurrentInsides(Insides):
         blank = th.zeros(lstm.num_layers, n_rows, lstm.hidden_size, device=policy.device)
         self._actor_states: LstmStates = (blank, blank)
         self._critic_states: LstmStates = (blank, blank)
-        self._without: dict[Replacement, LstmStates] = {name: (blank, blank) for name in REPLACEMENTS}
+        self._without: dict[Replacement, LstmStates] = dict.fromkeys(REPLACEMENTS, (blank, blank))
 
     def look(
         self, obs: Tensors, starts: npt.NDArray[np.bool_], action_masks: npt.NDArray[np.bool_] | None = None
