@@ -48,8 +48,8 @@ def game_steps_per_second(model: BaseAlgorithm) -> float | None:
 
 def log_game_steps(algorithm_class: AlgorithmClass) -> AlgorithmClass:
     """
-    Let an algorithm log ``time/game_steps`` and ``time/game_steps_per_second`` beside SB3's ``time/total_timesteps`` and
-    ``time/fps``, which count agents' steps, whenever it trains on teams.
+    Let an algorithm log ``time/game_steps`` and ``time/game_steps_per_second`` whenever it trains on teams. SB3's
+    ``time/total_timesteps`` and ``time/fps`` beside them count agents' steps.
 
     SB3 has no door for this: callbacks end before the logs are written, and must be passed to every ``learn``. So
     ``dump_logs`` of the class is wrapped; models on other environments log what they always did. Calling it again, for

@@ -70,9 +70,9 @@ def lambda_returns(played: Played, gamma: float, lam: float = 1.0) -> Doubles:
     :param lam: lambda
     :return: (T, B)
     """
-    targets = np.zeros(played.rewards.shape)
+    targets: Doubles = np.zeros(played.rewards.shape)
     values = np.asarray(played.values, dtype=np.float64)
-    ahead = next_value = np.zeros(targets.shape[1])
+    ahead = next_value = np.zeros_like(values[0])
     for t in reversed(range(len(targets))):
         going_on = (1 - lam) * next_value + lam * ahead
         targets[t] = played.rewards[t] + gamma * np.where(played.ends[t], played.last_values[t], going_on)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
@@ -23,6 +24,9 @@ from sb3_saf.inspection.insides import require_team_policy
 from sb3_saf.inspection.page import Page, hparams, hyperparameters
 from sb3_saf.inspection.pool import chosen_by, differences
 from sb3_saf.inspection.randomness import own_randomness
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MplFigure
 
 
 class InspectionCallback(BaseCallback):
@@ -186,7 +190,7 @@ class InspectionCallback(BaseCallback):
             self._page.show("episode/strip", Image(film.strip(played.pictures), "HWC"))
             self._page.gif("episode/film", film.gif(played.pictures), self.num_timesteps)
 
-    def _figures(self, played: Played) -> dict[str, figures.Figure]:
+    def _figures(self, played: Played) -> dict[str, MplFigure]:
         counted, gamma = played.counted, self._number("gamma", 1.0)
         values, returns = played.values[counted], lambda_returns(played, gamma)[counted]
         unit = return_scale(self.eval_env).unit
@@ -204,7 +208,7 @@ class InspectionCallback(BaseCallback):
             drawn["knowledge_source/one_episode"] = figures.attention_over_time(_first_episode(played, played.write))
         return drawn
 
-    def _by_zone(self, played: Played) -> figures.Figure:
+    def _by_zone(self, played: Played) -> MplFigure:
         assert played.weights is not None and played.zones is not None
         zones = played.zones[played.counted]
         colours = zone_colours(self.eval_env)

@@ -27,7 +27,7 @@ _BLUE: Final = "#0072B2"
 _ORANGE: Final = "#D55E00"
 _GREY: Final = "#666666"
 _SCATTERED: Final = 1500
-_STYLE: Final = {
+_STYLE: Final[dict[Any, Any]] = {
     "font.size": 12,
     "axes.titlesize": 13,
     "axes.labelsize": 12,
@@ -61,7 +61,7 @@ def _heat_map(axes: Axes, table: Doubles, unit: str, vmax: float | None = None, 
                 axes.text(column, row, text, ha="center", va="center", fontsize=size, color=ink)
     axes.spines[:].set_visible(False)
     bar = axes.figure.colorbar(image, ax=axes, pad=0.02, label=unit)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     if percent:
         from matplotlib.ticker import PercentFormatter
 

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.common.critic import JointStates, TeamStates
@@ -122,7 +123,7 @@ class Insides:
         :param rows: (K,) which rows of the last step they are
         :return: (K,)
         """
-        values: th.Tensor = self.policy.predict_values(obs)  # type: ignore[operator]
+        values: th.Tensor = self.policy.predict_values(obs)
         return values.flatten()
 
     def _view(
@@ -142,7 +143,7 @@ class Insides:
         """As SB3 hands them to environments."""
         array = actions.cpu().numpy()
         space = self.policy.action_space
-        return np.clip(array, space.low, space.high) if hasattr(space, "low") else array
+        return np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array
 
     def _pool_view(self, obs: Tensors, latent: th.Tensor, action_masks: npt.NDArray[np.bool_] | None) -> PoolView:
         assert self.pool is not None

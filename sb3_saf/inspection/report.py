@@ -37,8 +37,7 @@ def counted_agents(played: Played) -> npt.NDArray[np.int64]:
 
 def counted_games(played: Played) -> npt.NDArray[np.bool_]:
     """(T, E) whether a game was in an episode of the set."""
-    counted: npt.NDArray[np.bool_] = played.counted.reshape(len(played.counted), -1, played.n_agents).any(axis=2)
-    return counted
+    return np.any(played.counted.reshape(len(played.counted), -1, played.n_agents), axis=2)
 
 
 def team_scalars(played: Played, scale: ReturnScale) -> Scalars:
@@ -88,9 +87,8 @@ def read_attention(played: Played) -> Attention | None:
     """Attention of agents over slots; None without a knowledge source."""
     if played.read is None:
         return None
-    n_steps, n_games, n_agents, n_slots = played.read.shape
     # Readers that take no part are left out as queries without sources are.
-    takes_part = played.counted.reshape(n_steps, n_games, n_agents, 1)
+    takes_part = played.counted.reshape(*played.read.shape[:3], 1)
     return attention_of((played.read * takes_part)[counted_games(played)])
 
 
