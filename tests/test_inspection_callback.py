@@ -47,7 +47,7 @@ def learn(
     folder: Path | None,
     callback: InspectionCallback | None,
     policy: str = "SAFPolicy",
-    algorithm: type[BaseAlgorithm] = PPO,
+    algorithm: Any = PPO,
     env: Any = None,
     n_updates: int = 2,
     **policy_kwargs: Any,
@@ -76,7 +76,9 @@ def learn(
 
 def events(folder: Path) -> EventAccumulator:
     (file,) = folder.rglob("events.*")
-    return EventAccumulator(str(file), size_guidance=dict.fromkeys(("scalars", "images", "histograms", "tensors"), 0)).Reload()
+    return EventAccumulator(
+        str(file), size_guidance=dict.fromkeys(("scalars", "images", "histograms", "tensors"), 0)
+    ).Reload()
 
 
 def scalars_of(folder: Path) -> dict[str, list[float]]:
@@ -136,8 +138,8 @@ class TestPage:
         for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1"):
             assert name in layout
         told = page.PluginTagToContent("hparams")
-        for name in (b"TeamSupport", b"n_policies", b"learning_rate"):
-            assert name in told["_hparams_/session_start_info"]
+        for word in (b"TeamSupport", b"n_policies", b"learning_rate"):
+            assert word in told["_hparams_/session_start_info"]
         assert b"team/return" in told["_hparams_/experiment"]
 
     def test_before_during_and_after_training(self, page: EventAccumulator) -> None:
@@ -157,7 +159,7 @@ class _NoOptimizer(th.optim.SGD):
     def __init__(self, params: Any, lr: float, eps: float = 0.0):
         super().__init__(params, lr)
 
-    def step(self, closure: Any = None) -> None:
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
         return None
 
 
@@ -431,11 +433,12 @@ def test_policies_of_others_are_refused() -> None:
         model.learn(60, callback=InspectionCallback(ToyTeams()))
 
 
-def test_a_strip_has_five_moments() -> None:
+def test_a_strip_has_six_moments_in_two_rows() -> None:
     frames = [np.full((40, 30, 3), shade, dtype=np.uint8) for shade in range(50)]
     strip = film.strip(frames)
-    assert strip.shape == (40, 5 * 30 + 4 * 6, 3)
-    assert strip[0, ::36, 0].tolist() == [0, 12, 24, 37, 49]
+    assert strip.shape == (2 * 40 + 6, 3 * 30 + 2 * 6, 3)
+    assert strip[0, ::36, 0].tolist() == [0, 10, 20]
+    assert strip[46, ::36, 0].tolist() == [29, 39, 49]
     assert film.strip(frames[:2]).shape == (40, 2 * 30 + 6, 3)
 
 

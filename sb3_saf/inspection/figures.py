@@ -44,7 +44,7 @@ def _figure(width: float, height: float, columns: int = 1, title: str = "") -> t
         figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
         axes = figure.subplots(1, columns, squeeze=False)
     if title:
-        figure.suptitle(title, fontsize=14)
+        figure.suptitle(title, fontsize=13)
     return figure, list(axes.flat)
 
 
@@ -88,7 +88,7 @@ def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
     :param colours: of the zones
     """
     n_zones, n_policies = table.shape
-    figure, (axes,) = _figure(6.4, 1.8 + 0.55 * max(3, n_zones), title="Which policy acts in which zone")
+    figure, (axes,) = _figure(5.6, 1.8 + 0.55 * max(3, n_zones), title="Which policy acts in which zone")
     _heat_map(axes, table, "chosen", vmax=1.0)
     _ticks(axes, [f"zone {zone}" for zone in range(n_zones)], [f"policy {policy}" for policy in range(n_policies)])
     if colours is not None:
@@ -108,7 +108,7 @@ def chosen_by_agent(table: Doubles) -> Figure:
     :param table: (N, U)
     """
     n_agents, n_policies = table.shape
-    figure, (axes,) = _figure(6.4, min(12.0, 1.8 + 0.42 * max(3, n_agents)), title="Which policy acts for which agent")
+    figure, (axes,) = _figure(5.6, min(12.0, 1.8 + 0.42 * max(3, n_agents)), title="Which policy acts for which agent")
     _heat_map(axes, table, "chosen", vmax=1.0)
     _ticks(axes, _numbers(n_agents), [f"policy {policy}" for policy in range(n_policies)])
     axes.set_ylabel("agent")
@@ -122,8 +122,8 @@ def policy_differences(table: Doubles) -> Figure:
     :param table: (U, U) Hellinger distances
     """
     names = [f"policy {policy}" for policy in range(len(table))]
-    figure, (axes,) = _figure(6.4, 4.6, title="How differently the policies act")
-    _heat_map(axes, table, "Hellinger distance (0 same, 1 nothing in common)", vmax=1.0, percent=False)
+    figure, (axes,) = _figure(5.6, 4.4, title="How differently policies act (0 alike, 1 never alike)")
+    _heat_map(axes, table, "Hellinger distance", vmax=1.0, percent=False)
     _ticks(axes, names, names)
     return figure
 
@@ -139,9 +139,10 @@ def attention(write: Attention, read: Attention) -> Figure:
     figure, (left, right) = _figure(
         min(16.0, 7.5 + 0.4 * n_agents), 2.0 + 0.5 * n_slots, 2, title="Knowledge source: mean attention"
     )
-    _heat_map(left, write.mean, "share of a slot's attention")
+    highest = float(max(np.nanmax(write.mean), np.nanmax(read.mean)))
+    _heat_map(left, write.mean, "share of a slot's attention", highest)
     left.set_title("writing: each row sums to 100 %")
-    _heat_map(right, read.mean.T, "share of an agent's attention")
+    _heat_map(right, read.mean.T, "share of an agent's attention", highest)
     right.set_title("reading: each column sums to 100 %")
     for axes in (left, right):
         _ticks(axes, [f"slot {slot}" for slot in range(n_slots)], _numbers(n_agents))
@@ -176,7 +177,9 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
     panels[0].set_ylabel("agent")
     from matplotlib.ticker import PercentFormatter
 
-    figure.colorbar(picture, ax=panels, label="attention", format=PercentFormatter(1.0, decimals=0))
+    figure.colorbar(
+        picture, ax=panels, label="attention", pad=0.01, aspect=12, format=PercentFormatter(1.0, decimals=0)
+    )
     return figure
 
 
@@ -189,7 +192,7 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Cali
     :param found: what they agree on
     :param unit: what returns count
     """
-    figure, (axes,) = _figure(6.4, 5.0, title="Critic calibration")
+    figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
     axes.scatter(values[few], returns[few], s=6, alpha=0.25, color=_GREY, linewidths=0, label="single steps")
     ends = [float(min(values.min(), returns.min())), float(max(values.max(), returns.max()))]
@@ -205,12 +208,12 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Cali
         ecolor=_BLUE,
         elinewidth=1.5,
         capsize=3,
-        label="mean of a tenth, ± standard deviation",
+        label="tenths: mean ± standard deviation",
     )
     of_unit = f" ({unit} per agent)" if unit else ""
-    axes.set(xlabel=f"value predicted{of_unit}", ylabel=f"discounted return that followed{of_unit}")
+    axes.set(xlabel=f"value{of_unit}", ylabel=f"discounted return{of_unit}")
     axes.set_title(_summary(found), fontsize=11, color=_ORANGE)
-    axes.legend(loc="upper left", fontsize=9, frameon=False)
+    axes.legend(loc="upper left", fontsize=10, frameon=False)
     return figure
 
 

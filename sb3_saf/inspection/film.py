@@ -1,4 +1,4 @@
-"""An episode as pictures: a strip of a few moments, and a GIF that plays in the page."""
+"""An episode as pictures: a few moments in two rows, and a GIF that plays in the page."""
 
 from __future__ import annotations
 
@@ -13,22 +13,30 @@ from sb3_saf.inspection.doors import Picture
 #: Pixels: height of a moment in the strip, and of the GIF.
 _HEIGHT: Final = 320
 _GAP: Final = 6
-_N_MOMENTS: Final = 5
+_N_MOMENTS: Final = 6
+_PER_ROW: Final = 3
 _SECONDS_PER_STEP: Final = 0.125
 _COLOURS: Final = 64
 
 
 def strip(pictures: Sequence[Picture]) -> Picture:
     """
-    A few moments, evenly spread from the first to the last, side by side.
+    Six moments, evenly spread from the first to the last, in two rows; fewer in one where there are no more.
 
     :param pictures: (height, width, 3) each
     :return: (height, width, 3)
     """
     chosen = np.unique(np.linspace(0, len(pictures) - 1, _N_MOMENTS).round().astype(int))
     moments = [_scaled(pictures[index]) for index in chosen]
-    gap = np.full((len(moments[0]), _GAP, 3), 255, dtype=np.uint8)
-    return np.concatenate([part for moment in moments for part in (moment, gap)][:-1], axis=1)
+    rows = [moments] if len(moments) < _N_MOMENTS else [moments[:_PER_ROW], moments[_PER_ROW:]]
+    return _joined([_joined(row, axis=1) for row in rows], axis=0)
+
+
+def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
+    """With white gaps."""
+    height, width, _ = pictures[0].shape
+    gap = np.full((height, _GAP, 3) if axis == 1 else (_GAP, width, 3), 255, dtype=np.uint8)
+    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
 
 
 def gif(pictures: Sequence[Picture]) -> bytes:

@@ -97,7 +97,8 @@ class Page:
                 layout[category] = kept
         band = ["team/return", "team/return_low", "team/return_high"]
         if set(band) <= set(tags):
-            layout["Team"] = {"team return, with 95 % interval": ["Margin", band], **layout["Team"]}
+            # A group of its own, because the page shows bands after all lines of their group.
+            layout = {"Team return": {"evaluation, with 95 % interval": ["Margin", band]}, **layout}
         zones = sorted({tag.rsplit("/", 1)[0] for tag in tags if tag.startswith("pool_by_zone/")})
         if zones:
             layout["Policy pool by zone"] = {
