@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from sb3_saf import InspectionCallback, TeamRolloutBuffer, make_team_env
+from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamMonitor, TeamRolloutBuffer, make_team_env
 from sb3_saf.common.policies import TeamPolicy
 from sb3_saf.common.teams import TeamSpaces
 from sb3_saf.inspection import film
@@ -35,7 +35,11 @@ from sb3_saf.saf.policies import SAFPolicy
 from sb3_saf.saf.policy_pool import PolicyPool, PoolOutput
 from tests.contrib_teams import MaskedTeams
 from tests.probe_envs import ConstantReward, DelayedReward, Message, Probe
+from tests.team_venv import TeamVenv
+from tests.test_active import ACTIVE, LIVES
+from tests.test_monitor import RETURN_OF_GAME_0, RETURN_OF_GAME_1
 from tests.test_probes import train as train_on_probe
+from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams
 
 LEVEL: dict[str, Any] = {"n_agents": 3, "grid_size": 9, "n_treasures": 30, "heterogeneity": 2, "max_cycles": 6}
@@ -296,6 +300,33 @@ class TestCritic:
         with th.no_grad():
             values = policy.predict_values({key: th.as_tensor(value) for key, value in obs.items()})  # type: ignore
         np.testing.assert_allclose(game.values[0], values.flatten().numpy(), rtol=1e-6)
+
+
+class TestWhatCounts:
+    def test_each_game_plays_its_share_of_episodes(self) -> None:
+        """Three episodes in two games of three and two steps: one and two."""
+        env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
+        game = play(env, hand_made(IPPOPolicy, env), n_episodes=3)
+        assert game.counted[:, ::3].T.tolist() == [[True, True, True, False], [True] * 4]
+        assert game.returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1]
+        assert game.lengths == [2, 3, 2]
+
+    def test_agents_that_take_no_part_do_not_count(self) -> None:
+        """Illegal actions stop this environment; agents die and join."""
+        env = make_team_env(TellingEnv(**LIVES), n_envs=2)
+        policy = hand_made(SAFPolicy, env)
+        game = play(env, policy, n_episodes=2)
+        active = np.array(ACTIVE, dtype=bool)
+        np.testing.assert_array_equal(game.counted, np.tile(active, 2))
+        # Agent 0 ends with step 3, and all with step 5; who is not there yet has nothing to end.
+        assert game.ends[:, 0].tolist() == [False, False, True, True, True]
+        assert game.ends[:, 2].tolist() == [False, False, False, False, True]
+        assert game.write is not None and game.actions is not None
+        assert ((game.write > 0) == active[:, np.newaxis, np.newaxis]).all()
+        legal = np.array(
+            [[(action + agent + step) % 2 == 0 for action in range(4)] for agent in (0,) for step in (0, 1)]
+        )
+        assert ((game.actions[:2, 0, 0] > -1e7) == legal).all()
 
 
 class ZonedProbe(Probe):
