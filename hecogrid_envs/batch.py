@@ -166,6 +166,11 @@ class GameBatch:
         return self._games.collected
 
     @property
+    def columns(self) -> npt.NDArray[np.int32]:
+        """(E, N) the column x in which each agent stands."""
+        return self._games.x
+
+    @property
     def order(self) -> npt.NDArray[np.int32]:
         """(E, N) the order in which agents acted in the last step."""
         return self._games.order

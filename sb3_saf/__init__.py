@@ -39,6 +39,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
     from sb3_saf.export.weights import load_weights
     from sb3_saf.export.writer import export_actors
+    from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.ippo.policies import IPPOPolicy
     from sb3_saf.mappo.policies import MAPPOPolicy
     from sb3_saf.registration import register_all
@@ -66,6 +67,7 @@ __all__ = [
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
+    "InspectionCallback",
     "LightEncoder",
     "MAPPOLstmPolicy",
     "MAPPOMaskablePolicy",
