@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3 import PPO
 
 from sb3_saf import SAFLstmPolicy, SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
@@ -27,6 +28,14 @@ class TwiceMaskedEnv(TellingEnv):
 
     def action_masks(self) -> dict[str, Any]:
         return {agent: np.arange(N_ACTIONS) >= 2 for agent in self.agents}
+
+
+class ShownMasksEnv(TellingEnv):
+    """Masks in observations or infos and no method that gives them."""
+
+    @property
+    def action_masks(self) -> Any:
+        raise AttributeError("this game has no action_masks()")
 
 
 def lively_env(env: Any = TellingEnv, **kwargs: Any) -> CentralizedValueWrapper:
@@ -179,3 +188,16 @@ def test_normalised_values_with_every_critic_and_agents_that_die(policy_kwargs: 
     ).learn(120)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     assert isinstance(model.action_space, spaces.Discrete)
+
+
+@pytest.mark.parametrize("masks", ["observation", "info"])
+def test_maskable_ppo_finds_the_masks_that_observations_show(masks: str) -> None:
+    """The game has no method action_masks(), and stops the test at the first illegal action."""
+    env = lively_env(ShownMasksEnv, masks=masks, deaths={}, joins={})
+    assert is_masking_supported(env)
+    obs: Any = env.reset()
+    np.testing.assert_array_equal(get_action_masks(env), obs["action_mask"] == 1)
+    settings: dict[str, Any] = {"n_steps": 10, "batch_size": 30, "n_epochs": 1, "seed": 0, "device": "cpu"}
+    model = MaskablePPO("MAPPOMaskablePolicy", env, policy_kwargs=small_policy(), **settings).learn(60)
+    assert evaluate_team(model, lively_env(ShownMasksEnv, masks=masks, deaths={}, joins={}), 2).lengths == [5, 5]
+    assert not is_masking_supported(lively_env(ShownMasksEnv, masks=None))
