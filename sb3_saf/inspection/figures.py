@@ -36,13 +36,13 @@ _STYLE: Final[dict[Any, Any]] = {
 }
 
 
-def _figure(width: float, height: float, columns: int = 1, title: str = "") -> tuple[Figure, list[Axes]]:
+def _figure(width: float, height: float, rows: int = 1, title: str = "") -> tuple[Figure, list[Axes]]:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE):
         figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
-        axes = figure.subplots(1, columns, squeeze=False)
+        axes = figure.subplots(rows, 1, squeeze=False, sharex=True)
     if title:
         figure.suptitle(title, fontsize=13)
     return figure, list(axes.flat)
@@ -136,17 +136,15 @@ def attention(write: Attention, read: Attention) -> Figure:
     :param read: (N, L)
     """
     n_slots, n_agents = write.mean.shape
-    figure, (left, right) = _figure(
-        min(16.0, 7.5 + 0.4 * n_agents), 2.0 + 0.5 * n_slots, 2, title="Knowledge source: mean attention"
-    )
-    highest = float(max(np.nanmax(write.mean), np.nanmax(read.mean)))
-    _heat_map(left, write.mean, "share of a slot's attention", highest)
-    left.set_title("writing: each row sums to 100 %")
-    _heat_map(right, read.mean.T, "share of an agent's attention", highest)
-    right.set_title("reading: each column sums to 100 %")
-    for axes in (left, right):
+    width, height = min(14.0, 4.2 + 0.28 * n_agents), 2.4 + 0.7 * n_slots
+    figure, (above, below) = _figure(width, height, 2, title="Knowledge source: mean attention")
+    _heat_map(above, write.mean, "attention")
+    above.set_title("writing: each row sums to 100 %")
+    _heat_map(below, read.mean.T, "attention")
+    below.set_title("reading: each column sums to 100 %")
+    for axes in (above, below):
         _ticks(axes, [f"slot {slot}" for slot in range(n_slots)], _numbers(n_agents))
-        axes.set_xlabel("agent")
+    below.set_xlabel("agent")
     return figure
 
 
@@ -158,9 +156,8 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
     """
     n_steps, n_slots, n_agents = write.shape
     n_shown = min(n_slots, 6)
-    figure, panels = _figure(
-        3.2 * n_shown + 0.8, 1.9 + 0.22 * min(n_agents, 20), n_shown, title="Who writes to which slot, in one episode"
-    )
+    height = 1.4 + n_shown * (0.35 + 0.12 * min(n_agents, 20))
+    figure, panels = _figure(5.6, height, n_shown, title="Who writes to which slot, in one episode")
     highest = float(write.max())
     for slot, axes in enumerate(panels):
         picture = axes.imshow(
@@ -172,13 +169,13 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
             interpolation="nearest",
             extent=(0, n_steps, n_agents - 0.5, -0.5),
         )
-        axes.set(title=f"slot {slot}", xlabel="game step")
-        axes.set_yticks(range(n_agents), _numbers(n_agents) if slot == 0 else [""] * n_agents)
-    panels[0].set_ylabel("agent")
+        axes.set_ylabel(f"slot {slot}\nagent")
+        axes.set_yticks([0, n_agents - 1])
+    panels[-1].set_xlabel("game step")
     from matplotlib.ticker import PercentFormatter
 
     figure.colorbar(
-        picture, ax=panels, label="attention", pad=0.01, aspect=12, format=PercentFormatter(1.0, decimals=0)
+        picture, ax=panels, label="attention", pad=0.02, aspect=25, format=PercentFormatter(1.0, decimals=0)
     )
     return figure
 

@@ -21,9 +21,8 @@ _NOT_FOR: Final = ("stdout", "log", "json", "csv")
 #: Charts of the custom scalars page: group, chart, regular expressions of tags.
 _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
     "Team": {
-        "share of what can be collected": [r"team/share_of_.*"],
-        "episode length (game steps)": [r"team/episode_length"],
-        "training: mean team return of the last 100 episodes": [r"rollout/ep_rew_mean"],
+        "training: mean return of the last 100 episodes": [r"rollout/ep_rew_mean"],
+        "evaluation: episode length (game steps)": [r"team/episode_length"],
         "training: game steps per second": [r"time/game_steps_per_second"],
     },
     "Policy pool": {
