@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import configparser
 import inspect
+import subprocess
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -260,3 +263,17 @@ def test_monitor_is_left_in_the_folder_and_time_limit_reaches_the_wrapper(tmp_pa
 
 def test_runs_decide_what_settings_cannot_name() -> None:
     assert {"env", "seed", "device", "verbose", "policy", "tensorboard_log"}.isdisjoint(algorithm_arguments(PPO))
+
+
+def test_every_file_is_installed_with_the_packages() -> None:
+    config = configparser.ConfigParser()
+    config.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
+    assert config["options.package_data"]["zoo_configs"] == "*.yml"
+    assert "zoo_configs*" in config["options.packages.find"]["include"].split()
+
+
+def test_settings_need_neither_rl_zoo_nor_optuna() -> None:
+    code = "import sb3_saf.zoo.settings, sys; print(*{name.partition('.')[0] for name in sys.modules})"
+    root = Path(__file__).parents[1]
+    result = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert {"rl_zoo3", "optuna", "matplotlib", "pandas"}.isdisjoint(result.stdout.split())
