@@ -16,7 +16,8 @@ project = "sb3-saf"
 author = "sb3-saf contributors"
 copyright = f"2026, {author}"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
+extensions = ["docs.mathml", "myst_parser", "sphinx.ext.autodoc"]
+html_math_renderer = "mathml"
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["tools"]
 html_theme = "furo"
