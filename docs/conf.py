@@ -48,8 +48,7 @@ def _insert_docstrings(app: Sphinx, docname: str, source: list[str]) -> None:
     lines = source[0].splitlines()
     if any(line.startswith(DOCSTRING_LINE) for line in lines):
         source[0] = "\n".join(
-            _docstring(line.removeprefix(DOCSTRING_LINE)) if line.startswith(DOCSTRING_LINE) else line
-            for line in lines
+            _docstring(line.removeprefix(DOCSTRING_LINE)) if line.startswith(DOCSTRING_LINE) else line for line in lines
         )
 
 

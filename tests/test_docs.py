@@ -75,7 +75,7 @@ def test_links_inside_the_repository_resolve(page: Path) -> None:
 def test_names_of_ours_exist(page: Path) -> None:
     """``sb3_saf.X`` and ``hecogrid_envs.X.Y`` anywhere on the page, imports in code included."""
     text = page.read_text(encoding="utf-8")
-    for name in set(re.findall(r"\b(?:sb3_saf|hecogrid_envs)(?:\.[A-Za-z_]\w*)+", text)):
+    for name in set(re.findall(r"(?<![\w/])(?:sb3_saf|hecogrid_envs)(?:\.[A-Za-z_]\w*)+", text)):
         assert exists(name), f"{name} does not exist"
     for code in blocks(page, "python"):
         for node in ast.walk(ast.parse(code)):
@@ -142,7 +142,9 @@ def test_parameter_table_is_the_programs() -> None:
 
 
 def test_broken_links_of_a_site_are_found(tmp_path: Path) -> None:
-    (tmp_path / "index.html").write_text('<p id="here"></p><a href="#here">1</a><a href="#no">2</a><a href="b.html">3</a>')
+    (tmp_path / "index.html").write_text(
+        '<p id="here"></p><a href="#here">1</a><a href="#no">2</a><a href="b.html">3</a>'
+    )
     (tmp_path / "other.html").write_text('<a href="index.html#here">4</a><a href="https://example.org/x">5</a>')
     found = check(tmp_path)
     assert found.broken == ["index.html: #no", "index.html: b.html"]

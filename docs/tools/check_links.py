@@ -80,7 +80,7 @@ def check(folder: Path) -> Found:
     folder = folder.resolve()
     pages = {path.resolve(): read_page(path) for path in sorted(folder.rglob("*.html"))}
     found = Found(len(pages), sum(map(len, _internal(pages).values())), [], set())
-    for path, page in pages.items():
+    for page in pages.values():
         found.external.update(link for link in page.links if urlsplit(link).scheme in ("http", "https"))
     for path, links in _internal(pages).items():
         found.broken.extend(f"{path.relative_to(folder)}: {link}" for link in links if not _leads(path, link, pages))
