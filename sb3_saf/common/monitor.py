@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Mapping
-from typing import Any, TextIO
+from typing import IO, Any
 
 import numpy as np
 from stable_baselines3.common.monitor import ResultsWriter
@@ -155,14 +155,14 @@ class TeamMonitor(TeamVecEnvWrapper):
         super().close()
 
 
-def _synced_size(file: TextIO) -> int:
+def _synced_size(file: IO[Any]) -> int:
     """Bytes of a file that are surely on the disk."""
     file.flush()
     os.fsync(file.fileno())
     return os.fstat(file.fileno()).st_size
 
 
-def _cut(file: TextIO, size: int) -> None:
+def _cut(file: IO[Any], size: int) -> None:
     found = os.fstat(file.fileno()).st_size
     if found < size:
         warnings.warn(
