@@ -22,6 +22,9 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
+    from sb3_saf.checkpoints.callback import TeamCheckpointCallback
+    from sb3_saf.checkpoints.errors import CheckpointError
+    from sb3_saf.checkpoints.learning import resumable_learn, resume
     from sb3_saf.common.buffers import TeamRolloutBuffer
     from sb3_saf.common.callbacks import TeamEvalCallback
     from sb3_saf.common.centralized import CentralizedValueWrapper
@@ -62,6 +65,7 @@ except PackageNotFoundError:  # run from a checkout that was never installed
 __all__ = [
     "Actor",
     "CentralizedValueWrapper",
+    "CheckpointError",
     "EvaluationResult",
     "ExportError",
     "IPPOLstmPolicy",
@@ -79,6 +83,7 @@ __all__ = [
     "SAFLstmPolicy",
     "SAFMaskablePolicy",
     "SAFPolicy",
+    "TeamCheckpointCallback",
     "TeamEvalCallback",
     "TeamMonitor",
     "TeamRolloutBuffer",
@@ -88,4 +93,6 @@ __all__ = [
     "export_actors",
     "load_weights",
     "make_team_env",
+    "resumable_learn",
+    "resume",
 ]
