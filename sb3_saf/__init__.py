@@ -41,6 +41,9 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.export.writer import export_actors
     from sb3_saf.ippo.policies import IPPOPolicy
     from sb3_saf.mappo.policies import MAPPOPolicy
+    from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
+    from sb3_saf.qplex.qplex import QPLEX
+    from sb3_saf.qplex.replay_buffer import TeamReplayBuffer
     from sb3_saf.registration import register_all
     from sb3_saf.saf.policies import SAFPolicy
 
@@ -59,6 +62,7 @@ except PackageNotFoundError:  # run from a checkout that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
+    "QPLEX",
     "Actor",
     "CentralizedValueWrapper",
     "EvaluationResult",
@@ -73,12 +77,16 @@ __all__ = [
     "MLPEncoder",
     "ObservationEncoder",
     "PaperCNN",
+    "QPLEXLstmPolicy",
+    "QPLEXPolicy",
+    "QPLEXPoolPolicy",
     "RandomPolicy",
     "SAFLstmPolicy",
     "SAFMaskablePolicy",
     "SAFPolicy",
     "TeamEvalCallback",
     "TeamMonitor",
+    "TeamReplayBuffer",
     "TeamRolloutBuffer",
     "confidence_interval",
     "evaluate_policy",
