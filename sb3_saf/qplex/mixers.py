@@ -10,7 +10,9 @@ Letters: G team steps, N agents, A actions, S size of the state, K attention ker
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from difflib import get_close_matches
+from itertools import pairwise
 from typing import Final, Literal, NamedTuple, get_args
 
 import torch as th
@@ -107,27 +109,52 @@ class QMIXMixer(Mixer):
         return Mixed(q_tot)
 
 
-class AttentionKernel(nn.Module):
+class ParallelMLPs(nn.Module):
     """
-    One summand of lambda: |key(s)| sigmoid(agents_i(s)) sigmoid(action_i(s, a)).
+    K networks of one shape, computed at once.
+
+    :param count: K
+    :param sizes: inputs, hidden layers, outputs of each; ReLU in between
+    """
+
+    def __init__(self, count: int, sizes: Sequence[int]):
+        super().__init__()
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for n_in, n_out in pairwise(sizes):
+            bound = n_in**-0.5  # as torch starts its linear layers
+            self.weights.append(nn.Parameter(th.empty(count, n_in, n_out).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(th.empty(count, 1, n_out).uniform_(-bound, bound)))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """(G, inputs) to (K, G, outputs)."""
+        x = x.expand(len(self.weights[0]), *x.shape)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = th.baddbmm(bias, nn.functional.relu(x) if i else x, weight)
+        return x
+
+
+class AttentionKernels(nn.Module):
+    """
+    lambda_i(s, a) = sum over K kernels of |key_k(s)| sigmoid(agents_ki(s)) sigmoid(action_ki(s, a)).
 
     :param state_dim: S
     :param n_agents: N
     :param n_actions: A
-    :param hidden: sizes of the hidden layers of the three networks
+    :param n_kernels: K
+    :param hidden: sizes of the hidden layers of the networks of each kernel
     """
 
-    def __init__(self, state_dim: int, n_agents: int, n_actions: int, hidden: tuple[int, ...]):
+    def __init__(self, state_dim: int, n_agents: int, n_actions: int, n_kernels: int, hidden: tuple[int, ...]):
         super().__init__()
-        self.key = mlp([state_dim, *hidden, 1], nn.ReLU)
-        self.agents = mlp([state_dim, *hidden, n_agents], nn.ReLU)
-        self.action = mlp([state_dim + n_agents * n_actions, *hidden, n_agents], nn.ReLU)
+        self.key = ParallelMLPs(n_kernels, [state_dim, *hidden, 1])
+        self.agents = ParallelMLPs(n_kernels, [state_dim, *hidden, n_agents])
+        self.action = ParallelMLPs(n_kernels, [state_dim + n_agents * n_actions, *hidden, n_agents])
 
     def forward(self, state: th.Tensor, state_and_actions: th.Tensor) -> th.Tensor:
         """(G, N): (G, S) and (G, S + N A)."""
         key = self.key(state).abs() + _EPSILON
         weights: th.Tensor = key * self.agents(state).sigmoid() * self.action(state_and_actions).sigmoid()
-        return weights
+        return weights.sum(dim=0)
 
 
 class QPLEXMixer(Mixer):
@@ -162,9 +189,7 @@ class QPLEXMixer(Mixer):
         self.n_actions = n_actions
         self.scale = mlp([state_dim, hidden, n_agents], nn.ReLU)
         self.shift = mlp([state_dim, hidden, n_agents], nn.ReLU)
-        self.kernels = nn.ModuleList(
-            AttentionKernel(state_dim, n_agents, n_actions, kernel_hidden) for _ in range(n_kernels)
-        )
+        self.kernels = AttentionKernels(state_dim, n_agents, n_actions, n_kernels, kernel_hidden)
 
     def forward(self, state: th.Tensor, choice: JointChoice) -> Mixed:
         """See :class:`Mixer`."""
@@ -186,8 +211,8 @@ class QPLEXMixer(Mixer):
         actions = nn.functional.one_hot(choice.actions, self.n_actions).to(state.dtype)
         if choice.active is not None:
             actions = actions * choice.active.unsqueeze(2)
-        both = th.cat([state, actions.flatten(1)], dim=1)
-        return th.stack([kernel(state, both) for kernel in self.kernels]).sum(dim=0)
+        weights: th.Tensor = self.kernels(state, th.cat([state, actions.flatten(1)], dim=1))
+        return weights
 
 
 def check_mixer(name: object) -> None:

@@ -67,8 +67,8 @@ class QPLEXPolicy(TeamRowsPolicy):
     :param features_extractor_class: encoder, built on the space of ``obs``
     :param features_extractor_kwargs: its further arguments
     :param normalize_images: whether pictures are divided by 255
-    :param optimizer_class: optimizer
-    :param optimizer_kwargs: its arguments, but for the learning rate
+    :param optimizer_class: optimizer; RMSprop as published, without which the matrix game of docs/qplex.md is not solved
+    :param optimizer_kwargs: its arguments, but for the learning rate; None for the published ones of RMSprop
     :param kwargs: fields of :class:`QPLEXParts`
     """
 
@@ -95,7 +95,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
         normalize_images: bool = True,
-        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.RMSprop,
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -110,7 +110,7 @@ class QPLEXPolicy(TeamRowsPolicy):
             dict(features_extractor_kwargs or {}),
             normalize_images=normalize_images,
             optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
+            optimizer_kwargs=_optimizer_kwargs(optimizer_class, optimizer_kwargs),
         )
         self.net_arch = [128, 128] if net_arch is None else list(net_arch)
         self.activation_fn, self.ortho_init = activation_fn, ortho_init
@@ -243,6 +243,14 @@ class QPLEXPolicy(TeamRowsPolicy):
         hidden, cell = memory(memory.inputs(features, last, agent), remembered)
         actions = q_values(self.actor, hidden, agent, self._action_mask(obs)).argmax(dim=1).cpu().numpy()
         return actions, (hidden.cpu().numpy(), cell.cpu().numpy(), actions.copy())
+
+
+def _optimizer_kwargs(
+    optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any] | None
+) -> dict[str, Any] | None:
+    if kwargs is None and optimizer_class is th.optim.RMSprop:
+        return {"alpha": 0.99, "eps": 1e-5}
+    return kwargs
 
 
 class QPLEXPoolPolicy(QPLEXPolicy):
