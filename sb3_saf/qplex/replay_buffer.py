@@ -6,6 +6,7 @@ Letters: S slots, E games, N agents, A actions, G sampled team steps. A *team st
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
@@ -38,6 +39,16 @@ Indices = npt.NDArray[np.int64]
 
 _TRUNCATED: Final = "TimeLimit.truncated"
 _NO_ACTION: Final = -1
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that are free; None where nobody knows."""
+    if psutil is not None:
+        return int(psutil.virtual_memory().available)
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # not Linux
+        return None
 
 
 class TeamSteps(NamedTuple):
@@ -181,7 +192,7 @@ class TeamReplayBuffer(ReplayBuffer):
         return self.size() * self.n_games
 
     def _check_memory(self) -> None:
-        available = None if psutil is None else psutil.virtual_memory().available
+        available = free_memory()
         if available is not None and self.nbytes > available:
             warnings.warn(
                 f"The replay buffer of {self.buffer_size * self.n_games} game steps takes {self.nbytes / 1e9:.2f} GB, "
