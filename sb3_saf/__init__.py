@@ -45,6 +45,9 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.ippo.policies import IPPOPolicy
     from sb3_saf.mappo.policies import MAPPOPolicy
+    from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
+    from sb3_saf.qplex.qplex import QPLEX
+    from sb3_saf.qplex.replay_buffer import TeamReplayBuffer
     from sb3_saf.registration import register_all
     from sb3_saf.saf.policies import SAFPolicy
 
@@ -63,6 +66,7 @@ except PackageNotFoundError:  # run from a checkout that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
+    "QPLEX",
     "Actor",
     "CentralizedValueWrapper",
     "CheckpointError",
@@ -79,6 +83,9 @@ __all__ = [
     "MLPEncoder",
     "ObservationEncoder",
     "PaperCNN",
+    "QPLEXLstmPolicy",
+    "QPLEXPolicy",
+    "QPLEXPoolPolicy",
     "RandomPolicy",
     "SAFLstmPolicy",
     "SAFMaskablePolicy",
@@ -86,6 +93,7 @@ __all__ = [
     "TeamCheckpointCallback",
     "TeamEvalCallback",
     "TeamMonitor",
+    "TeamReplayBuffer",
     "TeamRolloutBuffer",
     "confidence_interval",
     "evaluate_policy",

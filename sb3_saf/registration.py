@@ -15,6 +15,8 @@ from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SA
 from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
 from sb3_saf.ippo.policies import IPPOPolicy
 from sb3_saf.mappo.policies import MAPPOPolicy
+from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
+from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.saf.policies import SAFPolicy
 
 #: Which names each algorithm learns. SB3 keeps one dict per algorithm.
@@ -25,6 +27,7 @@ POLICIES: Final[dict[type[BaseAlgorithm], dict[str, type[BasePolicy]]]] = {
         (A2C, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
         (TRPO, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
         (RecurrentPPO, (IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy)),
+        (QPLEX, (QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy)),
         (MaskablePPO, (IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy)),
     )
 }

@@ -1,6 +1,6 @@
 """
 What the policies of SAF, MAPPO and IPPO share, for rows that carry their team's joint view: all of their construction
-and reading of rows (``TeamPolicy``), and SB3's ActorCriticPolicy of them (``TeamActorCriticPolicy``).
+(``TeamPolicy``), and SB3's ActorCriticPolicy of them (``TeamActorCriticPolicy``).
 
 The actor reads ``obs`` (and ``agent``, with one head per agent); only the critic reads ``team``. Letters: B rows, N
 agents.
@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from functools import partial
 from typing import Any, ClassVar, Final
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
@@ -29,18 +27,11 @@ from sb3_saf.common.actor import ActionHead, Actor
 from sb3_saf.common.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.common.encoders import ObservationEncoder
 from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
-from sb3_saf.common.parts import NetworkSpec, TeamParts, check_at_least_one
-from sb3_saf.common.teams import (
-    ACTION_MASK_KEY,
-    ACTIVE_KEY,
-    AGENT_KEY,
-    OBS_KEY,
-    STATE_KEY,
-    TEAM_KEY,
-    TeamSpaces,
-)
+from sb3_saf.common.parts import NetworkSpec, TeamParts
+from sb3_saf.common.row_policy import TeamRowsPolicy, entry_of, take_named
+from sb3_saf.common.teams import STATE_KEY
 from sb3_saf.common.value_normalizer import ValueNormalizer
-from sb3_saf.common.views import OwnViews, ViewEncoder
+from sb3_saf.common.views import OwnViews
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -48,7 +39,7 @@ NetArch = list[int] | dict[str, list[int]]
 _SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
 
 
-class TeamPolicy(BasePolicy):
+class TeamPolicy(TeamRowsPolicy):
     """
     Base of policies on rows of teams: one row is one agent in one game at one step.
 
@@ -112,21 +103,15 @@ class TeamPolicy(BasePolicy):
         **kwargs: Any,
     ):
         _refuse(use_sde=use_sde, share_features_extractor=share_features_extractor)
-        if chunk_size is not None:
-            check_at_least_one("chunk_size", chunk_size)
-        self.team_spaces = TeamSpaces.from_observation_space(observation_space)
-        _check_masks(self.team_spaces, action_space)
+        self._read_rows_of(observation_space, action_space, distinct, chunk_size)
         self._warned_of_idle_rows = False
-        self.parts = self.parts_class(**_taken(kwargs, {field.name for field in fields(self.parts_class)}))
-        self.chunk_size = chunk_size
-        self.distinct = distinct
+        self.parts = self.parts_class(**take_named(kwargs, {field.name for field in fields(self.parts_class)}))
         if normalize_values and not self.normalizes_values:
             raise ValueError(
                 f"normalize_values=True needs TeamRolloutBuffer, which the algorithms of {type(self).__name__} do not "
                 "take; leave normalize_values=False, or use PPO with SAFPolicy, MAPPOPolicy or IPPOPolicy"
             )
         self.normalize_values = normalize_values
-        self.views = ViewEncoder(self._encode, distinct)
         # The next class in line is SB3's or sb3-contrib's, which takes more than BasePolicy.
         super().__init__(
             observation_space,
@@ -139,10 +124,6 @@ class TeamPolicy(BasePolicy):
         )
 
     # --- construction -----------------------------------------------------------------------------------------------
-
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Make the encoder, for the observations of one agent."""
-        return self.features_extractor_class(self.team_spaces.own, **self.features_extractor_kwargs)
 
     def _build(self, lr_schedule: Schedule) -> None:
         # The critic comes last: policies of one seed that differ in the critic start with the same encoder and actor.
@@ -211,81 +192,6 @@ class TeamPolicy(BasePolicy):
         """
         return self._values(obs, None)
 
-    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor | None = None) -> th.Tensor:
-        """
-        Encode own observations.
-
-        :param obs: rows, or own observations alone
-        :param features_extractor: must be the policy's own, or None
-        :return: (B, d)
-        """
-        if features_extractor is not None and features_extractor is not self.features_extractor:
-            raise ValueError("a team policy encodes with its own features_extractor; call the other extractor directly")
-        own = self.views.own(self._own(obs))
-        return own.features[own.rows]
-
-    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        """
-        Make tensors of NumPy observations.
-
-        :param observation: rows, some of their entries, or own observations alone; a batch or a single one
-        :return: dict of tensors with a batch axis, and whether the observation was a batch
-        """
-        entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
-        keys = self.team_spaces.keys
-        unknown = [key for key in entries if key not in keys]
-        if unknown:
-            raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
-        arrays = {key: np.asarray(value) for key, value in entries.items()}
-        if AGENT_KEY in arrays:
-            arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
-        tensors, is_batch = super().obs_to_tensor(arrays)
-        assert isinstance(tensors, dict)
-        if len({len(tensor) for tensor in tensors.values()}) > 1:
-            lengths = ", ".join(f"{key!r} {len(tensor)}" for key, tensor in tensors.items())
-            raise ValueError(f"expected as many rows under each key of an observation, got {lengths}")
-        return tensors, is_batch
-
-    # --- reading rows -----------------------------------------------------------------------------------------------
-
-    def _own(self, obs: PyTorchObs) -> th.Tensor:
-        """(B, *shape) own observations."""
-        own = obs if isinstance(obs, th.Tensor) else _entry(obs, OBS_KEY, "the actor")
-        return own.reshape(-1, *self.team_spaces.own_shape)
-
-    def _team(self, obs: PyTorchObs) -> th.Tensor:
-        """(B, N, *shape) joint observations."""
-        return _entry(obs, TEAM_KEY, "the critic").reshape(-1, *self.team_spaces.team.shape)
-
-    def _agent(self, obs: PyTorchObs) -> th.Tensor:
-        """(B,) agents' indices; buffers give them as (B, 1), some as floats."""
-        return _entry(obs, AGENT_KEY, "a critic or head that depends on the agent").reshape(-1).long()
-
-    def _active(self, obs: PyTorchObs) -> th.Tensor | None:
-        """(B, N) bool, agents of the rows' teams that take part; None if all always do."""
-        if self.team_spaces.active is None:
-            return None
-        return _entry(obs, ACTIVE_KEY, "the critic").reshape(-1, self.team_spaces.n_agents) != 0
-
-    def _action_mask(self, obs: PyTorchObs, padded: bool = False) -> th.Tensor | None:
-        """(B, A) bool, the rows' legal actions; None if all always are. Only rows of a padding may have none."""
-        if self.team_spaces.action_mask is None:
-            return None
-        if isinstance(obs, th.Tensor) or ACTION_MASK_KEY not in obs:
-            raise ValueError(
-                f"expected {ACTION_MASK_KEY!r} beside {OBS_KEY!r}, because this policy was made for an environment "
-                f"with action masks; pass {{{OBS_KEY!r}: ..., {ACTION_MASK_KEY!r}: ...}}, one mask of "
-                f"{self.team_spaces.action_mask.n} zeros and ones per row"
-            )
-        mask = obs[ACTION_MASK_KEY].reshape(-1, *self.team_spaces.action_mask.shape) != 0
-        stuck = ~mask.any(dim=1)
-        if not padded and stuck.any():
-            raise ValueError(
-                f"expected at least one legal action in each {ACTION_MASK_KEY!r}, got none in row "
-                f"{int(stuck.nonzero()[0])} of {len(mask)}"
-            )
-        return mask
-
     def _warn_of_idle_rows(self, obs: PyTorchObs) -> None:
         """Rows of agents that take no part come from buffers that do not leave them out."""
         if self.team_spaces.active is None or self._warned_of_idle_rows:
@@ -307,26 +213,6 @@ class TeamPolicy(BasePolicy):
                 UserWarning,
                 stacklevel=3,
             )
-
-    def _checked_agent(self, agent: np.ndarray) -> np.ndarray:
-        n_agents = self.team_spaces.n_agents
-        agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
-        if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
-            raise ValueError(f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}")
-        return agent
-
-    def _encode(self, observations: th.Tensor) -> th.Tensor:
-        """(K, d) features of own observations (K, *shape)."""
-        return self._in_chunks(self.features_extractor, observations, self.team_spaces.own)
-
-    def _in_chunks(
-        self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
-    ) -> th.Tensor:
-        """(K, ...) what a module makes of preprocessed observations (K, *shape)."""
-        on_cpu = observations.device.type == "cpu"
-        parts = th.split(observations, self.chunk_size if self.chunk_size and on_cpu else max(1, len(observations)))
-        results = [module(preprocess_obs(part, space, self.normalize_images)) for part in parts]
-        return results[0] if len(results) == 1 else th.cat(results)
 
     def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
         """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
@@ -368,7 +254,7 @@ class TeamPolicy(BasePolicy):
         """(B,) values, each distinct state encoded once."""
         space = self.team_spaces.state
         assert space is not None
-        states = _entry(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
+        states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
         found = self.views.find(states)
         return self._in_chunks(critic, states[found.index], space)[found.inverse, self._agent(obs)]
 
@@ -419,25 +305,6 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
         return self._distribution(obs, self.views.own(self._own(obs)))
 
 
-def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:
-    mask = team.action_mask
-    if mask is not None and not (isinstance(action_space, spaces.Discrete) and mask.n == action_space.n):
-        raise ValueError(
-            f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A) where actions are Discrete(A), got {mask} for "
-            f"{action_space}"
-        )
-
-
-def _entry(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
-    if isinstance(obs, th.Tensor) or key not in obs:
-        raise ValueError(
-            f"expected the observation to have {key!r}, which {reader} reads, got "
-            f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs))}; pass whole rows of "
-            "sb3_saf.CentralizedValueWrapper"
-        )
-    return obs[key]
-
-
 def _refuse(use_sde: bool, share_features_extractor: bool) -> None:
     if use_sde:
         raise ValueError("team policies have no state-dependent exploration (gSDE): leave use_sde=False")
@@ -445,11 +312,6 @@ def _refuse(use_sde: bool, share_features_extractor: bool) -> None:
         raise ValueError(
             "team policies share the features extractor between actor and critic: leave share_features_extractor=True"
         )
-
-
-def _taken(kwargs: dict[str, Any], names: set[str]) -> dict[str, Any]:
-    """Take named entries out of ``kwargs``."""
-    return {name: kwargs.pop(name) for name in list(kwargs) if name in names}
 
 
 def _hidden_sizes(net_arch: NetArch) -> tuple[list[int], list[int]]:

@@ -35,8 +35,8 @@ class Outputs(NamedTuple):
 
     :param log_weights: (K, U) how likely each policy of the pool is to be chosen
     :param parameters: (K, U, P) parameters of each policy's action distribution: logits, or means and then log
-        standard deviations
-    :param log_probs: (K, A) of every action, for discrete actions
+        standard deviations; values of actions if the selection is greedy
+    :param log_probs: (K, A) of every action, for discrete actions that are drawn
     """
 
     log_weights: Array
@@ -94,12 +94,15 @@ def decide(action: dict[str, Any], selection: str, outputs: Outputs, draws: Draw
     Choose actions as the trained model's ``predict`` does.
 
     :param action: the action space, as in ``actor.json``
-    :param selection: ``"mixture"`` or ``"gumbel"``
+    :param selection: ``"mixture"``, ``"gumbel"``, or ``"greedy"`` if parameters are values of actions
     :param outputs: of the network
     :param draws: random numbers to sample with; None takes the most likely action
     :return: (K, ...) actions
     """
-    if draws is None:
+    if selection == "greedy":
+        # Values, not logits: there is nothing to draw.
+        chosen = _of_policy(outputs.parameters, outputs.log_weights.argmax(axis=1)).argmax(axis=1)
+    elif draws is None:
         chosen = _likeliest(action, selection, outputs)
     elif selection == "mixture" and outputs.log_probs is not None:
         chosen = draws.categorical(np.exp(outputs.log_probs))

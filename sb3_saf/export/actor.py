@@ -103,6 +103,7 @@ class Actor:
         :return: (A,), or (K, A) for a batch
         """
         outputs, is_batch = self._outputs(observation)
+        self._refuse_greedy()
         if outputs.log_probs is None:
             raise ValueError(f"{self.manifest.action.kind} actions have no list of probabilities; use log_prob")
         probabilities = np.exp(outputs.log_probs)
@@ -117,9 +118,14 @@ class Actor:
         :return: (), or (K,) for a batch
         """
         outputs, is_batch = self._outputs(observation)
+        self._refuse_greedy()
         actions = np.asarray(action).reshape(len(outputs.log_weights), -1)
         result = log_prob(self._action, outputs, actions)
         return result if is_batch else result[0]
+
+    def _refuse_greedy(self) -> None:
+        if self.manifest.selection == "greedy":
+            raise ValueError(f"{self.manifest.policy} has values of actions and takes the best: no action is drawn")
 
     def _outputs(self, observation: Any) -> tuple[Outputs, bool]:
         batch, is_batch = self._batch(observation)

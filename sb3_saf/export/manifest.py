@@ -44,7 +44,7 @@ ACTIVATION_NAMES: Final = (
     "Softplus",
     "Tanh",
 )
-SELECTIONS: Final = ("mixture", "gumbel")
+SELECTIONS: Final = ("mixture", "gumbel", "greedy")
 KINDS: Final = ("box", "discrete", "multi_discrete", "multi_binary")
 DTYPES: Final = tuple(
     ["bool", "float16", "float32", "float64"] + [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
@@ -268,7 +268,8 @@ class Manifest:
     :param policy: name of the policy class it was trained with, for people
     :param n_agents: N
     :param reads_agent: whether every agent has a policy of its own
-    :param selection: ``"mixture"`` or ``"gumbel"``
+    :param selection: ``"mixture"`` or ``"gumbel"``; ``"greedy"`` if parameters are values of actions, of which the best
+        is taken
     :param observation: space of one own observation
     :param action: action space
     :param encoder: the encoder; None if only the ONNX file knows
@@ -290,7 +291,7 @@ class Manifest:
     @property
     def gives_log_probs(self) -> bool:
         """Whether every action has a probability."""
-        return self.action.kind == "discrete"
+        return self.action.kind == "discrete" and self.selection != "greedy"
 
     def to_json(self) -> str:
         """The text of the file, its own checksum included."""
@@ -338,6 +339,8 @@ class Manifest:
             _refuse(f"{MANIFEST_FILE} names neither {WEIGHTS_FILE} nor {ONNX_FILE}")
         if self.actor is not None and self.reads_agent != (self.actor.name == "AgentPolicies"):
             _refuse(f"reads_agent must say whether the actor is AgentPolicies, got {self.reads_agent}")
+        if self.selection == "greedy" and self.action.kind != "discrete":
+            _refuse(f"selection 'greedy' needs discrete actions, got {self.action.kind}")
         if self.encoder is not None:
             _check_encoder(self.encoder, self.observation)
 

@@ -6,7 +6,7 @@ import copy
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +36,11 @@ from sb3_saf.export.manifest import (
     SpaceRecord,
 )
 from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor
+from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.saf.policy_pool import PolicyPool
+
+#: Policies whose actors read one agent's own observation and nothing else.
+ExportablePolicy: TypeAlias = TeamActorCriticPolicy | QPLEXPolicy
 
 #: Largest difference between the model's and the exported network's outputs, beside the outputs' own size.
 _TOLERANCE = 1e-4
@@ -44,7 +48,7 @@ _N_CHECKED = 16
 
 
 def export_actors(
-    model: BaseAlgorithm | TeamActorCriticPolicy,
+    model: BaseAlgorithm | ExportablePolicy,
     folder: str | PathLike[str],
     onnx: bool = True,
     overwrite: bool = False,
@@ -65,7 +69,7 @@ def export_actors(
     own, which no file can name, there is no ``actor.safetensors``: the ONNX graph is all. The folder appears whole or
     not at all; an earlier export in it is replaced.
 
-    :param model: PPO or A2C with SAFPolicy, MAPPOPolicy or IPPOPolicy, or the policy itself
+    :param model: PPO or A2C with SAFPolicy, MAPPOPolicy or IPPOPolicy, QPLEX without memory, or the policy itself
     :param folder: where to
     :param onnx: whether to write ``actor.onnx`` and ``act.py``, which needs ``pip install "sb3-saf[export]"``
     :param overwrite: whether to replace a folder that is not an export, with everything in it
@@ -100,11 +104,12 @@ def export_actors(
     return path
 
 
-def _checked_policy(model: object) -> TeamActorCriticPolicy:
+def _checked_policy(model: object) -> ExportablePolicy:
     policy = getattr(model, "policy", model)
-    if not isinstance(policy, TeamActorCriticPolicy):
+    if not isinstance(policy, (TeamActorCriticPolicy, QPLEXPolicy)):
         raise ExportError(
-            f"expected a model with SAFPolicy, MAPPOPolicy or IPPOPolicy, got {type(policy).__name__}; policies of "
+            f"expected a model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got "
+            f"{type(policy).__name__}; policies of "
             "Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
     if policy.team_spaces.action_mask is not None:
@@ -113,7 +118,7 @@ def _checked_policy(model: object) -> TeamActorCriticPolicy:
             "this model's environment; act with model.predict, or train without masks: "
             "make_team_env(..., action_masks=False)"
         )
-    if hasattr(policy, "lstm_actor"):
+    if hasattr(policy, "lstm_actor") or getattr(policy, "memory", None) is not None:
         raise ExportError("recurrent policies cannot be exported yet: their actors carry a hidden state")
     if type(policy.actor) not in (SinglePolicy, PolicyPool):
         raise ExportError(f"expected the actor SinglePolicy or PolicyPool, got {type(policy.actor).__name__}")
@@ -142,19 +147,18 @@ class _Described(NamedTuple):
         return self.actor.activation in ACTIVATIONS
 
     @classmethod
-    def of(cls, policy: TeamActorCriticPolicy) -> _Described:
+    def of(cls, policy: ExportablePolicy) -> _Described:
         own = policy.team_spaces.own
-        is_pool = isinstance(policy.actor, PolicyPool)
         return cls(
             encoder=_describe_encoder(policy),
             actor=_describe_actor(policy),
             features_dim=policy.features_dim,
-            selection=policy.actor.selection if isinstance(policy.actor, PolicyPool) and is_pool else "mixture",
+            selection=_selection(policy),
             observation=describe_space(own, "observation"),
             action=describe_space(policy.action_space, "action"),
         )
 
-    def network(self, policy: TeamActorCriticPolicy) -> ActorNetwork:
+    def network(self, policy: ExportablePolicy) -> ActorNetwork:
         """The network with the policy's weights, on the CPU."""
         encoder: nn.Module
         if self.encoder is None:
@@ -168,9 +172,10 @@ class _Described(NamedTuple):
         actor.load_state_dict(
             {name.removeprefix(prefix): tensor for name, tensor in policy.actor.state_dict().items()}, strict=True
         )
-        return ActorNetwork(encoder, actor, self.action.kind == "discrete").requires_grad_(False).eval()
+        gives_log_probs = self.action.kind == "discrete" and self.selection != "greedy"
+        return ActorNetwork(encoder, actor, gives_log_probs).requires_grad_(False).eval()
 
-    def manifest(self, policy: TeamActorCriticPolicy, data: dict[str, DataFile]) -> Manifest:
+    def manifest(self, policy: ExportablePolicy, data: dict[str, DataFile]) -> Manifest:
         """The manifest beside some files."""
         from sb3_saf import __version__
 
@@ -192,7 +197,7 @@ class _Described(NamedTuple):
 class _OwnExtractor(nn.Module):
     """A user's own features extractor on raw observations; only an ONNX graph can hold it."""
 
-    def __init__(self, policy: TeamActorCriticPolicy):
+    def __init__(self, policy: ExportablePolicy):
         super().__init__()
         self.space = policy.team_spaces.own
         self.normalize_images = policy.normalize_images
@@ -207,12 +212,18 @@ class _OwnExtractor(nn.Module):
 # --- describing -------------------------------------------------------------------------------------------------------
 
 
-def _inner_encoder(policy: TeamActorCriticPolicy) -> nn.Module:
+def _selection(policy: ExportablePolicy) -> str:
+    if isinstance(policy, QPLEXPolicy):
+        return "greedy"
+    return policy.actor.selection if isinstance(policy.actor, PolicyPool) else "mixture"
+
+
+def _inner_encoder(policy: ExportablePolicy) -> nn.Module:
     extractor = policy.features_extractor
     return extractor.encoder if type(extractor) is ObservationEncoder else extractor
 
 
-def _describe_encoder(policy: TeamActorCriticPolicy) -> EncoderNet | None:
+def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
     """None for an encoder that is not exactly one of ours: a subclass may do anything."""
     own, encoder = policy.team_spaces.own, _inner_encoder(policy)
     divide = bool(policy.normalize_images and isinstance(own, spaces.Box) and is_image_space(own))
@@ -233,7 +244,7 @@ def _describe_encoder(policy: TeamActorCriticPolicy) -> EncoderNet | None:
     return None
 
 
-def _encoder_tensors(policy: TeamActorCriticPolicy) -> dict[str, th.Tensor]:
+def _encoder_tensors(policy: ExportablePolicy) -> dict[str, th.Tensor]:
     tensors = dict(_inner_encoder(policy).state_dict())
     own: Any = policy.team_spaces.own
     if is_tile_space(own) and type(_inner_encoder(policy)) is not MLPEncoder:
@@ -242,7 +253,7 @@ def _encoder_tensors(policy: TeamActorCriticPolicy) -> dict[str, th.Tensor]:
     return tensors
 
 
-def _describe_actor(policy: TeamActorCriticPolicy) -> ActorNet:
+def _describe_actor(policy: ExportablePolicy) -> ActorNet:
     actor, activation = policy.actor, policy.activation_fn.__name__
     if ACTIVATIONS.get(activation) is not policy.activation_fn:
         activation = "one that no file can name"
@@ -318,7 +329,7 @@ def _some_observations(own: spaces.Space[Any]) -> th.Tensor:
     return th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))
 
 
-def _compare(policy: TeamActorCriticPolicy, network: ActorNetwork, observations: th.Tensor) -> tuple[th.Tensor, ...]:
+def _compare(policy: ExportablePolicy, network: ActorNetwork, observations: th.Tensor) -> tuple[th.Tensor, ...]:
     """The exported network's outputs, once they are known to be the model's."""
     was_training = policy.training
     policy.set_training_mode(False)

@@ -1,0 +1,195 @@
+"""
+The loss of QPLEX: the temporal-difference error of Q_tot, with double Q-learning and a target network.
+
+    y = r + gamma (1 - done) Q_tot_target(s', a'),   a'_i = the agent's own best legal action under the online networks
+
+Letters: G team steps, N agents, A actions, K distinct views, d features, H what heads read.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch as th
+from torch import nn
+
+from sb3_saf.common.distinct import Distinct
+from sb3_saf.qplex.heads import q_values
+from sb3_saf.qplex.mixers import JointChoice, Mixed
+from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
+from sb3_saf.qplex.replay_buffer import Sequences, TeamReplaySamples, TeamSteps
+
+
+class TeamError(NamedTuple):
+    """
+    The temporal-difference errors of G' team steps, those that the loss counts.
+
+    :param td: (G',) Q_tot - y
+    :param q_tot: (G',)
+    :param weights: (G', N) lambda_i, or None; zero for agents that take no part
+    """
+
+    td: th.Tensor
+    q_tot: th.Tensor
+    weights: th.Tensor | None
+
+    @property
+    def loss(self) -> th.Tensor:
+        """Mean of the squared errors, as published."""
+        return self.td.square().mean()
+
+
+class Features(NamedTuple):
+    """
+    What an encoder makes of two observations of each team.
+
+    :param now: (G, N, d) before the step
+    :param after: (G, N, d) after it
+    """
+
+    now: th.Tensor
+    after: th.Tensor
+
+
+class _Views(NamedTuple):
+    """
+    The distinct views of a batch; those that are seen before a step come first.
+
+    :param views: (K, *shape)
+    :param now: (G, N) which of them each agent sees before the step
+    :param after: (G, N) and after it
+    :param n_now: views that are seen before a step
+    """
+
+    views: th.Tensor
+    now: th.Tensor
+    after: th.Tensor
+    n_now: int
+
+    @classmethod
+    def of(cls, policy: QPLEXPolicy, samples: TeamReplaySamples) -> _Views:
+        """Find them."""
+        shape = samples.now.own.shape[:2]
+        both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
+        found: Distinct = policy.views.find(both)
+        now, after = found.inverse.view(2, *shape)
+        return cls(both[found.index], now, after, int(now.max()) + 1)
+
+
+def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -> TeamError:
+    """
+    Temporal-difference errors; the gradient goes into the online networks.
+
+    :param policy: with its online and target networks
+    :param samples: joint transitions
+    :param gamma: discount per game step
+    """
+    views = _Views.of(policy, samples)
+    online, latents = _online(policy, views, samples)
+    agent = _agents(samples.actions)
+    values = _q_values(policy.online, latents.now, agent, samples.now, draw=True)
+    mixed = _mix(policy, policy.online, values, samples.now, online.now, samples.actions)
+    with th.no_grad():
+        best = _q_values(policy.online, latents.after, agent, samples.after).argmax(dim=2)
+        features, remembered = _target(policy, views, samples)
+        following = _q_values(policy.target, remembered.after, agent, samples.after)
+        value = _mix(policy, policy.target, following, samples.after, features.after, best).q_tot
+        target = samples.rewards + gamma * (1.0 - samples.dones) * value
+    return _counted(TeamError(mixed.q_tot - target, mixed.q_tot, mixed.weights), samples.sequences)
+
+
+def _counted(error: TeamError, sequences: Sequences | None) -> TeamError:
+    if sequences is None:
+        return error
+    td, q_tot, weights = error
+    kept = sequences.counted
+    return TeamError(td[kept], q_tot[kept], None if weights is None else weights[kept])
+
+
+def _agents(actions: th.Tensor) -> th.Tensor:
+    """(G N,) indices of agents."""
+    n_steps, n_agents = actions.shape
+    return th.arange(n_agents, device=actions.device).repeat(n_steps)
+
+
+# --- encoding, each distinct view once per network --------------------------------------------------------------------
+
+
+def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
+    """Features and what heads read, of the online networks; views that are only seen after a step get no gradient."""
+    encoder = policy.online.encoder
+    known = policy.encode_with(encoder, views.views[: views.n_now])
+    with th.no_grad():
+        new = views.views[views.n_now :]
+        every = known.detach() if not len(new) else th.cat([known.detach(), policy.encode_with(encoder, new)])
+    features = Features(known[views.now], every[views.after])
+    return features, _recall(policy.online, features, samples)
+
+
+def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
+    """The same of the target networks. Without memory, only what is seen after a step is encoded."""
+    networks = policy.target
+    if networks.memory is not None:
+        every = policy.encode_with(networks.encoder, views.views)
+        features = Features(every[views.now], every[views.after])
+        return features, _recall(networks, features, samples)
+    seen, rows = views.after.unique(return_inverse=True)
+    after = policy.encode_with(networks.encoder, views.views[seen])[rows]
+    features = Features(after, after)  # nobody reads the target's features of before
+    return features, features
+
+
+def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples) -> Features:
+    """What heads read: the features, or what agents remember with them."""
+    memory, sequences = networks.memory, samples.sequences
+    if memory is None:
+        return features
+    assert sequences is not None, "agents that remember learn from sequences"
+    shape = samples.actions.shape
+    agent = _agents(samples.actions)
+    inputs = memory.inputs(features.now.flatten(0, 1), sequences.last_actions.flatten(), agent)
+    in_time = inputs.view(sequences.n, sequences.length, shape[1], -1)
+    hidden, cell = memory.unroll(in_time, sequences.resets.view(sequences.n, sequences.length))
+    # One step further from each step: exact also where the next step of the sequence is of another episode.
+    with th.no_grad():
+        further = memory.inputs(features.after.flatten(0, 1), samples.actions.flatten(), agent)
+        after, _ = memory(further, (hidden, cell))
+    return Features(hidden.view(*shape, -1), after.view(*shape, -1))
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def _q_values(
+    networks: QNetworks, latents: th.Tensor, agent: th.Tensor, steps: TeamSteps, draw: bool = False
+) -> th.Tensor:
+    """(G, N, A) values of agents' actions, -inf for illegal ones: (G, N, H)."""
+    masks = None if steps.masks is None else steps.masks.flatten(0, 1)
+    return q_values(networks.actor, latents.flatten(0, 1), agent, masks, draw).view(*latents.shape[:2], -1)
+
+
+def _mix(
+    policy: QPLEXPolicy,
+    networks: QNetworks,
+    values: th.Tensor,
+    steps: TeamSteps,
+    features: th.Tensor,
+    actions: th.Tensor,
+) -> Mixed:
+    """Q_tot of joint actions (G, N): (G, N, A) values and (G, N, d) features."""
+    chosen = values.gather(2, actions.unsqueeze(2)).squeeze(2)
+    choice = JointChoice(chosen, values.max(dim=2).values, actions, steps.active)
+    mixed: Mixed = networks.mixer(_state(policy, networks.state_encoder, steps, features), choice)
+    return mixed
+
+
+def _state(policy: QPLEXPolicy, state_encoder: nn.Module | None, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
+    """(G, S) what the mixer reads: the encoded state of the game, or the features of all agents."""
+    if state_encoder is not None:
+        assert steps.states is not None
+        return policy.encode_states(state_encoder, steps.states)
+    if policy.parts.detach_state:
+        features = features.detach()
+    if steps.active is not None:
+        features = features * steps.active.unsqueeze(2)
+    return features.flatten(1)

@@ -1,0 +1,121 @@
+"""What QPLEX is made of: heads, pool, memory and mixer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+from gymnasium import spaces
+from torch import nn
+
+from sb3_saf.common.actor import Actor, SinglePolicy
+from sb3_saf.common.critic import Heads
+from sb3_saf.common.parts import check_at_least_one, check_choice
+from sb3_saf.qplex.heads import AgentMemory
+from sb3_saf.qplex.mixers import Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer, check_mixer
+from sb3_saf.saf.policy_pool import PolicyPool
+
+
+@dataclass(frozen=True)
+class QPLEXParts:
+    """
+    The settings of a value-factorising algorithm.
+
+    :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``
+    :param heads: ``"shared"`` for one Q head that all agents use, ``"per_agent"`` for one each; a pool is always shared
+    :param n_policies: U, Q heads of the pool; 1 for none
+    :param latent_dim: d, size of the pool's queries and signature keys
+    :param projection_arch: hidden sizes of the pool's query network g_psel
+    :param mixer_hidden: hidden size of the mixer's networks
+    :param n_kernels: attention kernels of QPLEX's lambda
+    :param kernel_arch: hidden sizes of each kernel's networks
+    :param detach_state: whether the mixer's gradient stops before the agents' encoder
+    :param lstm_hidden_size: size of each agent's memory; 0 for none
+    :param sequence_length: with memory, game steps of a training sequence that the loss counts
+    :param burn_in: with memory, game steps before them that only warm up the memory; as many as an episode has mean
+        from its start
+    """
+
+    mixer: MixerName = "qplex"
+    heads: Heads = "shared"
+    n_policies: int = 1
+    latent_dim: int = 64
+    projection_arch: tuple[int, ...] = (128, 128)
+    mixer_hidden: int = 64
+    n_kernels: int = 4
+    kernel_arch: tuple[int, ...] = (64,)
+    detach_state: bool = True
+    lstm_hidden_size: int = 0
+    sequence_length: int = 16
+    burn_in: int = 8
+
+    def __post_init__(self) -> None:
+        check_mixer(self.mixer)
+        check_choice("heads", self.heads, get_args(Heads))
+        for name in ("n_policies", "latent_dim", "mixer_hidden", "n_kernels", "sequence_length"):
+            check_at_least_one(name, getattr(self, name))
+        for name in ("lstm_hidden_size", "burn_in"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
+        # Saved models may bring lists.
+        for name in ("projection_arch", "kernel_arch"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    def actor(
+        self,
+        features_dim: int,
+        n_agents: int,
+        action_space: spaces.Discrete,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+    ) -> Actor:
+        """The Q heads: an actor whose logits are Q values."""
+        if self.n_policies == 1:
+            heads = n_agents if self.heads == "per_agent" else None
+            return SinglePolicy(features_dim, action_space, hidden, activation_fn, n_agents=heads)
+        return PolicyPool(
+            features_dim,
+            action_space,
+            hidden,
+            activation_fn,
+            n_policies=self.n_policies,
+            selection="gumbel",
+            latent_dim=self.latent_dim,
+            projection_hidden=self.projection_arch,
+        )
+
+    def agent_memory(self, features_dim: int, action_space: spaces.Discrete, n_agents: int) -> AgentMemory | None:
+        """Each agent's memory, if any."""
+        if not self.lstm_hidden_size:
+            return None
+        return AgentMemory(features_dim, action_space, n_agents, self.lstm_hidden_size)
+
+    def make_mixer(self, state_dim: int, n_agents: int, n_actions: int) -> Mixer:
+        """
+        The mixer.
+
+        :param state_dim: size of the state that it reads
+        :param n_agents: N
+        :param n_actions: A
+        """
+        if self.mixer == "vdn":
+            return VDNMixer()
+        if self.mixer == "qmix":
+            return QMIXMixer(state_dim, n_agents, self.mixer_hidden)
+        return QPLEXMixer(state_dim, n_agents, n_actions, self.mixer_hidden, self.n_kernels, self.kernel_arch)
+
+
+@dataclass(frozen=True)
+class QPLEXPoolParts(QPLEXParts):
+    """QPLEX with a pool of as many heads as SAF has policies."""
+
+    n_policies: int = 4
+
+
+@dataclass(frozen=True)
+class QPLEXLstmParts(QPLEXParts):
+    """QPLEX with memory."""
+
+    lstm_hidden_size: int = 64

@@ -1,0 +1,276 @@
+"""Policies of QPLEX: the agents' Q networks, the mixer that reads the whole team, and their target copies."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_saf.common.actor import Actor
+from sb3_saf.common.encoders import ObservationEncoder
+from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
+from sb3_saf.common.row_policy import TeamRowsPolicy, take_named
+from sb3_saf.common.teams import Array
+from sb3_saf.qplex.heads import AgentMemory, q_values
+from sb3_saf.qplex.mixers import Mixer
+from sb3_saf.qplex.parts import QPLEXLstmParts, QPLEXParts, QPLEXPoolParts
+
+#: A recurrent policy's state: hidden (B, H), cell (B, H), last action (B,).
+State = tuple[Array, ...]
+
+
+class QNetworks(NamedTuple):
+    """
+    All networks of Q_tot.
+
+    :param encoder: own observations to features
+    :param memory: LSTM of each agent, or None
+    :param actor: Q heads
+    :param mixer: Q_i of all agents to Q_tot
+    :param state_encoder: states of games to what the mixer reads; None where it reads the agents' features
+    """
+
+    encoder: nn.Module
+    memory: AgentMemory | None
+    actor: Actor
+    mixer: Mixer
+    state_encoder: nn.Module | None
+
+
+class QPLEXPolicy(TeamRowsPolicy):
+    """
+    Policy of QPLEX, QMIX and VDN.
+
+    Acting reads each agent's own observation alone (``obs``; ``agent`` with one head per agent or with memory;
+    ``action_mask`` where observations have it). The mixer reads features of all agents, or the state of the game where
+    observations have one; only training uses it.
+
+    Beside these arguments, it takes the fields of :class:`QPLEXParts` by keyword, ``mixer`` among them.
+
+    :param observation_space: Dict observation space of ``CentralizedValueWrapper``
+    :param action_space: Discrete, counting from 0
+    :param lr_schedule: learning rate schedule
+    :param net_arch: hidden sizes of the Q heads
+    :param activation_fn: activation of hidden layers
+    :param ortho_init: whether encoder and heads start orthogonal, as those of SAF
+    :param distinct: False encodes every row, which gives the same numbers slowly
+    :param chunk_size: views encoded at once on the CPU; None for all
+    :param features_extractor_class: encoder, built on the space of ``obs``
+    :param features_extractor_kwargs: its further arguments
+    :param normalize_images: whether pictures are divided by 255
+    :param optimizer_class: optimizer; RMSprop as published; Adam does not solve the game of docs/qplex.md
+    :param optimizer_kwargs: its arguments, but for the learning rate; None for the published ones of RMSprop
+    :param kwargs: fields of :class:`QPLEXParts`
+    """
+
+    #: What differs between the policies: their parts' defaults.
+    parts_class: ClassVar[type[QPLEXParts]] = QPLEXParts
+
+    action_space: spaces.Discrete
+    features_extractor: BaseFeaturesExtractor
+    actor: Actor
+    memory: AgentMemory | None
+    state_encoder: nn.Module | None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        net_arch: list[int] | None = None,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        ortho_init: bool = True,
+        *,
+        distinct: bool = True,
+        chunk_size: int | None = 512,
+        features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
+        features_extractor_kwargs: Mapping[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.RMSprop,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        self._read_rows_of(observation_space, action_space, distinct, chunk_size)
+        self.parts = self.parts_class(**take_named(kwargs, {field.name for field in fields(self.parts_class)}))
+        if kwargs:
+            raise TypeError(f"{type(self).__name__} takes no argument {next(iter(kwargs))!r}")
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            dict(features_extractor_kwargs or {}),
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=_optimizer_kwargs(optimizer_class, optimizer_kwargs),
+        )
+        self.net_arch = [128, 128] if net_arch is None else list(net_arch)
+        self.activation_fn, self.ortho_init = activation_fn, ortho_init
+        self._build(lr_schedule)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.features_extractor = self.make_features_extractor()
+        self.features_dim = self.features_extractor.features_dim
+        parts, n_agents = self.parts, self.team_spaces.n_agents
+        self.memory = parts.agent_memory(self.features_dim, self.action_space, n_agents)
+        latent_dim = self.features_dim if self.memory is None else self.memory.hidden_size
+        self.actor = parts.actor(latent_dim, n_agents, self.action_space, self.net_arch, self.activation_fn)
+        if self.ortho_init:
+            self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
+            orthogonal_init(self.actor)
+        # The mixer comes last: policies of one seed that differ in it start with the same agents.
+        state = self.team_spaces.state
+        self.state_encoder = None if state is None else ObservationEncoder(state, self.features_dim)
+        state_dim = self.features_dim * (n_agents if state is None else 1)
+        self.mixer = parts.make_mixer(state_dim, n_agents, int(self.action_space.n))
+        learning = [module for module in self.online if module is not None]
+        self.target_networks = copy.deepcopy(nn.ModuleList(learning)).requires_grad_(False)
+        self.optimizer = self.optimizer_class(  # type: ignore[call-arg]
+            [parameter for module in learning for parameter in module.parameters()],
+            lr=lr_schedule(1),
+            **self.optimizer_kwargs,
+        )
+
+    @property
+    def online(self) -> QNetworks:
+        """The networks that learn and act."""
+        return QNetworks(self.features_extractor, self.memory, self.actor, self.mixer, self.state_encoder)
+
+    @property
+    def target(self) -> QNetworks:
+        """Their slower copies."""
+        copies = iter(self.target_networks)
+        parts = [None if module is None else next(copies) for module in self.online]
+        return QNetworks(*parts)  # type: ignore[arg-type]
+
+    def parameter_pairs(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+        """Parameters of the online networks, and of the target networks in the same order."""
+        online = [parameter for module in self.online if module is not None for parameter in module.parameters()]
+        return online, list(self.target_networks.parameters())
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        names = ("net_arch", "activation_fn", "ortho_init", "distinct", "chunk_size")
+        names += ("features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs")
+        own = {name: getattr(self, name) for name in names}
+        data = super()._get_constructor_parameters() | own | asdict(self.parts)
+        return data | {"lr_schedule": self._dummy_schedule}
+
+    # --- encoding ---------------------------------------------------------------------------------------------------
+
+    def encode_with(self, encoder: nn.Module, observations: th.Tensor) -> th.Tensor:
+        """(K, d) features of own observations (K, *shape), of the online or the target encoder."""
+        return self._in_chunks(encoder, observations, self.team_spaces.own)
+
+    def encode_states(self, encoder: nn.Module, states: th.Tensor) -> th.Tensor:
+        """(G, d) features of states (G, *state), each distinct one encoded once."""
+        assert self.team_spaces.state is not None
+        found = self.views.find(states)
+        return self._in_chunks(encoder, states[found.index], self.team_spaces.state)[found.inverse]
+
+    # --- acting -----------------------------------------------------------------------------------------------------
+
+    def own_q_values(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        Q_i of every action from own observations, without memory; -inf for illegal actions.
+
+        :param obs: rows, or own observations alone
+        :return: (B, A)
+        """
+        own = self.views.own(self._own(obs))
+        agent = self._agent(obs) if self.actor.reads_agent else None
+        values = self.views.per_agent(partial(q_values, self.actor), own, agent)
+        masks = self._action_mask(obs)
+        return values if masks is None else values.masked_fill(~masks, -th.inf)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = True) -> th.Tensor:
+        """(B,) greedy actions."""
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
+        """(B,) greedy actions; exploration is the algorithm's."""
+        return self.own_q_values(observation).argmax(dim=1)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, State | None]:
+        """
+        Act greedily, as SB3's ``predict``.
+
+        :param observation: rows, or own observations alone (with ``"agent"`` beside them where the policy remembers or
+            every agent has a head of its own); one or a batch
+        :param state: what a policy with memory gave after the last step: hidden state, cell state, last action. None at
+            the start
+        :param episode_start: (B,) where an episode starts, which forgets the state
+        :param deterministic: not read
+        :return: actions (B,) and the next state
+        """
+        if self.memory is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        self.set_training_mode(False)
+        obs, is_batch = self.obs_to_tensor(observation)
+        with th.no_grad():
+            actions, state = self._recall_and_act(self.memory, obs, state, episode_start)
+        return (actions if is_batch else actions.squeeze(axis=0)), state
+
+    def _recall_and_act(
+        self, memory: AgentMemory, obs: PyTorchObs, state: State | None, episode_start: np.ndarray | None
+    ) -> tuple[np.ndarray, State]:
+        own = self.views.own(self._own(obs))
+        features = own.features[own.rows]
+        last = th.full((len(features),), -1, dtype=th.long, device=features.device)
+        remembered = memory.empty(len(features), features)
+        if state is not None:
+            fresh = th.zeros_like(last, dtype=th.bool)
+            if episode_start is not None:
+                fresh = th.as_tensor(np.asarray(episode_start).astype(bool), device=features.device).reshape(-1)
+            hidden, cell, last_action = (th.as_tensor(part, device=features.device) for part in state)
+            keep = (~fresh).to(features.dtype).unsqueeze(1)
+            remembered = hidden * keep, cell * keep
+            last = last_action.long().masked_fill(fresh, -1)
+        agent = self._agent(obs)
+        hidden, cell = memory(memory.inputs(features, last, agent), remembered)
+        actions = q_values(self.actor, hidden, agent, self._action_mask(obs)).argmax(dim=1).cpu().numpy()
+        return actions, (hidden.cpu().numpy(), cell.cpu().numpy(), actions.copy())
+
+
+def _optimizer_kwargs(
+    optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any] | None
+) -> dict[str, Any] | None:
+    if kwargs is None and optimizer_class is th.optim.RMSprop:
+        return {"alpha": 0.99, "eps": 1e-5}
+    return kwargs
+
+
+class QPLEXPoolPolicy(QPLEXPolicy):
+    """
+    QPLEX with a pool: each agent's Q head is chosen from a shared pool by signature keys, as SAF's policies are.
+
+    Training draws the head (Gumbel noise, hard choice, straight-through gradient): heads learn in proportion to their
+    weights, none is starved, and Q_i, V_i and A_i of a row are always one head's, so the consistency of the mixer holds
+    for every draw. Acting and the targets of the loss take the favourite head: what is bootstrapped is the value of
+    what is executed. A mean of all heads would be consistent, too, but it is one larger head and not a choice.
+    """
+
+    parts_class: ClassVar[type[QPLEXParts]] = QPLEXPoolParts
+
+
+class QPLEXLstmPolicy(QPLEXPolicy):
+    """
+    QPLEX whose agents remember: an LSTM over features, last action and the agent's index.
+
+    ``predict`` takes and gives the state, as SB3's recurrent policies do; it needs ``"agent"`` beside ``"obs"``.
+    """
+
+    parts_class: ClassVar[type[QPLEXParts]] = QPLEXLstmParts

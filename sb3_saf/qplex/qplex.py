@@ -1,0 +1,444 @@
+"""QPLEX for Stable-Baselines3: value factorisation on team transitions (arXiv 2008.01062)."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_saf.common.teams import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    Array,
+    TeamSpaces,
+    check_count,
+    check_whole_teams,
+)
+from sb3_saf.qplex.learning import TeamError, team_errors
+from sb3_saf.qplex.mixers import MixerName, check_mixer
+from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy, State
+from sb3_saf.qplex.replay_buffer import TeamReplayBuffer, TeamReplaySamples
+
+SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
+
+_TERMINAL_OBSERVATION = "terminal_observation"
+
+
+class QPLEX(OffPolicyAlgorithm):
+    """
+    QPLEX, QMIX and VDN: each agent has values of its own actions, a mixer makes the team's value of them, and that
+    value learns from the sum of all agents' rewards.
+
+    It trains on the same environments as PPO with SAFPolicy (``make_team_env``), whose actions must be Discrete.
+
+    **Units**: ``buffer_size``, ``learning_starts``, ``batch_size``, ``train_freq`` and ``target_update_interval`` count
+    *game steps*, summed over all parallel games, however many games there are. ``total_timesteps`` counts rows (game
+    steps times N), as everywhere in SB3.
+
+    **Exploration**: each agent tosses a coin of its own, with the same probability, and then takes any legal action;
+    ``predict(deterministic=False)`` does so, too.
+
+    :param policy: ``"QPLEXPolicy"``, ``"QPLEXPoolPolicy"`` (Q heads from a pool) or ``"QPLEXLstmPolicy"`` (memory)
+    :param env: vector environment of teams
+    :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``; None leaves it to ``policy_kwargs`` (and there to QPLEX)
+    :param learning_rate: learning rate, or a schedule of it
+    :param buffer_size: game steps that the replay buffer keeps
+    :param learning_starts: game steps before learning begins; until then actions are random
+    :param batch_size: game steps per update (with memory: those that the loss counts, in sequences)
+    :param tau: share of the online networks in an update of the target networks; 1 copies them
+    :param gamma: discount per game step
+    :param train_freq: game steps between updates
+    :param gradient_steps: gradient steps per update; -1 for as many as game steps in between
+    :param replay_buffer_class: TeamReplayBuffer or a subclass of it
+    :param replay_buffer_kwargs: its further arguments
+    :param target_update_interval: game steps between updates of the target networks
+    :param exploration_fraction: part of training over which the probability of random actions falls
+    :param exploration_initial_eps: probability at the start
+    :param exploration_final_eps: probability at its end
+    :param max_grad_norm: largest norm of the gradient
+    :param stats_window_size: team episodes over which ``rollout/ep_rew_mean`` is taken
+    :param tensorboard_log: folder for TensorBoard; None for none
+    :param policy_kwargs: arguments of the policy, see :class:`QPLEXPolicy` and :class:`QPLEXParts`
+    :param verbose: 0 for silence, 1 for information, 2 for debugging
+    :param seed: of everything
+    :param device: where networks are
+    :param _init_setup_model: whether to build the networks now
+    :raises ValueError: for environments without teams, actions that are not Discrete, and numbers that do not fit
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        policy.__name__: policy for policy in (QPLEXPolicy, QPLEXPoolPolicy, QPLEXLstmPolicy)
+    }
+    policy: QPLEXPolicy
+    replay_buffer: TeamReplayBuffer | None
+    action_space: spaces.Discrete
+
+    def __init__(
+        self,
+        policy: str | type[QPLEXPolicy],
+        env: GymEnv | str | None,
+        mixer: MixerName | None = None,
+        learning_rate: float | Schedule = 5e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 1_000,
+        batch_size: int = 64,
+        tau: float = 1.0,
+        gamma: float = 0.99,
+        train_freq: int = 16,
+        gradient_steps: int = 1,
+        replay_buffer_class: type[TeamReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        target_update_interval: int = 4_000,
+        exploration_fraction: float = 0.3,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        max_grad_norm: float = 10.0,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        if mixer is not None:
+            check_mixer(mixer)
+            policy_kwargs = {**(policy_kwargs or {}), "mixer": mixer}
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]  # None while loading
+            learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            replay_buffer_class=replay_buffer_class or TeamReplayBuffer,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            support_multi_env=True,
+        )
+        self.target_update_interval = target_update_interval
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.max_grad_norm = max_grad_norm
+        self.exploration_rate = exploration_initial_eps
+        #: What agents with memory remember while games are played.
+        self._agent_state: State | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    # --- setting up -------------------------------------------------------------------------------------------------
+
+    def _setup_model(self) -> None:
+        self._check_settings()
+        spaces_ = TeamSpaces.from_observation_space(self.observation_space)
+        self.n_agents = spaces_.n_agents
+        self.n_games = check_whole_teams(self.n_envs, self.n_agents, "give an environment of whole teams")
+        self._check_action_space()
+        super()._setup_model()
+        if not isinstance(self.policy, QPLEXPolicy):
+            raise ValueError(
+                f"expected one of {', '.join(map(repr, self.policy_aliases))} or a subclass of QPLEXPolicy, got "
+                f"{type(self.policy).__name__}"
+            )
+        buffer = self._buffer()
+        if self.verbose >= 1:
+            steps = buffer.buffer_size * buffer.n_games
+            print(f"Replay buffer of {steps:,} game steps: {buffer.nbytes / 1e6:,.1f} MB")
+
+    def _check_settings(self) -> None:
+        for name in ("buffer_size", "batch_size", "train_freq", "target_update_interval"):
+            value = getattr(self, name)
+            if isinstance(value, TrainFreq):  # as loaded
+                continue
+            if isinstance(value, tuple):
+                raise ValueError(f"{name} must be a number of game steps, got {value!r}")
+            check_count(name, value)
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size must be at most buffer_size, got {self.batch_size} and {self.buffer_size} game steps; "
+                "lower the one or raise the other"
+            )
+        if not issubclass(self.replay_buffer_class or TeamReplayBuffer, TeamReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class must be TeamReplayBuffer or a subclass of it, got {self.replay_buffer_class}; "
+                "SB3's own buffers store single rows"
+            )
+        if self._vec_normalize_env is not None:
+            raise ValueError("QPLEX does not train on VecNormalize; normalise below CentralizedValueWrapper")
+
+    def _check_action_space(self) -> None:
+        if not isinstance(self.action_space, spaces.Discrete) or self.action_space.start != 0:
+            raise ValueError(
+                f"QPLEX needs Discrete actions that count from 0, got {self.action_space}; for other actions use PPO "
+                'with "SAFPolicy", "MAPPOPolicy" or "IPPOPolicy"'
+            )
+
+    def _convert_train_freq(self) -> None:
+        """One step of all games at a time; :meth:`train` knows when updates are due."""
+        if not isinstance(self.train_freq, TrainFreq):
+            self.update_interval = int(self.train_freq)  # type: ignore[arg-type]
+        self.train_freq = TrainFreq(1, TrainFrequencyUnit.STEP)  # type: ignore[assignment]
+
+    def _buffer(self) -> TeamReplayBuffer:
+        assert self.replay_buffer is not None
+        return self.replay_buffer
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer from a pickle file. Unpickling runs code from the file: load only what you trust.
+
+        :param path: of the file
+        :param truncate_last_traj: not read, see SB3
+        :raises ValueError: if it is of other teams
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded: Any = self.replay_buffer
+        if isinstance(loaded, TeamReplayBuffer) and loaded.n_envs == self.n_envs and loaded.n_agents == self.n_agents:
+            return
+        self.replay_buffer = before
+        raise ValueError(
+            f"expected a TeamReplayBuffer of {self.n_games} games of {self.n_agents} agents, got "
+            f"{type(loaded).__name__} of {loaded.n_envs} rows; train on as many games as before"
+        )
+
+    def _game_steps(self) -> int:
+        return self.num_timesteps // self.n_agents
+
+    def _crossed(self, interval: int) -> int:
+        """How many multiples of ``interval`` the last step of all games has reached, in game steps."""
+        steps = self._game_steps()
+        return steps // interval - (steps - self.n_games) // interval
+
+    # --- playing ----------------------------------------------------------------------------------------------------
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State | None]:
+        """
+        Act from own observations.
+
+        :param observation: rows, or own observations alone; see :meth:`QPLEXPolicy.predict`
+        :param state: of policies with memory
+        :param episode_start: (B,) where an episode starts
+        :param deterministic: False tosses each agent's coin with the current exploration rate
+        :return: actions and the next state
+        """
+        actions, state = self.policy.predict(observation, state, episode_start, deterministic)
+        if deterministic or not self.exploration_rate:
+            return actions, state
+        masks = observation.get(ACTION_MASK_KEY) if isinstance(observation, dict) else None
+        explored = self._explore(np.atleast_1d(actions), self.exploration_rate, masks)
+        if state is not None:
+            state = (*state[:-1], explored.copy())
+        return explored.reshape(actions.shape), state
+
+    def _explore(self, actions: Array, rate: float, masks: Array | None) -> Array:
+        """(B,) actions, each replaced with the given probability by any legal action."""
+        # SB3 seeds NumPy's global generator, and no other, from the run's seed.
+        coins = np.random.random(len(actions)) < rate  # noqa: NPY002
+        if masks is None:
+            others = np.random.randint(0, int(self.action_space.n), size=len(actions))  # noqa: NPY002
+        else:
+            legal = np.asarray(masks).reshape(len(actions), -1) != 0
+            others = np.where(legal, np.random.random(legal.shape), -1.0).argmax(axis=1)  # noqa: NPY002
+        result: Array = np.where(coins, others, actions)
+        return result
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(B,) actions of the step to come; all random before ``learning_starts`` game steps."""
+        assert isinstance(self._last_obs, dict)
+        starts = self._last_episode_starts
+        if self._agent_state is not None and len(self._agent_state[0]) != n_envs:
+            self._agent_state = None  # another environment
+        actions, state = self.policy.predict(self._last_obs, self._agent_state, starts)
+        rate = 1.0 if self._game_steps() < learning_starts else self.exploration_rate
+        actions = self._explore(actions, rate, self._last_obs.get(ACTION_MASK_KEY))
+        self._agent_state = None if state is None else (*state[:-1], actions.copy())
+        return actions, actions
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """
+        Play one step of all games.
+
+        :param env: the training environment
+        :param callback: called after the step
+        :param train_freq: always one step
+        :param replay_buffer: where to
+        :param action_noise: not used
+        :param learning_starts: game steps of random actions
+        :param log_interval: team episodes between logs
+        :return: game steps played, team episodes ended, and whether training goes on
+        """
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()
+        actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
+        new_obs, rewards, dones, infos = env.step(actions)
+        self.num_timesteps += env.num_envs
+        callback.update_locals(locals())
+        if not callback.on_step():
+            return RolloutReturn(self.n_games, 0, continue_training=False)
+        self._update_info_buffer(infos, dones)
+        self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        self._on_step()
+        n_episodes = int(np.count_nonzero(dones)) // self.n_agents
+        self._episode_num += n_episodes
+        if (
+            log_interval is not None
+            and self._episode_num // log_interval > (self._episode_num - n_episodes) // log_interval
+        ):
+            self.dump_logs()
+        callback.on_rollout_end()
+        return RolloutReturn(self.n_games, n_episodes, continue_training=True)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one step of all games; of games that ended, with their last observations."""
+        assert isinstance(self._last_obs, dict) and isinstance(new_obs, dict)
+        assert isinstance(replay_buffer, TeamReplayBuffer)
+        keys = [key for key in (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY) if key in new_obs]
+        after = {key: new_obs[key] for key in keys}
+        ended = np.flatnonzero(dones)
+        if len(ended):
+            after = {key: part.copy() for key, part in after.items()}
+            for row in ended.tolist():
+                for key in keys:
+                    after[key][row] = infos[row][_TERMINAL_OBSERVATION][key]
+        replay_buffer.add(
+            self._last_obs, after, buffer_action, reward, dones, infos, episode_starts=self._last_episode_starts
+        )
+        self._last_obs, self._last_episode_starts = new_obs, dones
+
+    def _on_step(self) -> None:
+        """Update the target networks and the exploration rate."""
+        if self._crossed(self.target_update_interval):
+            polyak_update(*self.policy.parameter_pairs(), self.tau)
+        share = 1.0 - self._current_progress_remaining
+        fallen = min(1.0, share / self.exploration_fraction) if self.exploration_fraction > 0 else 1.0
+        change = self.exploration_final_eps - self.exploration_initial_eps
+        self.exploration_rate = self.exploration_initial_eps + fallen * change
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+        self.logger.record("rollout/replay_buffer_size", self._buffer().n_stored)
+
+    # --- learning ---------------------------------------------------------------------------------------------------
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """
+        Do the updates that are due after one step of all games.
+
+        :param gradient_steps: not read: those of ``gradient_steps`` and ``train_freq``
+        :param batch_size: game steps per gradient step
+        """
+        due = self._crossed(self.update_interval)
+        if not due or self._game_steps() <= self.learning_starts:
+            return
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        n_steps = due * (self.update_interval if self.gradient_steps < 0 else self.gradient_steps)
+        for _ in range(n_steps):
+            error = team_errors(self.policy, self._sample(batch_size), self.gamma)
+            self.policy.optimizer.zero_grad()
+            error.loss.backward()
+            th.nn.utils.clip_grad_norm_(self.policy.parameter_pairs()[0], self.max_grad_norm)
+            self.policy.optimizer.step()
+        self._n_updates += n_steps
+        self._log(error)
+
+    def _sample(self, batch_size: int) -> TeamReplaySamples:
+        """A batch; of sequences for agents with memory."""
+        parts = self.policy.parts
+        if self.policy.memory is None:
+            return self._buffer().sample(batch_size)
+        n_sequences = max(1, batch_size // parts.sequence_length)
+        return self._buffer().sample_sequences(n_sequences, parts.sequence_length, parts.burn_in)
+
+    def _log(self, error: TeamError) -> None:
+        """Of the last gradient step; means over the batch."""
+        record = self.logger.record
+        record("train/n_updates", self._n_updates, exclude="tensorboard")
+        record("train/loss", error.loss.item())
+        record("train/td_error", error.td.abs().mean().item())
+        record("train/q_tot", error.q_tot.mean().item())
+        if error.weights is not None:
+            for agent, weight in enumerate(error.weights.mean(dim=0).tolist()):
+                record(f"lambda/agent_{agent}", weight)
+
+    def learn(
+        self: SelfQPLEX,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 100,
+        tb_log_name: str = "QPLEX",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfQPLEX:
+        """
+        Train.
+
+        :param total_timesteps: rows: game steps times N
+        :param callback: called after every step of all games
+        :param log_interval: team episodes between logs
+        :param tb_log_name: name of the run for TensorBoard
+        :param reset_num_timesteps: whether to count from zero
+        :param progress_bar: whether to show one
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []

@@ -1,0 +1,453 @@
+"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, and its answers to games."""
+
+from __future__ import annotations
+
+import copy
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_saf import (
+    QPLEX,
+    Actor,
+    ExportError,
+    LightEncoder,
+    QPLEXPoolPolicy,
+    TeamEvalCallback,
+    evaluate_team,
+    export_actors,
+    load_weights,
+    make_team_env,
+)
+from sb3_saf.common.centralized import CentralizedValueWrapper, TimeLimit
+from sb3_saf.common.monitor import TeamMonitor
+from sb3_saf.qplex.heads import q_values
+from sb3_saf.qplex.learning import team_errors
+from sb3_saf.qplex.mixers import MixerName
+from tests.matrix_games import ONE_STEP, MatrixGame, TwoStates
+from tests.toy_envs import DictEnv, TellingEnv
+from tests.toy_teams import ToyTeams
+
+POLICIES = ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXLstmPolicy"]
+#: Small and quick.
+QUICK: dict[str, Any] = {
+    "buffer_size": 200,
+    "learning_starts": 20,
+    "batch_size": 16,
+    "train_freq": 8,
+    "target_update_interval": 24,
+    "device": "cpu",
+}
+SMALL_NETS: dict[str, Any] = {"net_arch": [16], "mixer_hidden": 16, "kernel_arch": (16,)}
+
+
+def toy_env(n_games: int = 4) -> CentralizedValueWrapper:
+    """Three agents, five steps, time limits that are ends."""
+    return telling_env(n_games, masks=None, joins={}, deaths={})
+
+
+def telling_env(n_games: int = 4, time_limit: TimeLimit = "terminal", **kwargs: Any) -> CentralizedValueWrapper:
+    """Agents join and die, masks that end the test where they are broken, a state."""
+    settings: dict[str, Any] = {"n_agents": 3, "max_cycles": 5, "deaths": {1: 3}, "joins": {2: 1}} | kwargs
+    masks = settings.get("masks", "observation") is not None
+    return make_team_env(
+        TellingEnv(**settings), n_envs=n_games, seed=0, time_limit=time_limit, state=True, action_masks=masks
+    )
+
+
+def make_model(env: Any = None, policy: str = "QPLEXPolicy", **kwargs: Any) -> QPLEX:
+    nets = SMALL_NETS | kwargs.pop("policy_kwargs", {})
+    if policy == "QPLEXLstmPolicy":
+        nets = {"lstm_hidden_size": 8, "sequence_length": 4, "burn_in": 2} | nets
+    return QPLEX(policy, toy_env() if env is None else env, **(QUICK | {"seed": 0, "policy_kwargs": nets} | kwargs))
+
+
+def weights(model: QPLEX) -> list[th.Tensor]:
+    return [tensor.clone() for tensor in model.policy.state_dict().values()]
+
+
+def same(one: list[th.Tensor], other: list[th.Tensor]) -> bool:
+    return all(map(th.equal, one, other))
+
+
+# --- games with a known answer ----------------------------------------------------------------------------------------
+
+
+def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:
+    """Payoff of the greedy joint action after learning from 1,000 uniformly drawn ones."""
+    env = make_team_env(MatrixGame(ONE_STEP), n_envs=8, active=False)
+    nets = {"n_kernels": 10, "kernel_arch": (64, 64)}
+    model = make_model(
+        env, mixer=mixer, seed=seed, learning_rate=1e-3, policy_kwargs=nets, buffer_size=1_000, learning_starts=1_000,
+        batch_size=64,
+    )  # fmt: skip
+    model.learn(1_000 * 2)
+    model.learning_starts, model.gradient_steps = 0, n_updates
+    model.train(n_updates)
+    row, column = model.predict(env.reset(), deterministic=True)[0][:2]
+    return float(ONE_STEP[row, column])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_qplex_learns_the_joint_action_that_is_worth_8(seed: int) -> None:
+    """RESULTS_ONE_STEP"""
+    assert learn_matrix("qplex", seed, n_updates=1_200) == 8.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_vdn_does_not(seed: int) -> None:
+    """Its best fit to uniform data is -61/9 + 22/9 for the first action of both, and 20/9 for any of the others."""
+    assert learn_matrix("vdn", seed, n_updates=300) == 0.0
+
+
+def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
+    """
+    Arxiv 2006.00587: off-policy learning with additive factorisation grows without bound; QPLEX's class holds the value.
+
+    With gamma = 0.9 the value is 10. VDN's iteration is V <- 3/4 + 1.125 V under uniform data.
+    """
+    values = {}
+    mixers: tuple[MixerName, ...] = ("vdn", "qplex")
+    for mixer in mixers:
+        env = make_team_env(TwoStates(), n_envs=8, active=False, time_limit="bootstrap")
+        model = make_model(
+            env, mixer=mixer, gamma=0.9, learning_rate=2e-3, buffer_size=800, learning_starts=800, batch_size=64,
+            exploration_final_eps=1.0, target_update_interval=8, tau=0.05,
+        )  # fmt: skip
+        model.learn(800 * 2)
+        model.learning_starts, model.gradient_steps = 0, 1
+        for _ in range(900):
+            model.train(1, 64)
+            model._on_step()
+        steps = model._buffer().sample(400)
+        stays = (steps.now.own[:, 0, 1] == 1) & (steps.actions == 0).all(dim=1)
+        values[mixer] = float(team_errors(model.policy, steps, 0.9).q_tot[stays].mean())
+    print(values)
+    assert values["vdn"] > 14.0
+    assert 8.0 < values["qplex"] < 12.0
+
+
+# --- the loss ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("kind", ["features", "all"])
+def test_distinct_views_give_the_numbers_of_every_row(policy: str, kind: str) -> None:
+    errors = []
+    for distinct in (True, False):
+        env = telling_env() if kind == "all" else ToyTeams()
+        model = make_model(env, policy, policy_kwargs={"distinct": distinct})
+        model.learn(30 * 3)
+        th.manual_seed(5)
+        np.random.seed(5)  # noqa: NPY002
+        errors.append(team_errors(model.policy, model._sample(16), 0.9))
+    assert th.allclose(errors[0].td, errors[1].td, atol=1e-4)
+
+
+def test_the_target_is_double_q_learning_by_hand() -> None:
+    """VDN without anything shared: y = r + gamma (1 - done) sum_i Q_target_i(argmax over legal actions of online Q_i)."""
+    env = telling_env(time_limit="bootstrap")
+    model = make_model(env, mixer="vdn", learning_starts=10)
+    model.learn(60 * 3)
+    samples, policy = model._buffer().sample(40), model.policy
+    error = team_errors(policy, samples, gamma=0.9)
+    assert samples.now.active is not None and samples.after.active is not None and samples.after.masks is not None
+    assert float(samples.dones.mean()) + 0.01 > 0 and not samples.after.active.all()
+    for i in range(40):
+        q_tot = value = 0.0
+        for agent in range(3):
+            now = policy.actor(policy.features_extractor(samples.now.own[i, agent][None]))[0]
+            after = policy.features_extractor(samples.after.own[i, agent][None])
+            online = policy.actor(after)[0].masked_fill(~samples.after.masks[i, agent], -th.inf)
+            target = policy.target.actor(policy.target.encoder(samples.after.own[i, agent][None]))[0]
+            q_tot += float(now[samples.actions[i, agent]]) * bool(samples.now.active[i, agent])
+            value += float(target[online.argmax()]) * bool(samples.after.active[i, agent])
+        y = float(samples.rewards[i]) + 0.9 * (1 - float(samples.dones[i])) * value
+        assert float(error.q_tot[i]) == pytest.approx(q_tot, abs=1e-3)
+        assert float(error.td[i]) == pytest.approx(q_tot - y, abs=1e-2)
+
+
+def test_the_gradient_goes_into_the_online_networks_alone() -> None:
+    model = make_model(ToyTeams(), "QPLEXPoolPolicy")
+    model.learn(30 * 3)
+    policy = model.policy
+    policy.optimizer.zero_grad()
+    team_errors(policy, model._sample(64), 0.9).loss.backward()
+    online, target = policy.parameter_pairs()
+    assert all(parameter.grad is not None for parameter in online)
+    assert float(policy.actor.signature_keys.grad.abs().sum()) > 0  # type: ignore[union-attr, operator]
+    assert not any(parameter.requires_grad for parameter in target)
+    parts: dict[str, Any] = {"detach_state": True}
+    attached = {}
+    for detach in (True, False):
+        parts["detach_state"] = detach
+        one = make_model(ToyTeams(), policy_kwargs=parts)
+        one.learn(16 * 3)
+        one.policy.optimizer.zero_grad()
+        np.random.seed(0)  # noqa: NPY002
+        team_errors(one.policy, one._sample(64), 0.9).loss.backward()
+        attached[detach] = next(one.policy.features_extractor.parameters()).grad
+    assert not th.equal(attached[True], attached[False])
+
+
+def test_memory_in_training_is_memory_in_play() -> None:
+    """Q values of sequences from the start of episodes equal those of predict, step by step."""
+    model = make_model(ToyTeams(length=4, n_games=1), "QPLEXLstmPolicy", buffer_size=12, batch_size=8)
+    model.learn(12 * 3)
+    policy, buffer = model.policy, model._buffer()
+    assert policy.memory is not None
+    samples = buffer.sample_sequences(1, 12, 0)
+    info = samples.sequences
+    assert info is not None
+    features = policy.encode_with(policy.features_extractor, samples.now.own.flatten(0, 1))
+    agents = th.arange(3).repeat(12)
+    inputs = policy.memory.inputs(features, info.last_actions.flatten(), agents).view(1, 12, 3, -1)
+    hidden, _ = policy.memory.unroll(inputs, info.resets.view(1, 12))
+    trained = q_values(policy.actor, hidden, agents).view(12, 3, -1).argmax(dim=2)
+    state: Any = None
+    for t in range(12):
+        obs = {"obs": samples.now.own[t].numpy(), "agent": np.arange(3)}
+        actions, state = policy.predict(obs, state, np.full(3, t % 4 == 0))
+        assert np.array_equal(actions, trained[t])
+        state = (*state[:2], samples.actions[t].numpy())  # what was really done
+
+
+# --- playing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_agents_learn_where_some_die_join_and_may_not_do_everything(policy: str) -> None:
+    """TellingEnv itself fails at an illegal action."""
+    env = telling_env(time_limit="bootstrap")
+    model = make_model(env, policy)
+    before = weights(model)
+    model.learn(60 * 3)
+    assert not same(before, weights(model))
+    assert evaluate_team(model, env, 4, deterministic=False).lengths == [5] * 4
+
+
+def test_each_agent_tosses_its_own_coin() -> None:
+    model = make_model()
+    obs = toy_env(40).reset()
+    greedy, _ = model.predict(obs, deterministic=True)
+    model.exploration_rate = 0.5
+    differs = np.array([model.predict(obs)[0] != greedy for _ in range(50)])
+    # 4 actions: a coin at 1/2 changes 3/8 of the actions. One coin for all would change 3/4 of them or none at a time.
+    assert differs.mean() == pytest.approx(0.375, abs=0.03)
+    assert differs.mean(axis=1).std() < 0.1
+    model.exploration_rate = 0.0
+    assert np.array_equal(model.predict(obs)[0], greedy)
+
+
+def test_units_are_game_steps() -> None:
+    env = toy_env(4)
+    model = make_model(env, learning_starts=40, train_freq=16, gradient_steps=2, target_update_interval=24)
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.append((self.num_timesteps // 3, model._n_updates, len(model._buffer().seen["obs"])))
+            return True
+
+    model.learn(100 * 3, callback=Watch())
+    assert model.num_timesteps == 300 and model._buffer().n_stored == 100
+    # Updates after 48, 64, 80, 96 game steps, two each; the callback sees them one step later.
+    assert [steps for (steps, n, _), (_, m, _) in zip(seen[1:], seen, strict=False) if n > m] == [52, 68, 84, 100]
+    assert model._n_updates == 8
+    assert seen[0][2] == 200 // 4 + 1
+    assert model.exploration_rate == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("n_games", [2, 3, 16])
+def test_updates_do_not_depend_on_the_number_of_games(n_games: int) -> None:
+    model = make_model(toy_env(n_games), train_freq=8, learning_starts=0)
+    model.learn(96 * 3)
+    assert model._n_updates == 12
+
+
+def test_logs_tell_what_is_learned(tmp_path: Path) -> None:
+    from stable_baselines3.common.logger import configure
+
+    model = make_model()
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(100 * 3, log_interval=8)
+    header, *lines = (tmp_path / "progress.csv").read_text().splitlines()
+    wanted = {"train/q_tot", "train/td_error", "train/loss", "rollout/exploration_rate", "rollout/replay_buffer_size"}
+    wanted |= {f"lambda/agent_{i}" for i in range(3)} | {"time/game_steps", "rollout/ep_rew_mean"}
+    assert wanted <= set(header.split(","))
+    assert len(lines) == 100 // 5 // 8  # once for every 8 team episodes
+
+
+# --- saving -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_seeded_runs_repeat_bit_for_bit(policy: str) -> None:
+    runs = []
+    for _ in range(2):
+        model = make_model(policy=policy)
+        model.learn(60 * 3)
+        runs.append(weights(model))
+    assert same(*runs)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path: Path) -> None:
+    """Model, replay buffer, games and random numbers restored."""
+    whole = make_model(ToyTeams(), policy)
+    whole.learn(120 * 3)
+    env = ToyTeams()
+    model = make_model(env, policy)
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.num_timesteps <= 60 * 3
+
+    model.learn(120 * 3, callback=Stop())
+    # The step that the callback stopped at was played, but not stored.
+    model = make_model(env := ToyTeams(), policy)
+    model._total_timesteps = 0
+    model.learn(60 * 3)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    numbers = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
+    expected = weights(copied := _continued(model, env, numbers))
+    again = QPLEX.load(tmp_path / "model", env=copy.deepcopy(env_before(copied)), force_reset=False, device="cpu")
+    again.load_replay_buffer(tmp_path / "buffer")
+    assert same(expected, weights(_continued(again, None, numbers)))
+    assert not same(expected, weights(whole)) or policy  # schedules differ: exploration falls over another total
+
+
+def env_before(model: QPLEX) -> Any:
+    return model._env_before  # type: ignore[attr-defined]
+
+
+def _continued(model: QPLEX, env: Any, numbers: Any) -> QPLEX:
+    """Sixty game steps more from given random numbers."""
+    if env is not None:
+        model._env_before = copy.deepcopy(model.env)  # type: ignore[attr-defined]
+    random.setstate(numbers[0])
+    np.random.set_state(numbers[1])  # noqa: NPY002
+    th.set_rng_state(numbers[2])
+    return model.learn(60 * 3, reset_num_timesteps=False)
+
+
+def test_a_loaded_model_acts_as_the_saved(tmp_path: Path) -> None:
+    env = toy_env()
+    model = make_model(env, "QPLEXPoolPolicy", mixer="qmix").learn(40 * 3)
+    model.save(tmp_path / "model")
+    obs = env.reset()
+    loaded = QPLEX.load(tmp_path / "model", device="cpu")
+    assert isinstance(loaded.policy, QPLEXPoolPolicy) and loaded.policy.parts.mixer == "qmix"
+    assert np.array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    fresh = make_model(env, "QPLEXPoolPolicy", mixer="qmix", seed=1)
+    load_weights(fresh, tmp_path / "model")
+    assert same(weights(fresh), weights(model))
+    loaded.set_env(toy_env(4))
+    loaded.learn(20 * 3, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 60 * 3
+    with pytest.raises(ExportError, match="weights"):
+        load_weights(make_model(env), tmp_path / "model")
+
+
+def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
+    make_model(toy_env(2)).learn(20 * 3).save_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match="4 games of 3 agents, got TeamReplayBuffer of 6 rows"):
+        make_model(toy_env(4)).load_replay_buffer(tmp_path / "buffer")
+
+
+def test_evaluation_callback(tmp_path: Path) -> None:
+    callback = TeamEvalCallback(toy_env(2), n_eval_episodes=2, eval_freq=20, log_path=str(tmp_path), verbose=0)
+    make_model(policy="QPLEXLstmPolicy").learn(60 * 3, callback=callback)
+    assert np.load(tmp_path / "evaluations.npz")["game_steps"].tolist() == [20, 40, 60]
+
+
+# --- export -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("onnx", [False, True])
+@pytest.mark.parametrize(
+    ("policy", "kwargs"), [("QPLEXPolicy", {}), ("QPLEXPoolPolicy", {}), ("QPLEXPolicy", {"heads": "per_agent"})]
+)
+def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], onnx: bool, tmp_path: Path) -> None:
+    env = make_team_env("TeamSupport", n_envs=4, n_agents=3, grid_size=9, n_treasures=3)
+    model = make_model(env, policy, policy_kwargs={"features_extractor_class": LightEncoder} | kwargs).learn(60 * 3)
+    # Heads that differ: a short training leaves their values close to zero.
+    for parameter in model.policy.actor.parameters():
+        parameter.data.add_(th.randn_like(parameter) * 0.3)
+    export_actors(model, tmp_path / "actor", onnx=onnx)
+    obs = env.reset()
+    for runtime in ("torch", "onnx") if onnx else ("torch",):
+        for agent in range(3):
+            actor = Actor.load(tmp_path / "actor", agent=agent, runtime=runtime)  # type: ignore[arg-type]
+            own = obs["obs"][agent::3]
+            expected = model.predict({"obs": own, "agent": np.full(4, agent)}, deterministic=True)[0]
+            assert np.array_equal(actor.act(own), expected)
+            assert np.array_equal(actor.act(own, deterministic=False), expected)
+            assert actor.act(own[0]) == expected[0]
+            with pytest.raises(ValueError, match="takes the best"):
+                actor.probabilities(own)
+
+
+def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="hidden state"):
+        export_actors(make_model(policy="QPLEXLstmPolicy"), tmp_path / "actor", onnx=False)
+    with pytest.raises(ExportError, match="masks"):
+        export_actors(make_model(telling_env()), tmp_path / "actor", onnx=False)
+
+
+def test_acting_reads_nothing_but_own_observations() -> None:
+    env = toy_env()
+    model, obs = make_model(env).learn(40 * 3), env.reset()
+    assert np.array_equal(model.predict(obs["obs"], deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    alone = [model.predict(own, deterministic=True)[0] for own in obs["obs"]]
+    assert np.array_equal(alone, model.predict(obs, deterministic=True)[0])
+    with pytest.raises(ValueError, match="'agent'"):
+        make_model(env, "QPLEXLstmPolicy").predict(obs["obs"], deterministic=True)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"mixer": "qmixx"}, "did you mean 'qmix'"),
+        ({"batch_size": 300}, "batch_size must be at most buffer_size, got 300 and 200 game steps"),
+        ({"train_freq": (1, "episode")}, "number of game steps"),
+        ({"train_freq": 0}, "train_freq must be an integer of at least 1"),
+        ({"replay_buffer_class": dict}, "TeamReplayBuffer"),
+        ({"policy_kwargs": {"heads": "own"}}, "heads must be one of"),
+        ({"policy_kwargs": {"burn_in": -1}}, "burn_in"),
+    ],
+)
+def test_bad_settings(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_model(**kwargs)
+
+
+def test_bad_environments() -> None:
+    with pytest.raises(ValueError, match="make_team_env"):
+        QPLEX("QPLEXPolicy", "CartPole-v1")
+    with pytest.raises(ValueError, match="QPLEX needs Discrete actions"):
+        make_model(ToyTeams(action_space=spaces.Box(-1.0, 1.0, (2,), np.float32)))
+    with pytest.raises(ValueError, match="QPLEX needs Discrete actions"):
+        make_model(ToyTeams(action_space=spaces.Discrete(3, start=1)))
+    with pytest.raises(ValueError, match="VecNormalize"):
+        make_model(VecNormalize(toy_env(), norm_obs=False))
+    with pytest.raises(ValueError, match="unknown"):
+        make_model(policy="QPLEXPolice")
+    with pytest.raises(ValueError, match="flatten"):
+        CentralizedValueWrapper(TeamMonitor(make_team_env(DictEnv()).venv))
+
+
+def test_verbose_tells_the_memory(capsys: pytest.CaptureFixture[str]) -> None:
+    make_model(verbose=1)
+    assert "Replay buffer of 200 game steps: 0.0 MB" in capsys.readouterr().out
