@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from difflib import get_close_matches
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Final, NamedTuple
 
 from hecogrid_envs.params import TASK_NAMES, TaskName
-
-Size = Literal["paper", "small", "smoke"]
-SIZES: Final[tuple[Size, ...]] = get_args(Size)
+from sb3_saf.zoo.names import unknown_name
+from sb3_saf.zoo.yaml_files import Size
 
 #: Seeds of a run that names none. The spec asks for at least three; smoke is for tests.
 DEFAULT_SEEDS: Final[dict[Size, tuple[int, ...]]] = {"paper": (0, 1, 2), "small": (0, 1, 2), "smoke": (0, 1)}
 
 #: The untrained team that every experiment has beside its methods.
 RANDOM: Final = "random"
-
-#: Names of algorithms as figures and pages write them.
-LABELS: Final[dict[str, str]] = {
-    "saf": "SAF",
-    "saf-no-pool": "SAF without pool",
-    "saf-no-ks": "SAF without knowledge source",
-    "mappo": "MAPPO",
-    "ippo": "IPPO",
-    "qplex": "QPLEX",
-    "qplex-pool": "QPLEX with pool",
-    RANDOM: "random team",
-}
-
 
 class Level(NamedTuple):
     """
@@ -62,6 +46,39 @@ class Setting(NamedTuple):
     tests: tuple[Level, ...]
 
 
+class View(NamedTuple):
+    """
+    One row of levels: what a bar chart shows.
+
+    :param axis: the dial that is turned, as figures name it
+    :param levels: tested at
+    :param train: trained at; None where every level is trained at itself
+    """
+
+    axis: str
+    levels: tuple[Level, ...]
+    train: Level | None = None
+
+    def position(self, level: Level) -> int:
+        """Where a level is on the axis."""
+        return level.heterogeneity if self.axis == HETEROGENEITY else level.coordination
+
+    def shows(self, train: Level, test: Level) -> bool:
+        """Whether something trained and tested at these levels belongs to it."""
+        return test in self.levels and train == (self.train or test)
+
+    @property
+    def settings(self) -> list[Setting]:
+        """What has to be trained and tested for it."""
+        if self.train is not None:
+            return [Setting(self.train, self.levels)]
+        return [Setting(level, (level,)) for level in self.levels]
+
+    def __str__(self) -> str:
+        levels = "; ".join(map(str, self.levels))
+        return f"levels {levels}" if self.train is None else f"trained at {self.train}, tested at {levels}"
+
+
 class Experiment(NamedTuple):
     """
     One row of the paper's list.
@@ -70,7 +87,7 @@ class Experiment(NamedTuple):
     :param question: what it asks
     :param tasks: the games
     :param methods: algorithms as in ``--algo``
-    :param settings: levels
+    :param views: levels
     :param n_agents: N where it is not the size's own
     """
 
@@ -78,55 +95,49 @@ class Experiment(NamedTuple):
     question: str
     tasks: tuple[TaskName, ...] = ()
     methods: tuple[str, ...] = ()
-    settings: tuple[Setting, ...] = ()
+    views: tuple[View, ...] = ()
     n_agents: int | None = None
 
     @property
     def is_grid(self) -> bool:
         """Whether there is anything to train."""
-        return bool(self.settings)
+        return bool(self.views)
 
     @property
-    def is_out_of_distribution(self) -> bool:
-        """Whether it tests where it has not trained."""
-        return any(setting.tests != (setting.train,) for setting in self.settings)
-
-    @property
-    def test_levels(self) -> list[Level]:
-        """All levels that are tested, in order."""
-        return list(dict.fromkeys(level for setting in self.settings for level in setting.tests))
-
-    @property
-    def varies(self) -> list[str]:
-        """Which of the dials its test levels turn."""
-        levels = self.test_levels
-        return [dial for dial in Level._fields if len({getattr(level, dial) for level in levels}) > 1]
+    def settings(self) -> list[Setting]:
+        """Each level that is trained at, once, with where it is tested."""
+        return list(dict.fromkeys(setting for view in self.views for setting in view.settings))
 
 
-def _same(*levels: Level) -> tuple[Setting, ...]:
-    """Settings that are tested where they are trained."""
-    return tuple(Setting(level, (level,)) for level in levels)
-
+COORDINATION: Final = "coordination"
+HETEROGENEITY: Final = "heterogeneity"
 
 _METHODS: Final = ("saf", "mappo", "ippo")
 _BY_COORDINATION: Final = tuple(Level(c, 1) for c in (1, 2, 3))
 _BY_HETEROGENEITY: Final = tuple(Level(1, h) for h in (1, 2, 3, 4, 5))
+_BOTH: Final = tuple(Level(level, level) for level in (2, 3, 4))
 _TWO_TASKS: Final[tuple[TaskName, ...]] = ("TeamTogether", "TeamSupport")
-_OOD_COORDINATION: Final = Setting(Level(2, 1), _BY_COORDINATION)
-_OOD_HETEROGENEITY: Final = Setting(Level(1, 2), _BY_HETEROGENEITY)
+_COORDINATION: Final = View(COORDINATION, _BY_COORDINATION)
+_HETEROGENEITY: Final = View(HETEROGENEITY, _BY_HETEROGENEITY)
+_OOD_COORDINATION: Final = View(COORDINATION, _BY_COORDINATION, train=Level(2, 1))
+_OOD_HETEROGENEITY: Final = View(HETEROGENEITY, _BY_HETEROGENEITY, train=Level(1, 2))
 
 _ALL: Final = (
-    Experiment("coordination", "how hard is coordination?", TASK_NAMES, _METHODS, _same(*_BY_COORDINATION)),
-    Experiment("heterogeneity", "how hard are zones?", TASK_NAMES, _METHODS, _same(*_BY_HETEROGENEITY)),
+    Experiment("coordination", "how hard is coordination?", TASK_NAMES, _METHODS, (_COORDINATION,)),
+    Experiment("heterogeneity", "how hard are zones?", TASK_NAMES, _METHODS, (_HETEROGENEITY,)),
     Experiment(
-        "joint", "both at once", ("TeamSupport",), _METHODS, _same(*(Level(level, level) for level in (2, 3, 4)))
+        "joint",
+        "how hard are both at once?",
+        ("TeamSupport",),
+        _METHODS,
+        (View(f"{COORDINATION} = {HETEROGENEITY}", _BOTH),),
     ),
     Experiment(
         "ablation",
         "what does each part of SAF give?",
         TASK_NAMES,
         ("saf-no-pool", *_METHODS),
-        _same(*_BY_COORDINATION, *_BY_HETEROGENEITY[1:]),
+        (_COORDINATION, _HETEROGENEITY),
     ),
     Experiment(
         "ood-coordination", "robustness to unseen coordination", _TWO_TASKS, _METHODS, (_OOD_COORDINATION,)
@@ -146,7 +157,7 @@ _ALL: Final = (
         "does a pool help value factorisation?",
         TASK_NAMES,
         ("qplex", "qplex-pool"),
-        _same(Level(1, 1)),
+        (View(COORDINATION, (Level(1, 1),)),),
         n_agents=5,
     ),
     Experiment("parameters", "the parameter table"),
@@ -160,23 +171,6 @@ def find_experiment(name: str) -> Experiment:
 
     :raises ValueError: with the nearest name that exists
     """
-    return EXPERIMENTS[check_choice("experiment", name, list(EXPERIMENTS))]
-
-
-def check_choice(what: str, name: str, known: Sequence[str]) -> str:
-    """
-    A name that exists.
-
-    :param what: what it names, for the error
-    :raises ValueError: with the nearest name that exists
-    """
-    if name in known:
-        return name
-    close = get_close_matches(name, known, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise ValueError(f"unknown {what} {name!r}{hint}; there are {', '.join(known)}")
-
-
-def label(method: str) -> str:
-    """A method as figures and pages write it."""
-    return LABELS.get(method, method)
+    if name not in EXPERIMENTS:
+        raise unknown_name("experiment", name, EXPERIMENTS)
+    return EXPERIMENTS[name]

@@ -35,7 +35,7 @@ class _Worker:
         self.process: BaseProcess = context.Process(target=_serve, args=(theirs,), daemon=True)
         self.job: Job | None = None
         self.attempt = 0
-        with _pinned(threads), _interrupts_kept_from_children():
+        with pinned(threads), _interrupts_kept_from_children():
             self.process.start()
         theirs.close()
 
@@ -148,7 +148,7 @@ def _death(exit_code: int | None) -> str:
 
 
 @contextmanager
-def _pinned(threads: int) -> Iterator[None]:
+def pinned(threads: int) -> Iterator[None]:
     """Environment variables as children are to inherit them."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))

@@ -46,6 +46,8 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        #: Unfinished files, on the same disk, so that a rename moves them; nothing there is a result.
+        self.scratch = folder / "scratch"
 
     # The protocol
 
@@ -189,31 +191,29 @@ class Results:
 
     # Only one run at a time
 
-    @property
-    def scratch(self) -> Path:
-        """Unfinished files; nothing here is a result."""
-        return self.folder / "scratch"
-
     @contextmanager
     def locked(self, shard: Shard) -> Iterator[None]:
         """
-        Keep a second run of the same cells away.
+        Keep a second run of the same cells away, and clear away what a killed one left unfinished.
 
         :raises ValueError: if there is one
         """
-        self.scratch.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(self.folder / f".lock-{shard.index}-of-{shard.count}")
+        part = f"{shard.index}-of-{shard.count}"
+        lock = filelock.FileLock(self.folder / f".lock-{part}")
         try:
             lock.acquire(timeout=0)
         except filelock.Timeout:
-            part = "" if shard.count == 1 else f" --shard {shard} of"
             raise ValueError(
-                f"another process is running{part} {self.folder}; wait for it, divide the cells among processes with "
-                "--shard 1/2 and --shard 2/2, or choose another folder with -f"
+                f"another process is running part {shard} of {self.folder}; wait for it, divide the cells among processes "
+                "with --shard 1/2 and --shard 2/2, or choose another folder with -f"
             ) from None
+        self.scratch = self.folder / "scratch" / part
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        self.scratch.mkdir(parents=True)
         try:
             yield
         finally:
+            shutil.rmtree(self.scratch, ignore_errors=True)
             lock.release()
 
 
