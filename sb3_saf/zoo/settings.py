@@ -42,6 +42,7 @@ _RENAMED: Final = {
     "n_timesteps": "game_steps (steps of the game; timesteps are those of every agent)",
     "policy": "--algo, which names the policy",
 }
+_SAVED_KEYS: Final = ("algo", "env", "size", "n_envs", "game_steps", "time_limit", "env_kwargs", "hyperparams")
 #: The games' default here: the same views as the paper's pictures in 49 bytes.
 _ENV_DEFAULTS: Final = {"observation": "tiles"}
 
@@ -196,6 +197,25 @@ def load_settings(
     _check_keys(given, spec, "the given settings")
     layers = (entry_of(read_config("levels"), env_id, size), own, _exclusive(given), {"env_kwargs": env_kwargs or {}})
     return _build(algo, env_id, size, merge(*layers, {"policy_kwargs": dict(spec.policy_kwargs)}))
+
+
+def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | None = None) -> Settings:
+    """
+    Settings that :meth:`Settings.as_dict` has written; files that have changed since do not matter.
+
+    :param saved: plain data
+    :param env_kwargs: parameters of the game that shall be others now
+    :raises ValueError: if it is something else, or the level cannot be built
+    """
+    missing = [key for key in _SAVED_KEYS if key not in saved]
+    if missing:
+        raise ValueError(f"expected settings that the zoo has saved; {', '.join(missing)} is missing")
+    find_algorithm(saved["algo"])
+    if saved["env"] not in TASK_OF_ENV:
+        raise unknown_name("environment", saved["env"], ENV_IDS)
+    own = {key: saved[key] for key in ("n_envs", "game_steps", "time_limit", "env_kwargs")}
+    entry = merge(own, saved["hyperparams"], {"env_kwargs": env_kwargs or {}})
+    return _build(saved["algo"], saved["env"], saved["size"], entry)
 
 
 def _check_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> None:
