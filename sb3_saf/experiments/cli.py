@@ -12,7 +12,6 @@ from sb3_saf.experiments.cells import Shard
 from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, find_experiment
 from sb3_saf.experiments.options import (
     PROGRAM,
-    OneLineParser,
     add_choice,
     add_engine,
     add_machine,
@@ -28,6 +27,7 @@ from sb3_saf.experiments.options import (
     wanted_of,
     workers_of,
 )
+from sb3_saf.zoo.commands import USAGE_ERROR, OneLineParser
 
 #: What a shell reports for a process that Ctrl-C has ended.
 _INTERRUPTED: Final = 130
@@ -43,8 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code: int = options.function(options)
     except (ValueError, OSError) as error:
-        print(f"{PROGRAM} {options.command}: error: {error}", file=sys.stderr)
-        return 2
+        print(f"{PROGRAM} {options.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return USAGE_ERROR
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return _INTERRUPTED

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import pandas as pd
 
 from sb3_saf.zoo.statistics import Estimate, mean_over_seeds
+
+#: Two seeds may agree by chance, and an interval then has no width.
+FEWEST_SEEDS: Final = 3
 
 
 class Comparison(NamedTuple):
@@ -27,6 +30,8 @@ class Comparison(NamedTuple):
     @property
     def sign(self) -> int:
         """1 if the first is higher, -1 if the second is, 0 if nothing can be said."""
+        if len(self.seeds) < FEWEST_SEEDS:
+            return 0
         if self.first.low > self.second.high and self.difference.low > 0:
             return 1
         if self.first.high < self.second.low and self.difference.high < 0:
@@ -36,8 +41,8 @@ class Comparison(NamedTuple):
     @property
     def verdict(self) -> str:
         """In words."""
-        if len(self.seeds) < 2:
-            return "no winner: one seed tells no spread"
+        if len(self.seeds) < FEWEST_SEEDS:
+            return f"no winner: fewer than {FEWEST_SEEDS} seeds"
         if self.sign == 0:
             return "no winner: intervals overlap"
         return "higher" if self.sign > 0 else "lower"

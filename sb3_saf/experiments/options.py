@@ -4,35 +4,27 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NoReturn, TypeVar
+from typing import Any, Final, TypeVar
 
 from hecogrid_envs.params import check_task
 from sb3_saf.experiments.cells import Choice, Protocol
-from sb3_saf.experiments.definitions import DEFAULT_SEEDS
+from sb3_saf.experiments.definitions import DEFAULT_SEEDS, Level
 from sb3_saf.experiments.engine import Engine
 from sb3_saf.experiments.local import LocalEngine
 from sb3_saf.experiments.on_ray import RayEngine, require_ray
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine
 from sb3_saf.zoo.algorithms import ALGOS
+from sb3_saf.zoo.commands import KeyValues
 from sb3_saf.zoo.names import unknown_name
 from sb3_saf.zoo.seeds import check_seed
-from sb3_saf.zoo.yaml_files import SIZES, Size, parse_value
+from sb3_saf.zoo.yaml_files import SIZES, Size
 
 PROGRAM: Final = "python -m sb3_saf.experiments"
 DEFAULT_SIZE: Final[Size] = "small"
 
 Number = TypeVar("Number", int, float, None)
-
-
-class OneLineParser(argparse.ArgumentParser):
-    """Errors in one line: the usage is what --help is for."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, and end."""
-        self.exit(2, f"{self.prog}: error: {message}\n")
 
 
 def add_choice(parser: argparse.ArgumentParser) -> None:
@@ -48,11 +40,10 @@ def add_choice(parser: argparse.ArgumentParser) -> None:
 def add_protocol(parser: argparse.ArgumentParser) -> None:
     """What is the same for all cells."""
     group = parser.add_argument_group("how cells are trained and tested (the same for all cells of a folder)")
-    group.add_argument("--game-steps", type=int, help="steps of the game to train for; default: the size's")
-    group.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="parameters of the game")
-    group.add_argument(
-        "--hyperparams", nargs="+", default=[], metavar="KEY:VALUE", help="in the place of the zoo's, for all methods"
-    )
+    group.add_argument("-n", "--game-steps", type=int, help="steps of the game to train for; default: the size's")
+    pairs: dict[str, Any] = {"nargs": "+", "action": KeyValues, "default": {}, "metavar": "KEY:VALUE"}
+    group.add_argument("--env-kwargs", **pairs, help="parameters of the game, beside the levels")
+    group.add_argument("-params", "--hyperparams", **pairs, help="in the place of the zoo's, for all methods")
     group.add_argument("--episodes", type=int, default=32, help="team episodes of each test")
     group.add_argument("--deterministic", action="store_true", help="test with the most likely actions")
 
@@ -146,26 +137,15 @@ def wanted_of(options: argparse.Namespace) -> Choice:
 
 def protocol_of(options: argparse.Namespace) -> Protocol:
     """How cells are trained and tested."""
-    overrides = _pairs("--hyperparams", options.hyperparams)
+    overrides = dict(options.hyperparams)
     if options.game_steps is not None:
         overrides["game_steps"] = positive("--game-steps", options.game_steps)
-    env_kwargs = _pairs("--env-kwargs", options.env_kwargs)
-    for dial in ("coordination", "heterogeneity"):
-        if dial in env_kwargs:
-            raise ValueError(f"{dial} is what an experiment chooses; leave it out of --env-kwargs")
-    if env_kwargs:
-        overrides["env_kwargs"] = env_kwargs
+    for dial in Level._fields:
+        if dial in options.env_kwargs:
+            raise ValueError(f"{dial} is what the experiment turns; leave it out of --env-kwargs")
+    if options.env_kwargs:
+        overrides["env_kwargs"] = options.env_kwargs
     return Protocol(size_of(options), overrides, positive("--episodes", options.episodes), options.deterministic)
-
-
-def _pairs(option: str, texts: Sequence[str]) -> dict[str, Any]:
-    pairs: dict[str, Any] = {}
-    for text in texts:
-        key, colon, value = text.partition(":")
-        if not (key and colon):
-            raise ValueError(f"{option} takes KEY:VALUE, got {text!r}")
-        pairs[key] = parse_value(value)
-    return pairs
 
 
 def machine_of(options: argparse.Namespace) -> Machine:

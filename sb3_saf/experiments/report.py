@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from sb3_saf.experiments.cells import Cell, Choice, LeftOut, Protocol, expand, merge
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level, View
 from sb3_saf.experiments.page import Content, write_page
+from sb3_saf.experiments.selection import complete, of_view, strata
 from sb3_saf.experiments.results import Results, write_text
 from sb3_saf.experiments.table import Row, rows, to_csv
 from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels
@@ -92,18 +93,6 @@ def _curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
     return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
 
 
-def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
-    """The rows that a view shows; the random team is the same wherever others were trained."""
-    shown = [
-        view.shows(Level(row.train_coordination, row.train_heterogeneity), Level(row.coordination, row.heterogeneity))
-        or (row.method == RANDOM and Level(row.coordination, row.heterogeneity) in view.levels)
-        for row in table.itertuples()
-    ]
-    rows_of_view = table[shown]
-    dial = "heterogeneity" if view.axis == "heterogeneity" else "coordination"
-    return rows_of_view.assign(**{view.axis: rows_of_view[dial]})
-
-
 def _save(figure: Figure, path: Path) -> Path:
     figure.savefig(path)
     return path
@@ -119,43 +108,24 @@ def _draw_views(experiment: Experiment, table: pd.DataFrame, folder: Path) -> li
         trained = "" if view.train is None else f", trained at {view.train}"
         drawn = shown.assign(score=shown["return_mean"])
         figure = draw_levels(drawn, view.axis, title=f"{experiment.name}{trained}", panel="task")
-        paths.append(_save(figure, folder / f"levels-{_slug(view)}.png"))
+        paths.append(_save(figure, folder / f"levels-{view.axis.replace(' = ', '-')}.png"))
     return paths
-
-
-def _slug(view: View) -> str:
-    return view.axis.replace(" = ", "-")
 
 
 def _draw_aggregates(experiment: Experiment, table: pd.DataFrame, folder: Path) -> list[Path]:
     """Interquartile means and performance profiles over everything that all methods have."""
-    common = complete(table)
+    common = complete(strata(experiment, table))
     if common.empty:
         return []
-    title = f"{experiment.name}: {common['task_and_level'].nunique()} settings, {common['seed'].nunique()} seeds"
-    figure = draw_aggregates(score_matrices(common, "task_and_level"), title=title, x_label="treasures collected (share)")
+    seeds = ", ".join(map(str, sorted(common["seed"].unique())))
+    title = f"{experiment.name}: {common['stratum'].nunique()} settings, seeds {seeds}"
+    figure = draw_aggregates(score_matrices(common, "stratum"), title=title, x_label="treasures collected (share)")
     return [_save(figure, folder / "aggregates.png")]
-
-
-def complete(table: pd.DataFrame) -> pd.DataFrame:
-    """
-    The settings and seeds that every method has, so that aggregates compare like with like.
-
-    :return: the table's rows with a column ``task_and_level``, of the tested level; none if there is nothing in common
-    """
-    names = table["task"] + " c" + table["coordination"].astype(str) + " h" + table["heterogeneity"].astype(str)
-    named = table.assign(task_and_level=names)
-    n_methods = named["method"].nunique()
-    # Settings that all methods have with some seed; of these, the seeds that all methods have everywhere.
-    methods = named.groupby("task_and_level")["method"].nunique()
-    named = named[named["task_and_level"].map(methods) == n_methods]
-    cells = named.drop_duplicates(["method", "seed", "task_and_level"]).groupby("seed").size()
-    return named[named["seed"].map(cells) == n_methods * named["task_and_level"].nunique()]
 
 
 def _draw_curves(experiment: Experiment, curves: pd.DataFrame, table: pd.DataFrame, folder: Path) -> list[Path]:
     """One figure for each setting that was trained at, with the random team as a line."""
-    paths = []
+    paths: list[Path] = []
     if curves.empty:
         return paths
     for (task, level), runs in curves.groupby(["task", "level"], sort=False):

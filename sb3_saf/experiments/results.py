@@ -102,6 +102,10 @@ class Results:
         """What a cell was trained with; empty before."""
         return _read_json(self.cell_folder(cell) / "config.json") or {}
 
+    def versions(self, cell: Cell) -> dict[str, str]:
+        """What a cell ran on; empty before."""
+        return _read_json(self.cell_folder(cell) / "versions.json") or {}
+
     def is_finished(self, cell: Cell) -> bool:
         """Whether a cell is trained."""
         return self.status(cell).get("state") == FINISHED

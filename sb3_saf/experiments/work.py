@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import platform
 import shlex
 import socket
 import subprocess
 import tempfile
 import time
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,12 +23,10 @@ from sb3_saf.experiments.cells import Cell, Protocol
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.results import FINISHED, config_of, pack, to_json
 from sb3_saf.zoo.seeds import evaluation_seed
-from sb3_saf.zoo.settings import Settings
+from sb3_saf.zoo.versions import software_versions
 
 #: Points of a learning curve at most.
 CURVE_POINTS: Final = 100
-#: Packages whose versions can change a result.
-PACKAGES: Final = ("sb3-saf", "torch", "stable-baselines3", "sb3-contrib", "numpy", "numba", "gymnasium", "pettingzoo")
 
 
 @dataclass(frozen=True)
@@ -109,7 +105,7 @@ def _train(work: Work, folder: Path) -> BaseAlgorithm:
     model.save(folder / "model.zip")
     env.close()
     monitor = folder / "monitor.csv"
-    _write(folder / "curve.csv", curve(monitor))
+    _write(folder / "curve.csv", curve(monitor, settings.n_envs))
     monitor.unlink()  # hundreds of thousands of lines at the paper's size
     return model
 
@@ -127,11 +123,12 @@ def _load(work: Work, folder: Path) -> BaseAlgorithm:
     return model
 
 
-def curve(monitor: Path) -> str:
+def curve(monitor: Path, n_games: int) -> str:
     """
     Condense the training episodes: the mean team return of equal stretches of game steps.
 
     :param monitor: a TeamMonitor's file, in the order in which episodes ended
+    :param n_games: E; a stretch has at least so many episodes
     :return: CSV of the game steps at the end of each stretch, the mean return, and the number of episodes
     """
     episodes = np.atleast_1d(np.genfromtxt(monitor, delimiter=",", skip_header=1, names=True))
@@ -139,9 +136,13 @@ def curve(monitor: Path) -> str:
         return "game_steps,mean_return,episodes\n"
     lines = ["game_steps,mean_return,episodes"]
     game_steps = np.cumsum(episodes["l"]).astype(np.int64)
-    for part in np.array_split(np.arange(len(episodes)), min(CURVE_POINTS, len(episodes))):
+    for part in np.array_split(np.arange(len(episodes)), _points(len(episodes), n_games)):
         lines.append(f"{game_steps[part[-1]]},{float(episodes['r'][part].mean())!r},{len(part)}")
     return "\n".join(lines) + "\n"
+
+
+def _points(n_episodes: int, n_games: int) -> int:
+    return max(1, min(CURVE_POINTS, n_episodes // n_games))
 
 
 def play(cell: Cell, protocol: Protocol, level: Level, model: BaseAlgorithm | None) -> dict[str, Any]:
@@ -176,7 +177,7 @@ def play(cell: Cell, protocol: Protocol, level: Level, model: BaseAlgorithm | No
 
 def command(cell: Cell, protocol: Protocol) -> str:
     """The command that trains a cell again."""
-    settings: Settings = protocol.settings(cell)
+    settings = protocol.settings(cell)
     words = ["python", "-m", "sb3_saf.train", "--algo", cell.method, "--env", settings.env_id]
     words += ["--size", protocol.size, "--seed", str(cell.seed)]
     env_kwargs = {**protocol.overrides.get("env_kwargs", {}), **cell.env_kwargs(cell.level)}
@@ -191,15 +192,8 @@ def command(cell: Cell, protocol: Protocol) -> str:
 
 def versions(model: BaseAlgorithm | None) -> dict[str, str]:
     """What a cell ran on."""
-    found = {"python": platform.python_version(), "platform": platform.platform(), "host": socket.gethostname()}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    if model is not None:
-        found["device"] = str(model.device)
-    return {**found, "commit": _commit()}
+    device = {} if model is None else {"device": str(model.device)}
+    return {**software_versions(), **device, "host": socket.gethostname(), "commit": _commit()}
 
 
 def _commit() -> str:
