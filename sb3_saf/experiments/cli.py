@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final, NoReturn
 
 from sb3_saf.experiments.cells import Shard
@@ -92,9 +93,9 @@ def _run(options: argparse.Namespace) -> int:
     results, machine = results_of(options), machine_of(options)
     choice, protocol, shard = choice_of(options), protocol_of(options), Shard.parse(options.shard)
     engine = engine_of(options)
-    _end_like_interrupted(signal.SIGTERM)
     try:
-        summary = run(experiment, choice, protocol, results, engine, machine, shard)
+        with _ending_like_interrupted(signal.SIGTERM):
+            summary = run(experiment, choice, protocol, results, engine, machine, shard)
     except KeyboardInterrupt:
         print("\ninterrupted: workers have ended, finished cells are kept; the same command continues", file=sys.stderr)
         return _INTERRUPTED
@@ -106,13 +107,18 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _end_like_interrupted(number: int) -> None:
+@contextmanager
+def _ending_like_interrupted(number: int) -> Iterator[None]:
     """Batch systems send SIGTERM before they kill: end as after Ctrl-C."""
 
     def interrupt(*_: object) -> NoReturn:
         raise KeyboardInterrupt
 
-    signal.signal(number, interrupt)
+    before = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
 
 
 def _plan(options: argparse.Namespace) -> int:

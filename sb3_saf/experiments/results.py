@@ -142,6 +142,7 @@ class Results:
             tests.mkdir(exist_ok=True)
             for path in (fresh / "tests").iterdir():
                 os.replace(path, tests / path.name)
+            (self.cell_folder(cell) / "error.txt").unlink(missing_ok=True)
 
     def add_failure(self, cell: Cell, protocol: Protocol, error: str) -> None:
         """

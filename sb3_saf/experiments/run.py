@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from textwrap import shorten
 from typing import NamedTuple
 
 from tqdm import tqdm
@@ -134,7 +135,7 @@ def _line(cell: Cell, ended: Ending, results: Results, count: str) -> str:
         tests = [(level, results.test(cell, level)) for level in cell.tests]
         returns = ", ".join(f"{test['return_mean']:.2f} ({level})" for level, test in tests if test is not None)
         return f"[{count}] {cell}: return {returns}"
-    reason = ended.error.strip().splitlines()[-1]
+    reason = shorten(ended.error.strip().splitlines()[-1], width=160, placeholder=" ...")
     if ended.final:
         return f"[{count}] {cell}: FAILED: {reason}; see {results.cell_folder(cell) / 'error.txt'}"
     return f"[{count}] {cell}: attempt {ended.attempt} failed, trying again: {reason}"

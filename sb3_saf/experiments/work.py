@@ -114,7 +114,7 @@ def _load(work: Work, folder: Path) -> BaseAlgorithm:
     """The model that was trained before; only numbers are taken from its file."""
     assert work.model is not None
     settings = work.protocol.settings(work.cell)
-    env = settings.make_env(work.cell.seed, n_envs=1)
+    env = settings.make_env(work.cell.seed)
     model = settings.make_model(env, work.cell.seed, device=work.device)
     path = folder / "trained.zip"
     path.write_bytes(work.model)
