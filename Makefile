@@ -62,7 +62,7 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	@echo "== install into $(VENV) (some minutes the first time)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
-	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,docs,dev]'
+	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,dev]'
 	@touch $@
 
 clean: ## remove caches and what was built

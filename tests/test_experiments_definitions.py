@@ -162,7 +162,10 @@ def test_bad_shards(text: str) -> None:
 
 
 def test_views_show_what_belongs_to_them() -> None:
-    inside, outside = View("coordination", (Level(1, 1), Level(2, 1))), View("coordination", (Level(1, 1),), Level(2, 1))
+    inside, outside = (
+        View("coordination", (Level(1, 1), Level(2, 1))),
+        View("coordination", (Level(1, 1),), Level(2, 1)),
+    )
     assert inside.shows(Level(1, 1), Level(1, 1))
     assert not inside.shows(Level(2, 1), Level(1, 1))
     assert outside.shows(Level(2, 1), Level(1, 1))

@@ -43,7 +43,10 @@ def test_retries(tmp_path: Path) -> None:
             (1, False, None),
             (2, True, b"second time"),
         ]
-    assert [(ended.attempt, ended.final, ended.result) for ended in found["fail"]] == [(1, False, None), (2, True, None)]
+    assert [(ended.attempt, ended.final, ended.result) for ended in found["fail"]] == [
+        (1, False, None),
+        (2, True, None),
+    ]
 
 
 def test_workers_have_the_threads_that_they_are_given(monkeypatch: pytest.MonkeyPatch) -> None:

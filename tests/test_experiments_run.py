@@ -19,7 +19,7 @@ from sb3_saf.experiments.definitions import Level, find_experiment
 from sb3_saf.experiments.results import Results, differences
 from sb3_saf.experiments.run import Machine, Summary, run
 from sb3_saf.experiments.table import Row
-from sb3_saf.experiments.work import Work, curve
+from sb3_saf.experiments.work import Work, curve, do
 from sb3_saf.zoo.seeds import evaluation_seed
 from tests.experiments_jobs import InlineEngine, read_table, wait_until
 
@@ -158,7 +158,7 @@ def _train_badly(work: Work) -> bytes:
     return good_work(work)
 
 
-good_work = run_module.do
+good_work = do
 
 
 def test_a_failed_cell_says_why_and_is_tried_again(
@@ -202,7 +202,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def _refused(folder: Path, protocol: Protocol) -> str:
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(ValueError, match="was") as error:
         run_inline(folder, TWO, protocol=protocol)
     return str(error.value)
 
@@ -260,5 +260,3 @@ def test_curve(tmp_path: Path) -> None:
     path = tmp_path / "monitor.csv"
     path.write_text("#{}\nr,l,t\n1,10,0\n2,10,0\n6,10,0\n4,10,0\n8,10,0\n")
     assert curve(path, 2) == "game_steps,mean_return,episodes\n30,3.0,3\n50,6.0,2\n"
-
-

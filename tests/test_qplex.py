@@ -1,4 +1,4 @@
-"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, and its answers to games."""
+"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, and answers to games."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_vdn_does_not(seed: int) -> None:
 
 def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
     """
-    Arxiv 2006.00587: off-policy learning with additive factorisation grows without bound; QPLEX's class holds the value.
+    Arxiv 2006.00587: off-policy learning with additive factorisation grows without bound; QPLEX's class has the value.
 
     With gamma = 0.9 the value is 10. VDN's iteration is V <- 3/4 + 1.125 V under uniform data.
     """
@@ -152,7 +152,7 @@ def test_distinct_views_give_the_numbers_of_every_row(policy: str, kind: str) ->
 
 
 def test_the_target_is_double_q_learning_by_hand() -> None:
-    """VDN without anything shared: y = r + gamma (1 - done) sum_i Q_target_i(argmax over legal actions of online Q_i)."""
+    """VDN, nothing shared: y = r + gamma (1 - done) sum_i Q_target_i(argmax over legal actions of online Q_i)."""
     env = telling_env(time_limit="bootstrap")
     model = make_model(env, mixer="vdn", learning_starts=10)
     model.learn(60 * 3)
@@ -194,7 +194,9 @@ def test_the_gradient_goes_into_the_online_networks_alone() -> None:
         np.random.seed(0)  # noqa: NPY002
         team_errors(one.policy, one._sample(64), 0.9).loss.backward()
         attached[detach] = next(one.policy.features_extractor.parameters()).grad
-    assert not th.equal(attached[True], attached[False])
+    with_gradient, without = attached[False], attached[True]
+    assert with_gradient is not None and without is not None
+    assert not th.equal(with_gradient, without)
 
 
 def test_memory_in_training_is_memory_in_play() -> None:
@@ -386,7 +388,7 @@ def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], onnx:
     obs = env.reset()
     for runtime in ("torch", "onnx") if onnx else ("torch",):
         for agent in range(3):
-            actor = Actor.load(tmp_path / "actor", agent=agent, runtime=runtime)  # type: ignore[arg-type]
+            actor = Actor.load(tmp_path / "actor", agent=agent, runtime=runtime)
             own = obs["obs"][agent::3]
             expected = model.predict({"obs": own, "agent": np.full(4, agent)}, deterministic=True)[0]
             assert np.array_equal(actor.act(own), expected)

@@ -217,8 +217,8 @@ class Shard(NamedTuple):
     :param count: parts
     """
 
-    index: int = 1
-    count: int = 1
+    index: int = 1  # type: ignore[assignment]  # hides methods of tuples that nobody needs here
+    count: int = 1  # type: ignore[assignment]
 
     @classmethod
     def parse(cls, text: str) -> Shard:

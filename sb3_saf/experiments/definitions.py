@@ -14,6 +14,7 @@ DEFAULT_SEEDS: Final[dict[Size, tuple[int, ...]]] = {"paper": (0, 1, 2), "small"
 #: The untrained team that every experiment has beside its methods.
 RANDOM: Final = "random"
 
+
 class Level(NamedTuple):
     """
     How hard a task is.
@@ -139,12 +140,8 @@ _ALL: Final = (
         ("saf-no-pool", *_METHODS),
         (_COORDINATION, _HETEROGENEITY),
     ),
-    Experiment(
-        "ood-coordination", "robustness to unseen coordination", _TWO_TASKS, _METHODS, (_OOD_COORDINATION,)
-    ),
-    Experiment(
-        "ood-heterogeneity", "robustness to unseen heterogeneity", _TWO_TASKS, _METHODS, (_OOD_HETEROGENEITY,)
-    ),
+    Experiment("ood-coordination", "robustness to unseen coordination", _TWO_TASKS, _METHODS, (_OOD_COORDINATION,)),
+    Experiment("ood-heterogeneity", "robustness to unseen heterogeneity", _TWO_TASKS, _METHODS, (_OOD_HETEROGENEITY,)),
     Experiment(
         "ood-ablation",
         "what does the pool give out of distribution?",

@@ -8,7 +8,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, cast
@@ -31,7 +31,7 @@ class _Worker:
     def __init__(self, threads: int) -> None:
         context = mp.get_context("spawn")  # forks of a process with threads may hang
         ours, theirs = context.Pipe()
-        self.connection: Connection[Any, Any] = cast("Connection[Any, Any]", ours)
+        self.connection: Connection[Any, Any] = ours
         self.process: BaseProcess = context.Process(target=_serve, args=(theirs,), daemon=True)
         self.job: Job | None = None
         self.attempt = 0
@@ -42,10 +42,8 @@ class _Worker:
     def give(self, function: JobFunction, job: Job, attempt: int) -> None:
         """Start a job; a worker that has died is found when its answer is read."""
         self.job, self.attempt = job, attempt
-        try:
+        with suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send((function, job.payload()))
-        except (BrokenPipeError, ConnectionResetError):
-            pass
 
     def answer(self) -> tuple[bytes | None, str | None]:
         """The job's result and error; a dead process is an error too."""

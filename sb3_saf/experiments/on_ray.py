@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster, or on a Ray that is started on this machine. Results travel through Ray, over no shared disk."""
+"""Jobs on a Ray cluster, or on a Ray started on this machine. Results travel through Ray, over no shared disk."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ class RayEngine:
             self._check_resources(ray)
             # Attempts are counted here, so that those of failures and of lost nodes are the same ones.
             task = ray.remote(num_cpus=self.cpus, num_gpus=self.gpus, max_retries=0)(guarded)
-            queue, running = deque((job, 1) for job in jobs), {}
+            queue = deque((job, 1) for job in jobs)
+            running: dict[Any, Any] = {}
             try:
                 while queue or running:
                     while queue and len(running) < self._most_at_once(ray):
@@ -70,8 +71,8 @@ class RayEngine:
             ray.init(address=self.address or "local", **options)
         except ConnectionError as error:
             raise ValueError(
-                f"no Ray cluster at --address {self.address} ({_first_line(error)}); start one with `ray start --head`, "
-                "or leave --address out to start Ray on this machine"
+                f"no Ray cluster at --address {self.address} ({_first_line(error)}); start one with `ray start "
+                "--head`, or leave --address out to start Ray on this machine"
             ) from None
         try:
             yield
@@ -128,7 +129,7 @@ def require_ray() -> ModuleType:
         import ray
     except ImportError:
         raise ValueError(
-            "--ray needs Ray, which is not installed: pip install 'sb3-saf[ray]', or leave --ray out to run in processes "
-            "of this machine"
+            "--ray needs Ray, which is not installed: pip install 'sb3-saf[ray]', or leave --ray out to run in "
+            "processes of this machine"
         ) from None
     return ray

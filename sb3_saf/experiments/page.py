@@ -88,7 +88,9 @@ def _numbers(column: pd.Series) -> str:
 def _missing(content: Content) -> str:
     lines = [f"- {left_out}" for left_out in content.left_out]
     if content.missing:
-        lines.append(f"- **{len(content.missing)} of {len(content.cells)} cells are missing**; numbers below lack them:")
+        lines.append(
+            f"- **{len(content.missing)} of {len(content.cells)} cells are missing**; numbers below lack them:"
+        )
         for cell in content.missing[:_MOST_NAMED]:
             failed = content.results.status(cell).get("state") == FAILED
             why = f"failed, see `{content.results.cell_folder(cell) / 'error.txt'}`" if failed else "not run yet"
@@ -183,8 +185,9 @@ def _comparisons(content: Content, view: View) -> str:
     head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", f"{ours} is"]
     text = (
         "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
-        f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than {FEWEST_SEEDS} "
-        "seeds, no winner is named. Every line is a test of its own; many lines name a winner by chance now and then."
+        f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than "
+        f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner by chance now "
+        "and then."
     )
     title = f"## Paired comparisons by {view.axis}{_trained(view)}"
     return "\n".join([title, "", text, "", *markdown_table(head, body)])
@@ -193,9 +196,7 @@ def _comparisons(content: Content, view: View) -> str:
 def _compared(rows: pd.DataFrame, ours: str, others: Sequence[str]) -> Iterator[list[str]]:
     for (task, level), here in rows.groupby(["task", "level"], sort=False):
         for other in others:
-            first, second = (
-                here.loc[here["method"] == method, ["seed", "return_mean"]] for method in (ours, other)
-            )
+            first, second = (here.loc[here["method"] == method, ["seed", "return_mean"]] for method in (ours, other))
             found = compare(first, second)
             if found is not None:
                 numbers = [show(found.first), show(found.second), show(found.difference)]

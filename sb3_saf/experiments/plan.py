@@ -59,7 +59,7 @@ def make_plan(
 
 def _factors(cells: Sequence[Cell]) -> str:
     """What a number of cells is made of."""
-    counts = {
+    counts: dict[str, set[object]] = {
         "methods": {cell.method for cell in cells},
         "settings": {(cell.task, cell.level) for cell in cells},
         "seeds": {cell.seed for cell in cells},

@@ -10,10 +10,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_saf.experiments.cells import Cell, Choice, LeftOut, Protocol, expand, merge
-from sb3_saf.experiments.definitions import RANDOM, Experiment, Level, View
+from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
 from sb3_saf.experiments.page import Content, write_page
-from sb3_saf.experiments.selection import complete, of_view, strata
 from sb3_saf.experiments.results import Results, write_text
+from sb3_saf.experiments.selection import complete, of_view, strata
 from sb3_saf.experiments.table import Row, rows, to_csv
 from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels
 from sb3_saf.zoo.statistics import score_matrices

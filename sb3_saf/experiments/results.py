@@ -209,8 +209,8 @@ class Results:
             lock.acquire(timeout=0)
         except filelock.Timeout:
             raise ValueError(
-                f"another process is running part {shard} of {self.folder}; wait for it, divide the cells among processes "
-                "with --shard 1/2 and --shard 2/2, or choose another folder with -f"
+                f"another process is running part {shard} of {self.folder}; wait for it, divide the cells among "
+                "processes with --shard 1/2 and --shard 2/2, or choose another folder with -f"
             ) from None
         self.scratch = self.folder / "scratch" / part
         shutil.rmtree(self.scratch, ignore_errors=True)

@@ -89,9 +89,7 @@ def _opening(
     return "\n".join(lines)
 
 
-def _run_all(
-    todo: Sequence[Cell], protocol: Protocol, results: Results, engine: Engine, machine: Machine
-) -> Summary:
+def _run_all(todo: Sequence[Cell], protocol: Protocol, results: Results, engine: Engine, machine: Machine) -> Summary:
     cells = {cell.id: cell for cell in todo}
     jobs = [Job(cell.id, partial(_work, cell, protocol, results, machine)) for cell in todo]
     finished, failed = 0, []

@@ -118,7 +118,7 @@ def _load(work: Work, folder: Path) -> BaseAlgorithm:
     model = settings.make_model(env, work.cell.seed, device=work.device)
     path = folder / "trained.zip"
     path.write_bytes(work.model)
-    model.set_parameters(path, device=work.device)
+    model.set_parameters(str(path), device=work.device)
     path.unlink()
     return model
 

@@ -327,6 +327,7 @@ class QPLEX(OffPolicyAlgorithm):
         if not callback.on_step():
             return RolloutReturn(self.n_games, 0, continue_training=False)
         self._update_info_buffer(infos, dones)
+        assert isinstance(new_obs, dict)
         self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._on_step()
@@ -353,7 +354,7 @@ class QPLEX(OffPolicyAlgorithm):
         assert isinstance(self._last_obs, dict) and isinstance(new_obs, dict)
         assert isinstance(replay_buffer, TeamReplayBuffer)
         keys = [key for key in (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY) if key in new_obs]
-        after = {key: new_obs[key] for key in keys}
+        after: dict[str, Array] = {key: new_obs[key] for key in keys}
         ended = np.flatnonzero(dones)
         if len(ended):
             after = {key: part.copy() for key, part in after.items()}

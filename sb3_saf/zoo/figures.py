@@ -76,7 +76,9 @@ def _finish(figure: Figure, axes: Sequence[Axes], title: str | None, n_entries: 
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             if label not in labels:
                 handles, labels = [*handles, handle], [*labels, label]
-    figure.legend(handles, labels, loc="outside lower center", ncols=max(1, min(n_entries, 2 * len(axes), 5)), frameon=False)
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=max(1, min(n_entries, 2 * len(axes), 5)), frameon=False
+    )
     if title:
         figure.suptitle(title)
     return figure
