@@ -186,8 +186,8 @@ def _comparisons(content: Content, view: View) -> str:
     text = (
         "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
         f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than "
-        f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner by chance now "
-        "and then."
+        f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner "
+        "by chance now and then."
     )
     title = f"## Paired comparisons by {view.axis}{_trained(view)}"
     return "\n".join([title, "", text, "", *markdown_table(head, body)])
