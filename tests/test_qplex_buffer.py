@@ -171,7 +171,7 @@ def test_rows_that_are_no_teams_are_refused() -> None:
     with pytest.raises(ValueError, match="at least one step"):
         buffer.sample(3)
     rows = story.rows(story.now)
-    rest = (np.zeros(6), np.zeros(6), np.zeros(6), [{}] * 6)
+    rest: Any = (np.zeros(6), np.zeros(6), np.zeros(6), [{}] * 6)
     with pytest.raises(ValueError, match="game-major, then agent"):
         buffer.add({**rows, "agent": rows["agent"][::-1]}, rows, *rest)
     with pytest.raises(ValueError, match="of shape"):
