@@ -1,4 +1,4 @@
-"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, and answers to games."""
+"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, games with an answer."""
 
 from __future__ import annotations
 
@@ -83,10 +83,10 @@ def same(one: list[th.Tensor], other: list[th.Tensor]) -> bool:
 def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:
     """Payoff of the greedy joint action after learning from 1,000 uniformly drawn ones."""
     env = make_team_env(MatrixGame(ONE_STEP), n_envs=8, active=False)
-    nets = {"n_kernels": 10, "kernel_arch": (64, 64)}
+    nets = {"n_kernels": 10, "kernel_arch": (64, 64), "mixer_hidden": 64, "net_arch": [128, 128]}
     model = make_model(
         env, mixer=mixer, seed=seed, learning_rate=1e-3, policy_kwargs=nets, buffer_size=1_000, learning_starts=1_000,
-        batch_size=64,
+        batch_size=32,
     )  # fmt: skip
     model.learn(1_000 * 2)
     model.learning_starts, model.gradient_steps = 0, n_updates
@@ -98,7 +98,7 @@ def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:
 @pytest.mark.parametrize("seed", range(3))
 def test_qplex_learns_the_joint_action_that_is_worth_8(seed: int) -> None:
     """RESULTS_ONE_STEP"""
-    assert learn_matrix("qplex", seed, n_updates=1_200) == 8.0
+    assert learn_matrix("qplex", seed, n_updates=1_500) == 8.0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -109,7 +109,7 @@ def test_vdn_does_not(seed: int) -> None:
 
 def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
     """
-    Arxiv 2006.00587: off-policy learning with additive factorisation grows without bound; QPLEX's class has the value.
+    Off-policy learning with additive factorisation grows without bound (arXiv 2006.00587); QPLEX finds the value.
 
     With gamma = 0.9 the value is 10. VDN's iteration is V <- 3/4 + 1.125 V under uniform data.
     """
@@ -128,8 +128,7 @@ def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
             model._on_step()
         steps = model._buffer().sample(400)
         stays = (steps.now.own[:, 0, 1] == 1) & (steps.actions == 0).all(dim=1)
-        values[mixer] = float(team_errors(model.policy, steps, 0.9).q_tot[stays].mean())
-    print(values)
+        values[mixer] = team_errors(model.policy, steps, 0.9).q_tot[stays].mean().item()
     assert values["vdn"] > 14.0
     assert 8.0 < values["qplex"] < 12.0
 
@@ -152,7 +151,7 @@ def test_distinct_views_give_the_numbers_of_every_row(policy: str, kind: str) ->
 
 
 def test_the_target_is_double_q_learning_by_hand() -> None:
-    """VDN, nothing shared: y = r + gamma (1 - done) sum_i Q_target_i(argmax over legal actions of online Q_i)."""
+    """VDN row by row: y = r + gamma (1 - done) sum_i Q_target_i(the best legal action of the online Q_i)."""
     env = telling_env(time_limit="bootstrap")
     model = make_model(env, mixer="vdn", learning_starts=10)
     model.learn(60 * 3)
@@ -193,10 +192,10 @@ def test_the_gradient_goes_into_the_online_networks_alone() -> None:
         one.policy.optimizer.zero_grad()
         np.random.seed(0)  # noqa: NPY002
         team_errors(one.policy, one._sample(64), 0.9).loss.backward()
-        attached[detach] = next(one.policy.features_extractor.parameters()).grad
-    with_gradient, without = attached[False], attached[True]
-    assert with_gradient is not None and without is not None
-    assert not th.equal(with_gradient, without)
+        gradient = next(one.policy.features_extractor.parameters()).grad
+        assert gradient is not None
+        attached[detach] = gradient
+    assert not th.equal(attached[True], attached[False])
 
 
 def test_memory_in_training_is_memory_in_play() -> None:
@@ -280,6 +279,7 @@ def test_logs_tell_what_is_learned(tmp_path: Path) -> None:
     model = make_model()
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(100 * 3, log_interval=8)
+    model.logger.close()
     header, *lines = (tmp_path / "progress.csv").read_text().splitlines()
     wanted = {"train/q_tot", "train/td_error", "train/loss", "rollout/exploration_rate", "rollout/replay_buffer_size"}
     wanted |= {f"lambda/agent_{i}" for i in range(3)} | {"time/game_steps", "rollout/ep_rew_mean"}
@@ -303,42 +303,21 @@ def test_seeded_runs_repeat_bit_for_bit(policy: str) -> None:
 @pytest.mark.parametrize("policy", POLICIES)
 def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path: Path) -> None:
     """Model, replay buffer, games and random numbers restored."""
-    whole = make_model(ToyTeams(), policy)
-    whole.learn(120 * 3)
-    env = ToyTeams()
-    model = make_model(env, policy)
-
-    class Stop(BaseCallback):
-        def _on_step(self) -> bool:
-            return self.num_timesteps <= 60 * 3
-
-    model.learn(120 * 3, callback=Stop())
-    # The step that the callback stopped at was played, but not stored.
-    model = make_model(env := ToyTeams(), policy)
-    model._total_timesteps = 0
-    model.learn(60 * 3)
+    model = make_model(ToyTeams(), policy).learn(60 * 3)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
     numbers = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
-    expected = weights(copied := _continued(model, env, numbers))
-    again = QPLEX.load(tmp_path / "model", env=copy.deepcopy(env_before(copied)), force_reset=False, device="cpu")
+    games = copy.deepcopy(model.env)
+    again = QPLEX.load(tmp_path / "model", env=games, force_reset=False, device="cpu")
     again.load_replay_buffer(tmp_path / "buffer")
-    assert same(expected, weights(_continued(again, None, numbers)))
-    assert not same(expected, weights(whole)) or policy  # schedules differ: exploration falls over another total
-
-
-def env_before(model: QPLEX) -> Any:
-    return model._env_before  # type: ignore[attr-defined]
-
-
-def _continued(model: QPLEX, env: Any, numbers: Any) -> QPLEX:
-    """Sixty game steps more from given random numbers."""
-    if env is not None:
-        model._env_before = copy.deepcopy(model.env)  # type: ignore[attr-defined]
-    random.setstate(numbers[0])
-    np.random.set_state(numbers[1])  # noqa: NPY002
-    th.set_rng_state(numbers[2])
-    return model.learn(60 * 3, reset_num_timesteps=False)
+    before = weights(model)
+    for each in (model, again):
+        random.setstate(numbers[0])
+        np.random.set_state(numbers[1])  # noqa: NPY002
+        th.set_rng_state(numbers[2])
+        each.learn(60 * 3, reset_num_timesteps=False)
+    assert same(weights(model), weights(again)) and not same(before, weights(again))
+    assert again.num_timesteps == 120 * 3
 
 
 def test_a_loaded_model_acts_as_the_saved(tmp_path: Path) -> None:

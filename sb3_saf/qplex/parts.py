@@ -45,7 +45,7 @@ class QPLEXParts:
     mixer_hidden: int = 64
     n_kernels: int = 4
     kernel_arch: tuple[int, ...] = (64,)
-    detach_state: bool = True
+    detach_state: bool = False
     lstm_hidden_size: int = 0
     sequence_length: int = 16
     burn_in: int = 8

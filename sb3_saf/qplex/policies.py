@@ -157,8 +157,8 @@ class QPLEXPolicy(TeamRowsPolicy):
         return online, list(self.target_networks.parameters())
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names: tuple[str, ...] = ("net_arch", "activation_fn", "ortho_init", "distinct", "chunk_size")
-        names += ("features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs")
+        names = ["net_arch", "activation_fn", "ortho_init", "distinct", "chunk_size"]
+        names += ["features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs"]
         own = {name: getattr(self, name) for name in names}
         data = super()._get_constructor_parameters() | own | asdict(self.parts)
         return data | {"lr_schedule": self._dummy_schedule}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 import torch as th
@@ -43,7 +43,8 @@ from sb3_saf.qplex.replay_buffer import TeamReplayBuffer, TeamReplaySamples
 
 SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
 
-_TERMINAL_OBSERVATION = "terminal_observation"
+_TERMINAL_OBSERVATION: Final = "terminal_observation"
+_STORED_KEYS: Final = (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY)
 
 
 class QPLEX(OffPolicyAlgorithm):
@@ -322,12 +323,12 @@ class QPLEX(OffPolicyAlgorithm):
         callback.on_rollout_start()
         actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
         new_obs, rewards, dones, infos = env.step(actions)
+        assert isinstance(new_obs, dict)
         self.num_timesteps += env.num_envs
         callback.update_locals(locals())
         if not callback.on_step():
             return RolloutReturn(self.n_games, 0, continue_training=False)
         self._update_info_buffer(infos, dones)
-        assert isinstance(new_obs, dict)
         self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._on_step()
@@ -353,8 +354,10 @@ class QPLEX(OffPolicyAlgorithm):
         """Store one step of all games; of games that ended, with their last observations."""
         assert isinstance(self._last_obs, dict) and isinstance(new_obs, dict)
         assert isinstance(replay_buffer, TeamReplayBuffer)
-        keys = [key for key in (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY) if key in new_obs]
-        after: dict[str, Array] = {key: new_obs[key] for key in keys}
+        keys: list[str] = [
+            key for key in (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY) if key in new_obs
+        ]
+        after = {key: new_obs[key] for key in keys}
         ended = np.flatnonzero(dones)
         if len(ended):
             after = {key: part.copy() for key, part in after.items()}
