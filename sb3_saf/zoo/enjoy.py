@@ -107,8 +107,7 @@ def load_team(options: argparse.Namespace) -> TrainedTeam:
     :param options: of the command line
     """
     require_zoo()
-    from huggingface_sb3 import EnvironmentName
-    from rl_zoo3.utils import get_model_path
+    from rl_zoo3.utils import EnvironmentName, get_model_path  # type: ignore[attr-defined]  # its own import
 
     from sb3_saf.zoo.runs import Run
 

@@ -170,7 +170,9 @@ def draw_aggregates(
         left.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color="black", linewidth=1.5)
     left.set_yticks(range(len(methods)), methods)
     left.invert_yaxis()
+    left.margins(x=0.1)
     left.use_sticky_edges = False  # bars end inside the axes
+    left.autoscale_view()
     left.set(xlabel=x_label, title="interquartile mean")
     top = max(float(runs.max()) for runs in scores.values())
     thresholds = np.linspace(0, top if top > 0 else 1, 101)

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import shutil
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,59 +28,13 @@ from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.callbacks import CheckpointInGameSteps, TrialCallback, ZooEvalCallback
+from sb3_saf.zoo.callbacks import CheckpointInGameSteps, GameStepsProgressBar, TrialCallback, ZooEvalCallback
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
+from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
-from sb3_saf.zoo.settings import Settings, load_settings
+from sb3_saf.zoo.settings import Settings
 from sb3_saf.zoo.storage import open_storage
 from sb3_saf.zoo.versions import software_versions
-from sb3_saf.zoo.yaml_files import Size, merge
-
-
-@dataclass(frozen=True)
-class Request:
-    """
-    What the user asked for and RL-Zoo3 has no words for.
-
-    :param algo: name in ``ALGOS``
-    :param env_id: the environment
-    :param size: the size
-    :param env_kwargs: parameters of the level
-    :param eval_env_kwargs: what differs in the level of evaluation
-    :param overrides: settings that win over the files
-    :param config: a file in place of the algorithm's
-    :param eval_freq: game steps between evaluations; 0 or less for none, None for 20 in a run
-    :param save_freq: game steps between checkpoints; 0 or less for none
-    :param deterministic_eval: whether evaluation takes the most likely actions
-    :param trial: number of the trial to train again, or ``"best"``
-    :param options: all options as given, to be kept
-    :param command: the command, to be kept
-    """
-
-    algo: str
-    env_id: str
-    size: Size = "paper"
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    eval_env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    config: Path | None = None
-    eval_freq: int | None = None
-    save_freq: int = -1
-    deterministic_eval: bool = False
-    trial: int | str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-    command: str = ""
-
-    def settings(self, sampled: Mapping[str, Any] | None = None, *, evaluation: bool = False) -> Settings:
-        """
-        The settings asked for.
-
-        :param sampled: settings of a trial; what the user gave wins over them
-        :param evaluation: with the level of evaluation
-        """
-        env_kwargs = {**self.env_kwargs, **(self.eval_env_kwargs if evaluation else {})}
-        overrides = merge(sampled or {}, self.overrides)
-        return load_settings(self.algo, self.env_id, self.size, env_kwargs, overrides, self.config)
 
 
 class TeamExperimentManager(ExperimentManager):
@@ -114,6 +67,8 @@ class TeamExperimentManager(ExperimentManager):
         self.deterministic_eval = request.deterministic_eval
         # RL-Zoo3 would divide these by the number of games.
         self.eval_freq = self.save_freq = -1
+        self._envs: list[VecEnv] = []
+        self._has_folder = False
         HYPERPARAMS_SAMPLER[algo] = self._sample
         HYPERPARAMS_CONVERTER[algo] = to_overrides  # type: ignore[assignment]  # their dict is typed by its first entry
 
@@ -127,6 +82,11 @@ class TeamExperimentManager(ExperimentManager):
         """
         self.settings = self.request.settings(self._trial_overrides())
         self._eval_settings = self.request.settings(self._trial_overrides(), evaluation=True)
+        if self._eval_settings.n_agents != self.settings.n_agents:
+            raise ValueError(
+                f"evaluation needs the {self.settings.n_agents} agents of training, got "
+                f"n_agents={self._eval_settings.n_agents}; leave n_agents out of --eval-env-kwargs"
+            )
         print(yaml.safe_dump(self.settings.as_dict(), sort_keys=False), end="")
         return self._arguments(self.settings), {**self.settings.as_dict(), "seed": self.seed}
 
@@ -164,14 +124,36 @@ class TeamExperimentManager(ExperimentManager):
     # --- one run ----------------------------------------------------------------------------------------------------
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """Make folder, environments, callbacks and model."""
-        with user_errors(AssertionError, TypeError):  # SB3's checks of what it is given
-            prepared = super().setup_experiment()
+        """Make folder, environments, callbacks and model; if that fails, nothing is left."""
+        try:
+            with user_errors(AssertionError, TypeError):  # SB3's checks of what it is given
+                prepared = super().setup_experiment()
+        except CommandError:
+            self._close_envs()
+            if self._has_folder:
+                shutil.rmtree(self.save_path)  # it would pass for the latest run
+            raise
         if prepared is not None:
             model, _ = prepared
             # SB3 would call every run PPO.
             model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
         return prepared
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        Train.
+
+        :param model: from :meth:`setup_experiment`
+        """
+        try:
+            super().learn(model)
+        finally:
+            self._close_envs()
+
+    def _close_envs(self) -> None:
+        """Close those of training again, which does no harm, and those of evaluation, which RL-Zoo3 leaves open."""
+        while self._envs:
+            self._envs.pop().close()
 
     def create_log_folder(self) -> None:
         """Take a folder of our own; tuning leaves none, which would pass for the latest run."""
@@ -180,6 +162,7 @@ class TeamExperimentManager(ExperimentManager):
         while True:
             try:
                 Path(self.save_path).mkdir(parents=True)
+                self._has_folder = True
                 break
             except FileExistsError:  # another process was faster
                 number = get_latest_run_id(self.log_path, self.env_name) + 1
@@ -200,18 +183,16 @@ class TeamExperimentManager(ExperimentManager):
         env = settings.make_env(
             self.seed, evaluation=eval_env, monitor_dir=None if quiet else self.save_path, n_envs=n_envs
         )
-        if eval_env and self._eval_settings.n_agents != self.settings.n_agents:
-            raise ValueError(
-                f"evaluation needs the {self.settings.n_agents} agents of training, got "
-                f"n_agents={self._eval_settings.n_agents}; leave n_agents out of --eval-env-kwargs"
-            )
+        if not self.optimize_hyperparameters:  # a trial closes its own
+            self._envs.append(env)
         return env
 
     def create_callbacks(self) -> None:
         """Add the progress bar, checkpoints and evaluation."""
-        super().create_callbacks()
         if self.optimize_hyperparameters:
-            return
+            return  # trials have callbacks of their own
+        if self.show_progress:
+            self.callbacks.append(GameStepsProgressBar())
         if self.request.save_freq > 0:
             self.callbacks.append(CheckpointInGameSteps(self.request.save_freq, self.save_path, self.verbose))
         eval_freq = self.request.eval_freq

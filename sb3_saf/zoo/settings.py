@@ -16,6 +16,7 @@ from typing import Any, Final, get_args
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from hecogrid_envs.params import TASK_NAMES, HECOGridParams, TaskName
+from sb3_saf.common.buffers import TeamRolloutBuffer
 from sb3_saf.common.centralized import CentralizedValueWrapper, TimeLimit
 from sb3_saf.common.env import make_team_env
 from sb3_saf.zoo.algorithms import ALGOS, AlgorithmSpec, find_algorithm
@@ -257,6 +258,7 @@ def _build(algo: str, env_id: str, size: Size, entry: dict[str, Any]) -> Setting
     if own["n_minibatches"] is not None:
         n_minibatches = _count("n_minibatches", own["n_minibatches"])
         plain["batch_size"] = _teams(spec, plain, n_minibatches, n_envs) * int(env_kwargs["n_agents"])
+    _check_batch_size(plain.get("batch_size"), int(env_kwargs["n_agents"]), plain.get("rollout_buffer_class"))
     hints = algorithm_arguments(spec.algorithm)
     hyperparams = {key: resolve(key, value, hints[key]) for key, value in plain.items()}
     if own["policy_kwargs"]:
@@ -287,9 +289,21 @@ def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_
     return -(-_count("n_steps", n_steps) * n_envs // n_minibatches)
 
 
+def _check_batch_size(batch_size: object, n_agents: int, buffer: object) -> None:
+    """Minibatches of the team buffer are whole teams, which it would say only after the first rollout."""
+    if buffer == TeamRolloutBuffer.__name__ and batch_size is not None and _count("batch_size", batch_size) % n_agents:
+        raise ValueError(
+            f"batch_size counts rows and must be a multiple of n_agents={n_agents}, got {batch_size}; n_minibatches "
+            "says how many parts a rollout is divided into instead"
+        )
+
+
 def _resolved_policy_kwargs(spec: AlgorithmSpec, given: Mapping[str, Any]) -> dict[str, Any]:
     hints = policy_arguments(spec.policy_class)
     for key in given:
         if key not in hints:
             raise unknown_name(f"argument of {spec.policy}", key, hints)
     return {key: resolve(key, value, hints[key]) for key, value in given.items()}
+
+
+__all__ = ["ALGOS", "ENV_IDS", "SIZES", "TASK_OF_ENV", "Settings", "Size", "load_settings", "saved_settings"]

@@ -9,16 +9,14 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from sb3_saf.zoo.algorithms import ALGOS
 from sb3_saf.zoo.commands import CommandError, KeyValues, OneLineParser, replaced, require_zoo, run_command, user_errors
+from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.seeds import MAX_SEED, check_seed
 from sb3_saf.zoo.settings import ENV_IDS
 from sb3_saf.zoo.yaml_files import SIZES, merge
-
-if TYPE_CHECKING:
-    from sb3_saf.zoo.manager import Request
 
 PROGRAM: Final = "python -m sb3_saf.train"
 
@@ -141,7 +139,7 @@ def train(arguments: Sequence[str] | None = None) -> None:
         overrides = merge(overrides, {"game_steps": options.game_steps})
     require_zoo()
     from sb3_saf.zoo.carriers import register_carriers
-    from sb3_saf.zoo.manager import Request, install_algorithm
+    from sb3_saf.zoo.manager import install_algorithm
 
     request = Request(
         algo=options.algo,

@@ -26,6 +26,8 @@ Frame = npt.NDArray[np.uint8]
 
 #: Game steps per second.
 FPS: Final = 8
+#: Variables of which one is set where windows can be opened.
+_DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 
 
 class Screen(NamedTuple):
@@ -76,6 +78,9 @@ def _checked_file(options: argparse.Namespace) -> Path | None:
 
 def _open_window(env: HECOGridEnv) -> None:
     try:
+        # Asked, SDL would print complaints of its own.
+        if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in _DISPLAYS):
+            raise RuntimeError("no window can be opened (there is no display)")
         env.reset(seed=0)
     except (ImportError, RuntimeError) as error:
         reason = str(error).partition(";")[0]
