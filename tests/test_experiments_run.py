@@ -98,7 +98,7 @@ def test_the_command_trains_the_same_model(undisturbed: Path, tmp_path: Path) ->
     assert all(th.equal(theirs[name], ours[name]) for name in ours)
 
 
-def test_seeds_and_methods_differ_and_test_games_are_shared(undisturbed: Path) -> None:
+def test_seeds_and_methods_differ(undisturbed: Path) -> None:
     returns = {
         (row["method"], row["seed"]): row["returns"]
         for row in read_table(undisturbed / "joint" / "table.csv")

@@ -19,7 +19,7 @@ from stable_baselines3 import PPO
 
 from sb3_saf import SAFPolicy
 from sb3_saf.zoo import train as zoo_train
-from sb3_saf.zoo.callbacks import own_generators
+from sb3_saf.zoo.callbacks import GameStepsProgressBar, own_generators
 from sb3_saf.zoo.settings import ENV_IDS, load_settings
 
 rl_zoo_train = pytest.importorskip("rl_zoo3.train")
@@ -163,6 +163,14 @@ def test_a_progress_bar_is_for_terminals(terminal: bool, monkeypatch: pytest.Mon
     options = zoo_train.make_parser().parse_args(["--no-progress"])
     zoo_train._complete(options)
     assert not options.progress
+
+
+def test_the_progress_bar_counts_game_steps() -> None:
+    settings = load_settings("ippo", ENV, "smoke", overrides={"game_steps": 80})
+    bar = GameStepsProgressBar()
+    settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=bar)
+    assert (bar.pbar.n, bar.pbar.total) == (80, 80)
+    GameStepsProgressBar().on_training_end()  # of a training that never began
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)

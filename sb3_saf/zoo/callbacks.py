@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import optuna
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.utils import set_random_seed
+from tqdm.rich import tqdm
 
 from sb3_saf.common.callbacks import TeamEvalCallback
 from sb3_saf.common.evaluation import EvaluationResult
 from sb3_saf.common.game_steps import game_steps
+from sb3_saf.common.teams import require_n_agents
 from sb3_saf.zoo.seeds import MAX_SEED, evaluation_seed
 
 
@@ -93,6 +95,24 @@ class TrialCallback(ZooEvalCallback):
 
     def _on_training_end(self) -> None:
         if not self.is_pruned:
+            super()._on_training_end()
+
+
+class GameStepsProgressBar(ProgressBarCallback):
+    """SB3's progress bar, which counts the steps of every agent, in game steps."""
+
+    def _on_training_start(self) -> None:
+        n_agents = require_n_agents(self.training_env)
+        total = self.locals["total_timesteps"] - self.model.num_timesteps
+        self.pbar = tqdm(total=total // n_agents, unit=" game steps")
+
+    def _on_step(self) -> bool:
+        self.pbar.update(self.training_env.num_envs // require_n_agents(self.training_env))
+        return True
+
+    def _on_training_end(self) -> None:
+        # RL-Zoo3 ends its first callback even if training never began, which would hide why.
+        if hasattr(self, "pbar"):
             super()._on_training_end()
 
 

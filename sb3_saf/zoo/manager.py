@@ -28,7 +28,7 @@ from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.callbacks import CheckpointInGameSteps, TrialCallback, ZooEvalCallback
+from sb3_saf.zoo.callbacks import CheckpointInGameSteps, GameStepsProgressBar, TrialCallback, ZooEvalCallback
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
@@ -189,9 +189,10 @@ class TeamExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         """Add the progress bar, checkpoints and evaluation."""
-        super().create_callbacks()
         if self.optimize_hyperparameters:
-            return
+            return  # trials have callbacks of their own
+        if self.show_progress:
+            self.callbacks.append(GameStepsProgressBar())
         if self.request.save_freq > 0:
             self.callbacks.append(CheckpointInGameSteps(self.request.save_freq, self.save_path, self.verbose))
         eval_freq = self.request.eval_freq

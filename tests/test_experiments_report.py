@@ -1,0 +1,163 @@
+"""``run`` and ``report`` of the coordination experiment as a user types them, and what reports say."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from sb3_saf.experiments import cli
+from sb3_saf.experiments.comparisons import compare
+from sb3_saf.experiments.definitions import EXPERIMENTS
+from sb3_saf.experiments.selection import complete
+from sb3_saf.zoo.statistics import Estimate
+from tests.experiments_jobs import read_table
+
+pytest.importorskip("rliable")
+LEVELS = [f"{task}-c{c}-h1" for task in ("TeamTogether", "TeamSupport", "KeyForTreasure") for c in (1, 2, 3)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``run coordination --size smoke`` in two processes, as the README has it."""
+    path = tmp_path_factory.mktemp("coordination")
+    assert cli.main(["run", "coordination", "--size", "smoke", "--workers", "2", "-f", str(path)]) == 0
+    return path
+
+
+def report(folder: Path, *words: str) -> str:
+    assert cli.main(["report", "coordination", "-f", str(folder), *words]) == 0
+    return (folder / "coordination" / "report.md").read_text(encoding="utf-8")
+
+
+def test_coordination_from_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = read_table(folder / "coordination" / "table.csv")
+    assert len(table) == 4 * 9 * 2
+    page = report(folder)
+    assert "missing" not in page
+    names = {"levels-coordination.png", "aggregates.png", *(f"curve-{level}.png" for level in LEVELS)}
+    assert {path.name for path in (folder / "coordination").glob("*.png")} == names
+    assert all(f"({name})" in page for name in names)
+    assert "Size `smoke`: 4 agents, 6 treasures, 400 game steps of training. saf, mappo, ippo and a random team" in page
+    printed = capsys.readouterr()
+    assert f"page: {folder / 'coordination' / 'report.md'}" in printed.out
+    assert printed.err == ""
+
+
+def test_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
+    page = report(folder)
+    table = pd.read_csv(folder / "coordination" / "table.csv")
+    runs = table[(table.method == "saf") & (table.task == "TeamSupport") & (table.coordination == 1)]
+    low, high = stats.t.interval(0.95, 1, loc=runs.return_mean.mean(), scale=runs.return_mean.sem())
+    assert f"| saf | {runs.return_mean.mean():.2f} [{low:.2f}, {high:.2f}] |" in page
+    every = np.sort(table[table.method == "mappo"].score)
+    # Of 18 scores, the middle half: four and a half from each end are left out, rounded as scipy does.
+    assert f"{stats.trim_mean(every, 0.25):.3f} [" in page.split("## Aggregates")[1].split("## ")[0]
+
+
+def test_two_seeds_name_no_winner(folder: Path) -> None:
+    verdicts = [line.split(" | ")[-1] for line in report(folder).splitlines() if line.startswith("| Team")][9:]
+    assert verdicts
+    assert {verdict.removesuffix(" |") for verdict in verdicts if "winner" in verdict} == {
+        "no winner: fewer than 3 seeds"
+    }
+    assert not any(verdict.startswith(("higher", "lower")) for verdict in verdicts)
+
+
+def test_the_page_repeats_itself(folder: Path) -> None:
+    assert report(folder) == report(folder)
+
+
+def test_commands_of_the_page(folder: Path) -> None:
+    page = report(folder)
+    assert f"python -m sb3_saf.experiments run coordination --size smoke --seeds 0 1 -f {folder}" in page
+    assert page.count("python -m sb3_saf.train --algo ") == 54
+
+
+def test_part_of_an_experiment(folder: Path) -> None:
+    page = report(folder, "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "1")
+    assert "ippo and a random team, seeds 1." in page
+    assert "TeamTogether" not in page.split("## Run it again")[0]
+
+
+def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    partial = tmp_path / "partial"
+    shutil.copytree(folder, partial)
+    shutil.rmtree(partial / "cells" / "TeamTogether-c1-h1" / "saf")
+    failed = partial / "cells" / "TeamSupport-c1-h1" / "mappo" / "seed-0"
+    (failed / "status.json").write_text(json.dumps({"state": "failed"}))
+    page = report(partial)
+    assert "**3 of 72 cells are missing**" in page
+    assert "- saf TeamTogether c=1, h=1 seed 1: not run yet" in page
+    assert f"- mappo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page
+    assert "| saf | – |" in page
+    assert "the seeds 1, which all methods have" in page
+    assert "3 of 72 cells are missing; the page names them" in capsys.readouterr().err
+
+
+def table_of(values: list[float]) -> pd.DataFrame:
+    return pd.DataFrame({"seed": range(len(values)), "return_mean": values})
+
+
+def test_a_winner_needs_intervals_apart() -> None:
+    low, high = [1.0, 1.1, 1.2], [3.0, 3.1, 3.3]
+    above = compare(table_of(high), table_of(low))
+    assert above is not None
+    assert (above.seeds, above.verdict) == ([0, 1, 2], "higher")
+    assert above.difference.value == pytest.approx(np.mean(high) - np.mean(low))
+    below = compare(table_of(low), table_of(high))
+    assert below is not None and below.verdict == "lower"
+    near = compare(table_of([1.0, 1.1, 1.2]), table_of([1.1, 1.2, 1.3]))
+    # The differences agree to the last digit, but the intervals overlap.
+    assert near is not None
+    assert near.difference.high < 0
+    assert near.verdict == "no winner: intervals overlap"
+
+
+def test_two_seeds_that_agree_are_no_proof() -> None:
+    found = compare(table_of([1.0, 1.0]), table_of([2.0, 2.0]))
+    assert found is not None
+    assert found.first == Estimate(1.0, 1.0, 1.0)
+    assert found.verdict == "no winner: fewer than 3 seeds"
+
+
+def test_only_common_seeds_are_compared() -> None:
+    found = compare(table_of([1.0, 2.0, 3.0]), pd.DataFrame({"seed": [2, 1, 7], "return_mean": [5.0, 4.0, 9.0]}))
+    assert found is not None
+    assert (found.seeds, found.first.value, found.second.value, found.difference.value) == ([1, 2], 2.5, 4.5, -2.0)
+    assert compare(table_of([1.0]), pd.DataFrame({"seed": [5], "return_mean": [1.0]})) is None
+
+
+def test_aggregates_compare_like_with_like() -> None:
+    rows = [("saf", 0, "a"), ("saf", 0, "b"), ("saf", 1, "a"), ("saf", 1, "b"), ("saf", 1, "c")]
+    rows += [("ippo", 0, "a"), ("ippo", 0, "b"), ("ippo", 1, "a")]
+    kept = complete(pd.DataFrame(rows, columns=["method", "seed", "stratum"]))
+    assert list(kept.itertuples(index=False, name=None)) == [rows[0], rows[1], rows[5], rows[6]]
+    apart = pd.DataFrame([("saf", 0, "a"), ("ippo", 0, "b")], columns=["method", "seed", "stratum"])
+    assert complete(apart).empty
+
+
+@pytest.mark.parametrize("name", [name for name, e in EXPERIMENTS.items() if e.is_grid and name not in ("qplex",)])
+def test_every_experiment_runs_and_reports(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One method, one seed: nothing is known of spreads, and the page says so by leaving intervals out."""
+    from tests.experiments_jobs import InlineEngine
+
+    monkeypatch.setattr(cli, "engine_of", lambda options: InlineEngine())
+    monkeypatch.chdir(tmp_path)
+    words = ["--size", "smoke", "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "0"]
+    assert cli.main(["run", name, *words, "--hyperparams", "n_epochs:1", "--game-steps", "80"]) == 0
+    assert cli.main(["report", name, "--size", "smoke"]) == 0
+    results = tmp_path / "runs" / "experiments" / "smoke" / name
+    page = (results / "report.md").read_text(encoding="utf-8")
+    charts = {path.name for path in results.glob("levels-*.png")}
+    assert charts == {f"levels-{view.axis.replace(' = ', '-')}.png" for view in EXPERIMENTS[name].views}
+    for view in EXPERIMENTS[name].views:
+        trained = "" if view.train is None else f", trained at {view.train}"
+        assert f"## Team return by {view.axis}{trained}" in page
+    assert "nan" not in page and "inf" not in page
+    assert "--hyperparams n_epochs:1" in page and "--game-steps 80" in page
