@@ -55,13 +55,23 @@ def test_plan_counts_what_is_finished_and_names_what_is_left_out(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     protocol = Protocol("smoke", {"env_kwargs": {"n_agents": 3}})
-    run(find_experiment("joint"), Choice((0,), ("ippo",)), protocol, Results(tmp_path), InlineEngine(), Machine(), Shard())
+    run(
+        find_experiment("joint"),
+        Choice((0,), ("ippo",)),
+        protocol,
+        Results(tmp_path),
+        InlineEngine(),
+        Machine(),
+        Shard(),
+    )
     capsys.readouterr()
     words = ["plan", "joint", "-f", str(tmp_path), "--env-kwargs", "n_agents:3", "--rate", "10"]
     printed = output(capsys, *words, "--methods", "ippo")
     assert "cells       4 to train (1 methods x 2 settings x 2 seeds); 2 of them are finished" in printed
     assert "game steps  800 (400 a cell)" in printed
-    assert "left out    TeamSupport: training at c=4, h=4 is left out: coordination must be an integer from 1" in printed
+    assert (
+        "left out    TeamSupport: training at c=4, h=4 is left out: coordination must be an integer from 1" in printed
+    )
     assert "nothing is left to train" in output(capsys, *words, "--methods", "ippo", "--seeds", "0")
 
 
@@ -98,7 +108,12 @@ BAD = {
     ("run", "joint", "--env-kwargs", "n_agent:2"): "unknown parameter 'n_agent' (did you mean 'n_agents'?)",
     ("run", "joint", "--hyperparams", "learning_rat:2"): "unknown setting 'learning_rat' (did you mean",
     ("plan", "joint", "--rate", "-5"): "--rate must be above 0, got -5",
-    ("report", "joint", "-f", "nowhere"): "there is no folder nowhere; name another with -f, or run it first: python -m",
+    (
+        "report",
+        "joint",
+        "-f",
+        "nowhere",
+    ): "there is no folder nowhere; name another with -f, or run it first: python -m",
     ("report", "joint", "-f", "empty"): "empty has no results of 'joint'; run it first: python -m",
 }
 

@@ -94,7 +94,7 @@ def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any,
 
 def test_cells_that_fit_on_no_node_of_a_fresh_ray() -> None:
     pytest.importorskip("ray")
-    with pytest.raises(ValueError, match="a cell wants 1 CPUs and 3 GPUs of one node, .* lower --cpus-per-cell or"):
+    with pytest.raises(ValueError, match=r"a cell wants 1 CPUs and 3 GPUs of one node, .* lower --cpus-per-cell or"):
         list(RayEngine(gpus=3, workers=1).run(obey, [job("a")]))
 
 
@@ -102,8 +102,8 @@ def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys:
     monkeypatch.setitem(sys.modules, "ray", None)
     assert cli.main(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)]) == 2
     assert capsys.readouterr().err == (
-        "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install 'sb3-saf[ray]', or "
-        "leave --ray out to run in processes of this machine\n"
+        "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install 'sb3-saf[ray]', "
+        "or leave --ray out to run in processes of this machine\n"
     )
 
 
