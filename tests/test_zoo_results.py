@@ -197,7 +197,7 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
     table = describe(find_runs(tmp_path))
-    assert list(table["method"]) == ["saf gamma=None", "saf gamma=0.9"]
+    assert list(table["method"]) == ["saf gamma=default", "saf gamma=0.9"]
     assert [run.number for run in table["run"]] == [1, 3]
     with pytest.raises(ValueError, match="has no evaluations"):
         table["run"][0].curve("evaluation")

@@ -155,7 +155,7 @@ def _method_names(runs: Sequence[Run]) -> list[str]:
         keys = sorted({key for peer in peers for key in peer})
         # The size of a minibatch follows from the number of agents.
         varying = [key for key in keys if key != "batch_size" and len({repr(peer.get(key)) for peer in peers}) > 1]
-        names.append(" ".join([run.settings.algo, *(f"{key}={own.get(key)}" for key in varying)]))
+        names.append(" ".join([run.settings.algo, *(f"{key}={own.get(key, 'default')}" for key in varying)]))
     return names
 
 
