@@ -10,7 +10,7 @@ VENV = .venv
 RUN = $(VENV)/bin/python -m
 INSTALLED = $(VENV)/.installed
 
-.PHONY: help install train test bench check format-check lint types format clean distclean
+.PHONY: help install train test bench docs check format-check lint types format clean distclean
 
 help: ## this list (the default)
 	@echo "make TARGET, with TARGET one of"
@@ -30,6 +30,10 @@ check: $(INSTALLED) ## what CI runs: format, lint, types, tests
 
 bench: $(INSTALLED) ## measure speed, side by side; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
+
+docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors, and check their links
+	@$(RUN) sphinx -b html -W --keep-going -n -q docs build/docs/html
+	@$(RUN) docs.tools.check_links build/docs/html
 
 format-check: $(INSTALLED)
 	@echo "== format"
@@ -58,7 +62,7 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	@echo "== install into $(VENV) (some minutes the first time)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
-	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,dev]'
+	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,dev]'
 	@touch $@
 
 clean: ## remove caches and what was built

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any, Final
@@ -136,10 +136,13 @@ class GameBatch:
         if self.n_threads == 1:
             work(0, self.n_games)
             return
-        edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int)
+        edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int).tolist()
         if self._threads is None:
-            self._threads = ThreadPoolExecutor(self.n_threads, thread_name_prefix="hecogrid")
-        for done in [self._threads.submit(work, int(a), int(b)) for a, b in pairwise(edges)]:
+            self._threads = ThreadPoolExecutor(self.n_threads - 1, thread_name_prefix="hecogrid")
+        *others, own = pairwise(edges)
+        pending = [self._threads.submit(work, first, last) for first, last in others]
+        work(*own)  # the calling thread takes a share, too: handing work over costs as much as stepping a dozen games
+        for done in pending:
             done.result()
 
     @property
@@ -161,6 +164,11 @@ class GameBatch:
     def collected(self) -> npt.NDArray[np.int32]:
         """(E,) treasures collected since the reset: the team's return so far."""
         return self._games.collected
+
+    @property
+    def columns(self) -> npt.NDArray[np.int32]:
+        """(E, N) the column x in which each agent stands."""
+        return self._games.x
 
     @property
     def order(self) -> npt.NDArray[np.int32]:
@@ -205,6 +213,34 @@ class GameBatch:
         for agent in range(self.params.n_agents):
             arrive(games, game, agent, int(games.y[game, agent] * width + games.x[game, agent]))
         draw_level(games, self._book, game)
+
+    def snapshot(self) -> dict[str, npt.NDArray[Any]]:
+        """
+        Copy all that the games' future depends on, random generators included; see :meth:`restore`.
+
+        :return: arrays by name, with games along the first axis or flattened
+        """
+        return {"seeded": self._seeded.copy(), **{name: array.copy() for name, array in self._games._asdict().items()}}
+
+    def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
+        """
+        Go on from a snapshot of a batch with the same task, parameters and number of games.
+
+        :param snapshot: what :meth:`snapshot` gave; copied
+        :raises ValueError: naming the first array that does not fit; nothing is changed then
+        """
+        own = {"seeded": self._seeded, **self._games._asdict()}
+        if different := sorted(own.keys() ^ snapshot.keys()):
+            raise ValueError(f"expected a snapshot with the arrays {sorted(own)}, they differ in {different[0]!r}")
+        for name, array in own.items():
+            given = snapshot[name]
+            if given.shape != array.shape or given.dtype != array.dtype:
+                raise ValueError(
+                    f"expected {name!r} of shape {array.shape} and {array.dtype}, got {given.shape} and {given.dtype}; "
+                    "take the task, the parameters and the number of games that the snapshot was made with"
+                )
+        for name, array in own.items():
+            array[...] = snapshot[name]
 
     def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:
         """

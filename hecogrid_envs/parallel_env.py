@@ -12,7 +12,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.constants import N_ACTIONS, RenderMode
+from hecogrid_envs.constants import N_ACTIONS, ZONE_COLOURS, Colour, RenderMode
 from hecogrid_envs.page import COMMON_PAGE
 from hecogrid_envs.params import HECOGridParams, TaskName
 from hecogrid_envs.state import STATE_PLANES, StateMapping, central_view, state_option
@@ -48,6 +48,8 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         "is_parallelizable": True,
     }
     task: ClassVar[TaskName]
+    #: What the team's return counts.
+    return_unit: ClassVar[str] = "treasures"
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -175,6 +177,22 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         :raises ValueError: naming the first fault of an inconsistent mapping
         """
         self.reset(options={"state": state})
+
+    @property
+    def agent_zones(self) -> npt.NDArray[np.int64]:
+        """(N,) the zone that each agent stands in, which decides what its actions do."""
+        return self.params.zone_of_column()[self._batch.columns[self._game]]
+
+    @property
+    def zone_colours(self) -> tuple[Colour, ...]:
+        """Colour of an agent in each zone, from 0 to 255."""
+        n_zones = int(self.params.zone_of_column()[-1]) + 1
+        return tuple(ZONE_COLOURS[zone % len(ZONE_COLOURS)] for zone in range(n_zones))
+
+    @property
+    def best_return(self) -> int:
+        """The team's return if it collects every treasure."""
+        return self.params.n_treasures
 
     @property
     def n_steps(self) -> int:

@@ -120,7 +120,8 @@ def _check_is_parallel(env: Any, is_factory: bool) -> None:
     if isinstance(env, AECEnv):
         raise ValueError(
             f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
-            "convert it with pettingzoo.utils.conversions.aec_to_parallel"
+            "convert it with pettingzoo.utils.conversions.aec_to_parallel, or, where agents take turns, with "
+            "turn_based_aec_to_parallel"
         )
     if not isinstance(env, ParallelEnv):
         hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""
@@ -138,10 +139,12 @@ def _checked_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], s
     first = space_by_agent[agents[0]]
     others = [f"{agent} has {space}" for agent, space in space_by_agent.items() if space != first]
     if others:
-        repair = "pad_observations_v0" if kind == "observation" else "pad_action_space_v0"
+        repair = "with supersuit." + ("pad_observations_v0" if kind == "observation" else "pad_action_space_v0")
+        if not all(isinstance(space, (spaces.Box, spaces.Discrete)) for space in space_by_agent.values()):
+            repair = "in a wrapper of your own (SuperSuit pads Box and Discrete only)"
         raise ValueError(
             f"expected one {kind} space for all agents, got: {agents[0]} has {first}, {', '.join(others)}; "
-            f"make them equal with supersuit.{repair}"
+            f"make them equal {repair}"
         )
     parts = _leaves(first) if kind == "observation" else [first]
     if not all(isinstance(part, _FIXED_SHAPE) for part in parts):

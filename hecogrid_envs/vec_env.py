@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -127,6 +128,43 @@ class NativeVecEnv(VecEnv):
             observations = self._rows(self.batch.observe())
         return observations, rewards, dones, infos
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        All that the future depends on, as plain data.
+
+        :return: for :meth:`load_checkpoint_state` of an environment that was made with the same arguments
+        """
+        return {
+            "task": self.batch.task,
+            "params": {name: _plain(value) for name, value in asdict(self.params).items()},
+            "n_games": self.n_games,
+            "running": self._running,
+            "seeds": list(self._seeds),
+            "games": self.batch.snapshot(),
+        }
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there; observations of the present are those of before.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: naming the first difference, if the state is that of other games
+        """
+        own = self.checkpoint_state()
+        for name in ("task", "n_games"):
+            if own[name] != state[name]:
+                raise ValueError(f"expected games with {name}={own[name]!r}, got a state with {name}={state[name]!r}")
+        for name, value in own["params"].items():
+            if state["params"].get(name) != value:
+                raise ValueError(
+                    f"expected games with {name}={value!r}, got a state with {name}={state['params'].get(name)!r}"
+                )
+        self.batch.restore(state["games"])
+        self._running = state["running"]
+        self._seeds = list(state["seeds"])
+        for env in self.games:
+            env.agents = list(env.possible_agents) if self._running else []
+
     def close(self) -> None:
         """Close the windows, if any."""
         for env in self.games:
@@ -175,6 +213,11 @@ class NativeVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No row is wrapped in a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
+
+
+def _plain(value: object) -> object:
+    """A parameter as JSON gives it back."""
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def make_vec_env(

@@ -22,6 +22,9 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
+    from sb3_saf.checkpoints.callback import TeamCheckpointCallback
+    from sb3_saf.checkpoints.errors import CheckpointError
+    from sb3_saf.checkpoints.learning import resumable_learn, resume
     from sb3_saf.common.buffers import TeamRolloutBuffer
     from sb3_saf.common.callbacks import TeamEvalCallback
     from sb3_saf.common.centralized import CentralizedValueWrapper
@@ -39,6 +42,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
     from sb3_saf.export.weights import load_weights
     from sb3_saf.export.writer import export_actors
+    from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.ippo.policies import IPPOPolicy
     from sb3_saf.mappo.policies import MAPPOPolicy
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
@@ -65,11 +69,13 @@ __all__ = [
     "QPLEX",
     "Actor",
     "CentralizedValueWrapper",
+    "CheckpointError",
     "EvaluationResult",
     "ExportError",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
+    "InspectionCallback",
     "LightEncoder",
     "MAPPOLstmPolicy",
     "MAPPOMaskablePolicy",
@@ -84,6 +90,7 @@ __all__ = [
     "SAFLstmPolicy",
     "SAFMaskablePolicy",
     "SAFPolicy",
+    "TeamCheckpointCallback",
     "TeamEvalCallback",
     "TeamMonitor",
     "TeamReplayBuffer",
@@ -94,4 +101,6 @@ __all__ = [
     "export_actors",
     "load_weights",
     "make_team_env",
+    "resumable_learn",
+    "resume",
 ]

@@ -306,7 +306,7 @@ def test_team_size_that_only_the_wrapper_knows() -> None:
         (
             lambda: TeamSpaces.of(spaces.Dict({"a": VECTOR}), 2),
             r"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got Dict.*; "
-            r"flatten it first, for instance with supersuit.flatten_v0 or a wrapper of your own",
+            r"flatten it in a wrapper of the environment, for instance with gymnasium.spaces.flatten",
         ),
         (
             lambda: TeamSpaces.from_observation_space(VECTOR),

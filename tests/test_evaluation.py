@@ -22,7 +22,6 @@ from sb3_saf.common.evaluation import (
     confidence_interval,
     evaluate_policy,
     evaluate_team,
-    student_t_quantile,
 )
 from sb3_saf.common.monitor import TeamMonitor
 from tests.team_venv import Array, TeamVenv
@@ -158,26 +157,6 @@ class TestEvaluatePolicy:
 
 
 class TestIntervals:
-    @pytest.mark.parametrize(
-        ("degrees", "confidence", "t"),
-        [
-            # Tables of Student's distribution, two-sided.
-            (1, 0.95, 12.70620),
-            (2, 0.95, 4.302653),
-            (3, 0.95, 3.182446),
-            (4, 0.95, 2.776445),
-            (5, 0.99, 4.032143),
-            (9, 0.95, 2.262157),
-            (10, 0.90, 1.812461),
-            (29, 0.95, 2.045230),
-            (63, 0.95, 1.998341),
-            (1000, 0.95, 1.962339),
-            (100_001, 0.95, 1.959988),
-        ],
-    )
-    def test_quantiles_are_those_of_the_tables(self, degrees: int, confidence: float, t: float) -> None:
-        assert student_t_quantile(degrees, confidence) == pytest.approx(t, rel=2e-6)
-
     def test_interval_by_hand(self) -> None:
         # mean 3, sample standard deviation sqrt(2.5), 4 degrees of freedom: 3 -+ 2.776445 * sqrt(2.5 / 5).
         assert confidence_interval([1, 2, 3, 4, 5]) == pytest.approx((1.036757, 4.963243), rel=1e-6)

@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("hecogrid_envs", "sb3_saf")
+PACKAGES = ("hecogrid_envs", "sb3_saf", "zoo_configs")
 #: Files that decide where software comes from.
 INSTALL_FILES = ("setup.cfg", "pyproject.toml", "constraints.txt", "Makefile", ".ci/run")
 
@@ -113,7 +113,7 @@ def test_packages_are_typed_and_complete(package: str) -> None:
     assert [str(folder) for folder in folders if not (folder / "__init__.py").is_file()] == []
 
 
-@pytest.mark.parametrize("folder", ["zoo_configs", "notebooks", "benchmarks", "tests"])
+@pytest.mark.parametrize("folder", ["notebooks", "benchmarks", "tests"])
 def test_other_folders_stay_in_the_repository(folder: str) -> None:
     assert (ROOT / folder).is_dir()
     assert f"{folder}*" not in _setup_cfg()["options.packages.find"]["include"].split()

@@ -88,6 +88,10 @@ class TeamEvalCallback(EvalCallback):
         if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation:
             return True
         self._plan_next()
+        return self._evaluate()
+
+    def _evaluate(self) -> bool:
+        """Play, store and log: whether training goes on."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         self._is_success_buffer = []

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_saf.common.row_spaces import RowSpaces, channels_first
 from sb3_saf.common.teams import (
@@ -32,6 +32,8 @@ TIME_LIMITS: Final[tuple[TimeLimit, ...]] = get_args(TimeLimit)
 
 TERMINAL_OBSERVATION: Final = "terminal_observation"
 TRUNCATED: Final = "TimeLimit.truncated"
+#: What sb3-contrib asks an environment for.
+_ACTION_MASKS: Final = "action_masks"
 
 
 class CentralizedValueWrapper(TeamVecEnvWrapper):
@@ -92,6 +94,32 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._raw = raw
         self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
         self._n_steps = 0
+        self._masks_shown: Array | None = None
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""
+        return self._shows_masks(attr_name) or super().has_attr(attr_name)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of the rows' games; ``action_masks``, which MaskablePPO asks for, also where observations have
+        ``action_mask`` and the games have no such method.
+
+        :param method_name: of the game
+        :param method_args: positional arguments
+        :param indices: rows
+        :param method_kwargs: keyword arguments
+        :return: one result per row
+        """
+        if self._shows_masks(method_name) and not super().has_attr(method_name):
+            assert self._masks_shown is not None, "algorithms reset the environment before they ask"
+            return [self._masks_shown[row].astype(bool) for row in self._get_indices(indices)]
+        return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+
+    def _shows_masks(self, method_name: str) -> bool:
+        return method_name == _ACTION_MASKS and self.team_spaces.action_mask is not None
 
     def reset(self) -> dict[str, Array]:
         """
@@ -128,6 +156,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0), AGENT_KEY: self._agents.copy()}
         if ACTIVE_KEY in parts:
             joint[ACTIVE_KEY] = np.repeat(parts[ACTIVE_KEY], self.n_agents, axis=0)
+        self._masks_shown = parts.get(ACTION_MASK_KEY)
         return joint
 
     def _checked_parts(self, obs: Any, what: str, game: int | None = None) -> dict[str, Array]:

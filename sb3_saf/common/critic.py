@@ -76,6 +76,16 @@ class JointStates(TeamStates):
     def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`; agents that take no part are read as zeros."""
         members = features[teams] if self.members is None else self.members.states(features, teams, active)
+        return self.join(members, active)
+
+    def join(self, members: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        Put the states of a team's members side by side.
+
+        :param members: (G, N, d)
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N, S)
+        """
         if active is not None:
             members = members * active.unsqueeze(2)
         n_teams, n_agents, _ = members.shape

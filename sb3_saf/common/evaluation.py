@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from scipy.special import stdtrit
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -80,48 +81,16 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
     :raises ValueError: if there are no values or the confidence is out of range
     """
     sample = np.asarray(values, dtype=np.float64).reshape(-1)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be above 0 and below 1, got {confidence!r}")
     if len(sample) == 0:
         raise ValueError("an interval needs at least one value, got none")
     if len(sample) == 1:
         return Interval(-math.inf, math.inf)
     mean = float(sample.mean())
-    margin = student_t_quantile(len(sample) - 1, confidence) * float(sample.std(ddof=1)) / math.sqrt(len(sample))
+    t = float(stdtrit(len(sample) - 1, (1 + confidence) / 2))
+    margin = t * float(sample.std(ddof=1)) / math.sqrt(len(sample))
     return Interval(mean - margin, mean + margin)
-
-
-def student_t_quantile(degrees: int, confidence: float = 0.95) -> float:
-    """
-    The t with P(|T| <= t) = ``confidence``.
-
-    Bisection over the angle theta = atan(t / sqrt(degrees)), in which the probability is a finite sum for whole degrees
-    of freedom (Abramowitz and Stegun, 26.7.3 and 26.7.4).
-
-    :param degrees: degrees of freedom, at least 1
-    :param confidence: above 0, below 1
-    """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must be above 0 and below 1, got {confidence!r}")
-    check_count("degrees", degrees)
-    low, high = 0.0, math.pi / 2
-    for _ in range(60):
-        middle = (low + high) / 2
-        if _probability_within(middle, degrees) < confidence:
-            low = middle
-        else:
-            high = middle
-    return math.sqrt(degrees) * math.tan(low)
-
-
-def _probability_within(theta: float, degrees: int) -> float:
-    """P(|T| <= sqrt(degrees) * tan(theta))."""
-    odd = degrees % 2
-    if degrees == 1:
-        return 2 * theta / math.pi
-    # Factors (k - 1) / k * cos(theta)**2 between neighbouring terms, k = 3, 5, ... or 2, 4, ... below the degrees.
-    k = np.arange(2 + odd, degrees - 1, 2, dtype=np.float64)
-    terms = np.cumprod(np.concatenate(([1.0], (k - 1) / k * math.cos(theta) ** 2)))
-    series = math.sin(theta) * float(terms.sum())
-    return 2 / math.pi * (theta + math.cos(theta) * series) if odd else series
 
 
 class RandomPolicy:

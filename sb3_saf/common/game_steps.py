@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import sys
+import time
 from typing import Any, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -12,6 +14,7 @@ from sb3_saf.common.teams import find_n_agents
 AlgorithmClass = TypeVar("AlgorithmClass", bound=type[BaseAlgorithm])
 
 GAME_STEPS_TAG = "time/game_steps"
+GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"
 
 _MARK = "_records_game_steps"
 
@@ -28,9 +31,25 @@ def game_steps(model: BaseAlgorithm) -> int | None:
     return None if n_agents is None else model.num_timesteps // n_agents
 
 
+def game_steps_per_second(model: BaseAlgorithm) -> float | None:
+    """
+    Steps of games per second since ``learn`` was called; SB3's ``time/fps`` is the same in agents' steps.
+
+    :param model: an algorithm in or after ``learn``
+    :return: None if its environment is not made of teams, or it has not begun to learn
+    """
+    venv = model.get_env()
+    n_agents = None if venv is None else find_n_agents(venv)
+    if n_agents is None or not model.start_time:
+        return None
+    seconds = max((time.time_ns() - model.start_time) / 1e9, sys.float_info.epsilon)
+    return (model.num_timesteps - model._num_timesteps_at_start) / n_agents / seconds
+
+
 def log_game_steps(algorithm_class: AlgorithmClass) -> AlgorithmClass:
     """
-    Let an algorithm log ``time/game_steps`` beside ``time/total_timesteps`` whenever it trains on teams.
+    Let an algorithm log ``time/game_steps`` and ``time/game_steps_per_second`` whenever it trains on teams. SB3's
+    ``time/total_timesteps`` and ``time/fps`` beside them count agents' steps.
 
     SB3 has no door for this: callbacks end before the logs are written, and must be passed to every ``learn``. So
     ``dump_logs`` of the class is wrapped; models on other environments log what they always did. Calling it again, for
@@ -48,6 +67,9 @@ def log_game_steps(algorithm_class: AlgorithmClass) -> AlgorithmClass:
         steps = game_steps(self)
         if steps is not None:
             self.logger.record(GAME_STEPS_TAG, steps)
+        per_second = game_steps_per_second(self)
+        if per_second is not None:
+            self.logger.record(GAME_STEPS_PER_SECOND_TAG, round(per_second, 1))
         original(self, *args, **kwargs)
 
     setattr(dump_logs, _MARK, True)

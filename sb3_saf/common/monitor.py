@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
-from typing import Any
+import warnings
+from collections.abc import Mapping
+from typing import IO, Any
 
 import numpy as np
 from stable_baselines3.common.monitor import ResultsWriter
@@ -47,17 +50,19 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._returns = np.zeros(self.n_games, dtype=np.float64)
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
+        self._filename = filename
         self._writer: ResultsWriter | None = None
-        if filename is not None:
-            header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(getattr(venv, "spec", None))}
-            self._writer = ResultsWriter(filename, header=header, extra_keys=info_keywords)
 
     def reset(self) -> VecEnvObs:
         """
         Start new episodes in all games; unfinished ones are not counted.
 
+        The first reset begins the file. A resumed run has none, so it finds the file of before.
+
         :return: observations as ``venv`` gives them
         """
+        if self._writer is None:
+            self._writer = self._open(override_existing=True)
         self._returns[:] = 0
         self._lengths[:] = 0
         return self.venv.reset()
@@ -103,8 +108,68 @@ class TeamMonitor(TeamVecEnvWrapper):
             self._writer.write_row(episode)
         return episode
 
+    def _open(self, override_existing: bool) -> ResultsWriter | None:
+        if self._filename is None:
+            return None
+        header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(getattr(self.venv, "spec", None))}
+        return ResultsWriter(self._filename, header, self.info_keywords, override_existing)
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        Counters, unfinished episodes, and how long the file is.
+
+        :return: plain data for :meth:`load_checkpoint_state`
+        """
+        return {
+            "returns": self._returns.copy(),
+            "lengths": self._lengths.copy(),
+            "episode_count": self.episode_count,
+            "t_start": self.t_start,
+            "n_steps": self._n_steps,
+            "file_size": None if self._writer is None else _synced_size(self._writer.file_handler),
+        }
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there: lines that were written to the file later are cut off, for they will come again.
+
+        :param state: what :meth:`checkpoint_state` gave
+        """
+        self._returns[:] = state["returns"]
+        self._lengths[:] = state["lengths"]
+        self.episode_count = state["episode_count"]
+        self.t_start = state["t_start"]
+        self._n_steps = state["n_steps"]
+        if self._filename is None or state["file_size"] is None:
+            return
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = self._open(override_existing=False)
+        assert self._writer is not None
+        _cut(self._writer.file_handler, state["file_size"])
+
     def close(self) -> None:
         """Close the file and the environment."""
         if self._writer is not None:
             self._writer.close()
         super().close()
+
+
+def _synced_size(file: IO[Any]) -> int:
+    """Bytes of a file that are surely on the disk."""
+    file.flush()
+    os.fsync(file.fileno())
+    return os.fstat(file.fileno()).st_size
+
+
+def _cut(file: IO[Any], size: int) -> None:
+    found = os.fstat(file.fileno()).st_size
+    if found < size:
+        warnings.warn(
+            f"expected {file.name} with the {size} bytes that it had at the checkpoint, got {found}: episodes before "
+            "the checkpoint are missing in it",
+            UserWarning,
+            stacklevel=3,
+        )
+        return
+    os.truncate(file.fileno(), size)

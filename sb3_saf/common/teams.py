@@ -176,7 +176,7 @@ def _bounds(own: spaces.Space[Any]) -> tuple[Array, Array]:
         return np.zeros(own.shape, dtype=own.dtype), np.ones(own.shape, dtype=own.dtype)
     raise ValueError(
         f"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got {own}; "
-        "flatten it first, for instance with supersuit.flatten_v0 or a wrapper of your own"
+        "flatten it in a wrapper of the environment, for instance with gymnasium.spaces.flatten"
     )
 
 

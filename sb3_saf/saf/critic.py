@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch as th
 from torch import nn
@@ -10,7 +11,19 @@ from torch import nn
 from sb3_saf.common.critic import Heads, JointValueHead, OwnValueHead, TeamCritic, TeamStates
 from sb3_saf.common.networks import mlp
 from sb3_saf.common.parts import CriticInput
-from sb3_saf.saf.knowledge_source import KnowledgeSource
+from sb3_saf.saf.knowledge_source import Exchanged, KnowledgeSource
+
+
+class Communicated(NamedTuple):
+    """
+    What every agent knows itself, and what went through the knowledge source.
+
+    :param states: (G, N, d), s of every agent
+    :param exchanged: messages read, and the attention of writing and reading
+    """
+
+    states: th.Tensor
+    exchanged: Exchanged
 
 
 class SAFStates(TeamStates):
@@ -44,9 +57,29 @@ class SAFStates(TeamStates):
 
     def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`."""
+        communicated = self.communicate(features, teams, active)
+        return self.combine(communicated.states, communicated.exchanged.read)
+
+    def communicate(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> Communicated:
+        """
+        Send every agent's message through the knowledge source.
+
+        :param features: (K, d) features of views
+        :param teams: (G, N) int64, which view each agent of a team has
+        :param active: (G, N) bool, agents that take part; all if None
+        """
         # g_theta and g_omega depend on one view only: once per view, then gathered.
         messages, states = self.message_net(features)[teams], self.state_net(features)[teams]
-        read = self.knowledge_source(messages, states, active)
+        return Communicated(states, self.knowledge_source.exchange(messages, states, active))
+
+    def combine(self, states: th.Tensor, read: th.Tensor) -> th.Tensor:
+        """
+        s^SAF = g_phi([s, m]).
+
+        :param states: (G, N, d), s of every agent
+        :param read: (G, N, d), m of every agent: what it read, or what is to be tried in its place
+        :return: (G, N, d)
+        """
         combined: th.Tensor = self.combine_net(th.cat([states, read], dim=2))
         return combined
 
@@ -89,7 +122,16 @@ class SAFCritic(SAFStates, TeamCritic):
 
     def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`."""
-        states = self.states(features, teams, active)
+        return self.judge(self.states(features, teams, active), active)
+
+    def judge(self, states: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        V_i of every agent.
+
+        :param states: (G, N, d), s^SAF of every agent
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N)
+        """
         if isinstance(self.value_head, OwnValueHead):
             return self.value_head.of_teams(states)
         if active is not None:

@@ -26,6 +26,20 @@ class Written(NamedTuple):
     attention: th.Tensor
 
 
+class Exchanged(NamedTuple):
+    """
+    What went through the knowledge source: who wrote where, who read where, and what was read.
+
+    :param read: (G, N, d), m of every agent
+    :param write_attention: (G, L, N), how much each slot took from each agent; sums to 1 over agents
+    :param read_attention: (G, N, L), how much each agent took from each slot; sums to 1 over slots
+    """
+
+    read: th.Tensor
+    write_attention: th.Tensor
+    read_attention: th.Tensor
+
+
 class CrossAttentionBlock(nn.Module):
     """
     Slots look at the agents' messages: x + attend(norm(x), norm(messages)), then x + mlp(norm(x)).
@@ -130,6 +144,18 @@ class KnowledgeSource(nn.Module):
         attended: Attended = self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
         return attended
 
+    def exchange(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
+        """
+        Write, then read, and tell who attended to what.
+
+        :param messages: (G, N, d)
+        :param states: (G, N, d)
+        :param active: (G, N) bool or None
+        """
+        written = self.write(messages, active)
+        read = self.read(states, written.slots)
+        return Exchanged(read.values, written.attention, read.weights)
+
     def forward(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """
         Write, then read.
@@ -139,4 +165,4 @@ class KnowledgeSource(nn.Module):
         :param active: (G, N) bool or None
         :return: m (G, N, d)
         """
-        return self.read(states, self.write(messages, active).slots).values
+        return self.exchange(messages, states, active).read

@@ -1,0 +1,74 @@
+"""Settings of the documentation: ``make docs`` builds it, warnings as errors."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # the checkout's own packages, installed or not
+
+project = "sb3-saf"
+author = "sb3-saf contributors"
+copyright = f"2026, {author}"
+
+extensions = ["docs.mathml", "myst_parser", "sphinx.ext.autodoc"]
+html_math_renderer = "mathml"
+source_suffix = {".md": "markdown"}
+exclude_patterns = ["tools"]
+html_theme = "furo"
+html_title = "sb3-saf"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
+html_show_sphinx = False
+
+myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+python_use_unqualified_type_names = True
+# What belongs to others, and to our own modules that the reference does not list, is named without a link.
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!sb3_saf\.[A-Z]|hecogrid_envs\.[A-Z]).*"),
+]
+
+#: A line of this form is replaced by the docstring of the named class, which is Markdown.
+DOCSTRING_LINE = "%docstring "
+
+
+def _insert_docstrings(app: Sphinx, docname: str, source: list[str]) -> None:
+    """The environments' pages are their classes' docstrings."""
+    lines = source[0].splitlines()
+    if any(line.startswith(DOCSTRING_LINE) for line in lines):
+        source[0] = "\n".join(
+            _docstring(line.removeprefix(DOCSTRING_LINE)) if line.startswith(DOCSTRING_LINE) else line for line in lines
+        )
+
+
+def _docstring(path: str) -> str:
+    module, _, name = path.strip().rpartition(".")
+    text = inspect.getdoc(getattr(import_module(module), name))
+    if not text:
+        raise ValueError(f"{path} has no docstring")
+    return text
+
+
+def _drop_markdown_docstrings(
+    app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
+) -> None:
+    """In the reference, the tasks' long Markdown docstrings are one line and a link to their page."""
+    if what == "class" and "## Actions" in lines:
+        lines[:] = [lines[0], "", "Its page is under *Environments*.", ""]
+
+
+def setup(app: Sphinx) -> None:
+    """Register the two functions above."""
+    app.connect("source-read", _insert_docstrings)
+    app.connect("autodoc-process-docstring", _drop_markdown_docstrings)

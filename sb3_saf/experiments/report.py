@@ -1,0 +1,139 @@
+"""An experiment's report: what is there, what is missing, the paper's figures, and a page of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from sb3_saf.experiments.cells import Cell, Choice, LeftOut, Protocol, expand, merge
+from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
+from sb3_saf.experiments.page import Content, write_page
+from sb3_saf.experiments.results import Results, write_text
+from sb3_saf.experiments.selection import complete, of_view, strata
+from sb3_saf.experiments.table import Row, rows, to_csv
+from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels
+from sb3_saf.zoo.statistics import score_matrices
+
+
+class Report(NamedTuple):
+    """
+    What was written.
+
+    :param page: the Markdown page
+    :param figures: the pictures
+    :param missing: cells that are not finished
+    :param n_cells: all that were asked for
+    """
+
+    page: Path
+    figures: list[Path]
+    missing: list[Cell]
+    n_cells: int
+
+
+def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Report:
+    """
+    Draw and write what is there of an experiment, complete or not.
+
+    :param wanted: the seeds, methods and tasks to show; empty ones for all that were run
+    :raises ValueError: if nothing is finished
+    """
+    protocol = results.protocol()
+    assert protocol is not None
+    cells, left_out = _requested(experiment, results, protocol, wanted)
+    finished = rows(results, cells)
+    if not finished:
+        raise ValueError(f"{results.folder} has no finished cell of {experiment.name!r} among those to be shown")
+    folder = results.folder / experiment.name
+    write_text(folder / "table.csv", to_csv(finished))
+    table = _frame(finished)
+    curves = _curves(results, cells)
+    figures = [
+        *_draw_views(experiment, table, folder),
+        *_draw_aggregates(experiment, table, folder),
+        *_draw_curves(experiment, curves, table, folder),
+    ]
+    missing = [cell for cell in cells if results.missing_tests(cell)]
+    content = Content(experiment, protocol, results, cells, missing, left_out, table, figures)
+    return Report(write_page(content, folder / "report.md"), figures, missing, len(cells))
+
+
+def _requested(
+    experiment: Experiment, results: Results, protocol: Protocol, wanted: Choice
+) -> tuple[list[Cell], list[LeftOut]]:
+    """All cells that were asked for in this folder, without those that are not to be shown."""
+    grids = [expand(experiment, request, protocol) for request in results.requests(experiment.name)]
+    cells = [
+        cell
+        for cell in merge(cell for grid in grids for cell in grid.cells)
+        if (not wanted.seeds or cell.seed in wanted.seeds)
+        and (not wanted.tasks or cell.task in wanted.tasks)
+        and (not wanted.methods or cell.method in wanted.methods or not cell.is_trained)
+    ]
+    return cells, list(dict.fromkeys(left_out for grid in grids for left_out in grid.left_out))
+
+
+def _frame(finished: Iterable[Row]) -> pd.DataFrame:
+    """The table, without what only files need."""
+    return pd.DataFrame(finished, columns=Row._fields).drop(columns=["returns", "cell"])
+
+
+def _curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
+    """Learning curves of all trained cells, in one table."""
+    found = []
+    for cell in cells:
+        path = results.cell_folder(cell) / "curve.csv"
+        if results.is_finished(cell) and path.exists():
+            names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, "seed": cell.seed}
+            found.append(pd.read_csv(path).rename(columns={"mean_return": "score"}).assign(**names))
+    return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    figure.savefig(path)
+    return path
+
+
+def _draw_views(experiment: Experiment, table: pd.DataFrame, folder: Path) -> list[Path]:
+    """One bar chart for each dial."""
+    paths = []
+    for view in experiment.views:
+        shown = of_view(table, view)
+        if shown.empty:
+            continue
+        trained = "" if view.train is None else f", trained at {view.train}"
+        drawn = shown.assign(score=shown["return_mean"])
+        figure = draw_levels(drawn, view.axis, title=f"{experiment.name}{trained}", panel="task")
+        paths.append(_save(figure, folder / f"levels-{view.axis.replace(' = ', '-')}.png"))
+    return paths
+
+
+def _draw_aggregates(experiment: Experiment, table: pd.DataFrame, folder: Path) -> list[Path]:
+    """Interquartile means and performance profiles over everything that all methods have."""
+    common = complete(strata(experiment, table))
+    if common.empty:
+        return []
+    seeds = ", ".join(map(str, sorted(common["seed"].unique())))
+    title = f"{experiment.name}: {common['stratum'].nunique()} settings, seeds {seeds}"
+    figure = draw_aggregates(score_matrices(common, "stratum"), title=title, x_label="treasures collected (share)")
+    return [_save(figure, folder / "aggregates.png")]
+
+
+def _draw_curves(experiment: Experiment, curves: pd.DataFrame, table: pd.DataFrame, folder: Path) -> list[Path]:
+    """One figure for each setting that was trained at, with the random team as a line."""
+    paths: list[Path] = []
+    if curves.empty:
+        return paths
+    for (task, level), runs in curves.groupby(["task", "level"], sort=False):
+        random = table[(table["method"] == RANDOM) & (table["task"] == task)]
+        random = random[[Level(row.coordination, row.heterogeneity).slug == level for row in random.itertuples()]]
+        steps = pd.DataFrame({"game_steps": [runs["game_steps"].min(), runs["game_steps"].max()]})
+        line = random[["method", "seed", "return_mean"]].rename(columns={"return_mean": "score"})
+        together = pd.concat([runs, line.merge(steps, how="cross")], ignore_index=True)
+        figure = draw_curves(together, title=f"{experiment.name}: {task}, {level.replace('-', ', ')}")
+        paths.append(_save(figure, folder / f"curve-{task}-{level}.png"))
+    return paths

@@ -1,0 +1,1 @@
+"""Looking into team policies while they train, on TensorBoard's page."""

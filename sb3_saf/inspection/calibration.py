@@ -1,0 +1,121 @@
+"""
+Is the critic right? Its values against the discounted returns that followed.
+
+Letters: T game steps, B rows, n values.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_saf.inspection.episodes import Played
+
+Floats = npt.NDArray[np.floating[Any]]
+Doubles = npt.NDArray[np.float64]
+
+#: Spread below which values or returns count as constant.
+_CONSTANT = 1e-9
+
+
+class Calibration(NamedTuple):
+    """
+    Agreement of values V with returns G.
+
+    :param explained_variance: 1 - Var(G - V) / Var(G): 1 for a perfect critic, 0 for one that says a constant; None if
+        all returns are equal
+    :param slope: of the line through (V, G): 1 for a calibrated critic, below 1 for one that exaggerates; None if all
+        values are equal
+    :param bias: mean of V - G: positive for a critic that promises too much
+    :param rmse: root mean square of V - G
+    """
+
+    explained_variance: float | None
+    slope: float | None
+    bias: float
+    rmse: float
+
+
+class Bin(NamedTuple):
+    """
+    Values of about the same size.
+
+    :param value: their mean
+    :param mean: mean of the returns that followed
+    :param std: standard deviation of these returns
+    """
+
+    value: float
+    mean: float
+    std: float
+
+
+def lambda_returns(played: Played, gamma: float, lam: float = 1.0) -> Doubles:
+    """
+    What the critic is trained towards: TD(lambda) targets, with the discounted return as the case ``lam=1``.
+
+    ::
+
+        R_t = r_t + gamma last_t                                          if the episode ends with step t
+        R_t = r_t + gamma ((1 - lam) V_{t+1} + lam R_{t+1})               otherwise
+
+    ``last`` is the value of the last observation where the time limit is no true end (``time_limit="bootstrap"``),
+    else 0. These are SB3's advantages by GAE plus values. Rows of episodes that were not played to their end are to be
+    left out.
+
+    :param played: episodes
+    :param gamma: discount factor
+    :param lam: lambda
+    :return: (T, B)
+    """
+    targets: Doubles = np.zeros(played.rewards.shape)
+    values = np.asarray(played.values, dtype=np.float64)
+    ahead = next_value = np.zeros_like(values[0])
+    for t in reversed(range(len(targets))):
+        going_on = (1 - lam) * next_value + lam * ahead
+        targets[t] = played.rewards[t] + gamma * np.where(played.ends[t], played.last_values[t], going_on)
+        ahead, next_value = targets[t], values[t]
+    return targets
+
+
+def calibrate(values: Floats, returns: Floats) -> Calibration:
+    """
+    Compare values with returns.
+
+    :param values: (n,)
+    :param returns: (n,)
+    """
+    v, g = np.asarray(values, dtype=np.float64), np.asarray(returns, dtype=np.float64)
+    error = v - g
+    var_v, var_g = v.var(), g.var()
+    return Calibration(
+        explained_variance=None if var_g < _CONSTANT**2 else float(1 - error.var() / var_g),
+        slope=None if var_v < _CONSTANT**2 else float(((v - v.mean()) * (g - g.mean())).mean() / var_v),
+        bias=float(error.mean()),
+        rmse=float(np.sqrt((error**2).mean())),
+    )
+
+
+def reliability(values: Floats, returns: Floats, n_bins: int = 10) -> list[Bin]:
+    """
+    Mean return by size of the value, in bins of equally many values.
+
+    :param values: (n,)
+    :param returns: (n,)
+    :param n_bins: at most this many
+    """
+    order = np.argsort(values, kind="stable")
+    parts = np.array_split(order, min(n_bins, len(order)))
+    return [Bin(float(values[part].mean()), float(returns[part].mean()), float(returns[part].std())) for part in parts]
+
+
+def rmse(values: Floats, returns: Floats) -> float:
+    """
+    Root mean square error of values.
+
+    :param values: (n,)
+    :param returns: (n,)
+    """
+    return float(np.sqrt(((np.asarray(values, dtype=np.float64) - returns) ** 2).mean()))

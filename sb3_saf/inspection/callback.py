@@ -1,0 +1,264 @@
+"""The callback that writes what is worth watching about a team policy to TensorBoard."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Figure, Image
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, sync_envs_normalization
+
+from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.common.game_steps import game_steps
+from sb3_saf.common.teams import check_count, require_n_agents
+from sb3_saf.inspection import figures, film, report
+from sb3_saf.inspection.calibration import calibrate, lambda_returns
+from sb3_saf.inspection.doors import Zones, check_zones, return_scale, zone_colours, zone_function
+from sb3_saf.inspection.episodes import Played, Player
+from sb3_saf.inspection.insides import require_team_policy
+from sb3_saf.inspection.page import Page, hparams, hyperparameters
+from sb3_saf.inspection.pool import chosen_by, differences
+from sb3_saf.inspection.randomness import own_randomness
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MplFigure
+
+
+class InspectionCallback(BaseCallback):
+    """
+    Look into SAF, MAPPO and IPPO while they train.
+
+    Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes, and what
+    it does and thinks is written to the run's own TensorBoard file: team returns; which policy of the pool acts, by
+    zone and by agent; who writes to and reads from the slots of the knowledge source; the critic's calibration; how
+    much its values owe to messages; an episode as pictures; hyperparameters; and a layout of the custom scalars page.
+    ``docs/tensorboard.md`` says how to read it. What a policy or an environment lacks is left out.
+
+    Training goes on as if nothing had happened: no generator that it draws from moves.
+
+    :param eval_env: environment of teams of its own, for instance from ``make_team_env`` with ``n_envs=16`` and, for
+        pictures of episodes, ``render_mode="rgb_array"``
+    :param every_game_steps: game steps (of training, summed over all parallel games) between inspections
+    :param n_eval_episodes: team episodes per inspection
+    :param seed: of the episodes; the same ones are played at every inspection
+    :param deterministic: whether the policy takes its most likely actions; as it trains, it does not
+    :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) whole numbers from 0; None asks the
+        games for ``agent_zones``, as HECOGrid's have them; False for no zones
+    :param pictures: whether to draw figures and episodes, which needs matplotlib and Pillow; False writes numbers only
+    :param hparams: hyperparameters of your own to show beside the model's, such as the task and its level
+    :param verbose: 1 prints a line per inspection
+    :raises ValueError: if ``eval_env`` is not made of teams or an argument is out of range; when training starts, if
+        the policy is none of this package's or ``eval_env`` does not fit the training environment
+    """
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        every_game_steps: int = 50_000,
+        n_eval_episodes: int = 16,
+        seed: int = 20_000,
+        deterministic: bool = False,
+        zones: Zones = None,
+        pictures: bool = True,
+        hparams: Mapping[str, object] | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        self.n_agents = require_n_agents(eval_env)
+        self.every_game_steps = check_count("every_game_steps", every_game_steps)
+        check_count("n_eval_episodes", n_eval_episodes)
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
+        check_zones(zones)
+        if pictures:
+            _require_matplotlib()
+        self.eval_env = eval_env
+        self.pictures = pictures
+        self.hparams = dict(hparams or {})
+        self.player = Player(eval_env, n_eval_episodes, int(seed), deterministic, zone_function(eval_env, zones))
+        #: Seconds spent so far.
+        self.seconds = 0.0
+        self._next = 0
+        self._last: int | None = None
+
+    # --- when -------------------------------------------------------------------------------------------------------
+
+    def _init_callback(self) -> None:
+        require_team_policy(self.model.policy)
+        _check_fits(self.training_env, self.eval_env)
+
+    def _on_training_start(self) -> None:
+        self._page = Page(self.model)
+        self._started = time.perf_counter()
+        self.seconds = 0.0
+        if not self._page.has_tensorboard:
+            warnings.warn(
+                "The model writes no TensorBoard file, so nobody will see what InspectionCallback draws: pass "
+                "tensorboard_log='...' to the algorithm.",
+                UserWarning,
+                stacklevel=2,
+            )
+        scalars = self._inspect()
+        self._page.arrange(scalars)
+        policy = require_team_policy(self.model.policy)
+        self._page.show("hparams", hparams(hyperparameters(self.model, policy, self.hparams), scalars))
+        self._page.write(self.num_timesteps)
+
+    def _on_step(self) -> bool:
+        if self._game_steps() >= self._next:
+            self._inspect()
+        return True
+
+    def _on_training_end(self) -> None:
+        if self._last != self._game_steps():
+            self._inspect()
+
+    def _game_steps(self) -> int:
+        steps = game_steps(self.model)
+        assert steps is not None, "_init_callback has checked that the environment is made of teams"
+        return steps
+
+    # --- what -------------------------------------------------------------------------------------------------------
+
+    def _inspect(self) -> dict[str, float]:
+        """Play, write, and say what it cost."""
+        began = time.perf_counter()
+        now = self._game_steps()
+        self._last, self._next = now, (now // self.every_game_steps + 1) * self.every_game_steps
+        policy = require_team_policy(self.model.policy)
+        training = policy.training
+        policy.set_training_mode(False)
+        with own_randomness(self.player.seed, self.model.device):
+            played = self.player.play(policy, self._reward_normalisation(), draw=self.pictures)
+            scalars = self._scalars(played)
+            if self.pictures and self._page.has_tensorboard:
+                self._draw(played)
+        policy.set_training_mode(training)
+        self._page.scalars(scalars)
+        self.seconds += time.perf_counter() - began
+        self._page.scalars(self._costs())
+        self._page.write(self.num_timesteps)
+        if self.verbose:
+            print(
+                f"Inspection after {now} game steps: team return {scalars['team/return']:.2f} "
+                f"({time.perf_counter() - began:.1f} s)"
+            )
+        return scalars
+
+    def _reward_normalisation(self) -> VecNormalize | None:
+        """What normalises the rewards that the critic learns from."""
+        normalising = self.model.get_vec_normalize_env()
+        if normalising is None:
+            return None
+        if isinstance(self.eval_env, VecNormalize):
+            sync_envs_normalization(self.training_env, self.eval_env)
+        return normalising
+
+    def _scalars(self, played: Played) -> dict[str, float]:
+        gamma = self._number("gamma", 1.0)
+        assert self.model.action_space is not None
+        return {
+            **report.team_scalars(played, return_scale(self.eval_env)),
+            **report.pool_scalars(played, self.model.action_space),
+            **report.knowledge_scalars(played),
+            **report.critic_scalars(played, gamma, self._number("gae_lambda", 1.0)),
+            **report.message_scalars(played, gamma),
+        }
+
+    def _number(self, name: str, default: float) -> float:
+        return float(getattr(self.model, name, default))
+
+    def _costs(self) -> dict[str, float]:
+        # At the start there is no training yet that it could be a share of.
+        elapsed = time.perf_counter() - self._started
+        costs = {"time/inspection_seconds": self.seconds}
+        return costs | {"time/inspection_share": self.seconds / elapsed} if self._game_steps() else costs
+
+    def _draw(self, played: Played) -> None:
+        self._page.show("team/return_of_each_episode", th.tensor(played.returns))
+        if self.model.ep_info_buffer:
+            recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
+            self._page.show("rollout/team_return_of_each_episode", recent)
+        for tag, figure in self._figures(played).items():
+            self._page.show(tag, Figure(figure, close=True))
+        if played.pictures:
+            self._page.show("episode/strip", Image(film.strip(played.pictures), "HWC"))
+            self._page.gif("episode/film", film.gif(played.pictures), self.num_timesteps)
+
+    def _figures(self, played: Played) -> dict[str, MplFigure]:
+        counted, gamma = played.counted, self._number("gamma", 1.0)
+        values, returns = played.values[counted], lambda_returns(played, gamma)[counted]
+        unit = return_scale(self.eval_env).unit
+        drawn = {"critic/calibration": figures.calibration(values, returns, calibrate(values, returns), unit)}
+        if played.weights is not None and played.actions is not None:
+            weights, agents = played.weights[counted], report.counted_agents(played)
+            drawn["pool/by_agent"] = figures.chosen_by_agent(chosen_by(weights, agents, self.n_agents))
+            table = differences(self.model.action_space, played.actions[counted])
+            drawn["pool/differences"] = figures.policy_differences(table)
+            if played.zones is not None:
+                drawn["pool/by_zone"] = self._by_zone(played)
+        write, read = report.write_attention(played), report.read_attention(played)
+        if write is not None and read is not None and played.write is not None:
+            drawn["knowledge_source/attention"] = figures.attention(write, read)
+            drawn["knowledge_source/one_episode"] = figures.attention_over_time(_first_episode(played, played.write))
+        return drawn
+
+    def _by_zone(self, played: Played) -> MplFigure:
+        assert played.weights is not None and played.zones is not None
+        zones = played.zones[played.counted]
+        colours = zone_colours(self.eval_env)
+        n_zones = max(int(zones.max(initial=0)) + 1, len(colours or ()))
+        table = chosen_by(played.weights[played.counted], zones, n_zones)
+        return figures.chosen_by_zone(table, colours)
+
+
+def _first_episode(played: Played, attention: np.ndarray) -> np.ndarray:
+    """(T', ...) of the first game that was played, up to the end of its first episode."""
+    game = int(np.flatnonzero(report.counted_games(played).any(axis=0))[0])
+    ends = played.ends.reshape(len(played.ends), -1, played.n_agents)[:, game].all(axis=1)
+    return attention[: int(np.flatnonzero(ends)[0]) + 1, game]
+
+
+def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:
+    if training_env.unwrapped is eval_env.unwrapped:
+        raise ValueError(
+            "eval_env is the training environment; inspections would play on its games: make another one, for instance "
+            "with sb3_saf.make_team_env and a seed of its own"
+        )
+    for name in ("observation_space", "action_space"):
+        of_training, of_eval = getattr(training_env, name), getattr(eval_env, name)
+        if of_training != of_eval:
+            raise ValueError(
+                f"expected eval_env to have the {name} of the training environment, {of_training}, got {of_eval}; make "
+                "both with the same arguments"
+            )
+    limits = [_time_limit(env) for env in (training_env, eval_env)]
+    if None not in limits and limits[0] != limits[1]:
+        raise ValueError(
+            f"expected eval_env to treat time limits as training does (time_limit={limits[0]!r}), got {limits[1]!r}: "
+            "the critic would be compared with returns that it does not learn"
+        )
+
+
+def _time_limit(env: VecEnv) -> str | None:
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, CentralizedValueWrapper):
+            return env.time_limit
+        env = env.venv
+    return None
+
+
+def _require_matplotlib() -> None:
+    try:
+        import matplotlib  # noqa: F401
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            f"InspectionCallback draws with matplotlib and Pillow ({error}): pip install sb3-saf[render], or pass "
+            "pictures=False for numbers only"
+        ) from error

@@ -1,0 +1,223 @@
+"""
+Figures of the TensorBoard page. Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones are
+marked in the colours that the environment gives them.
+
+Letters: U policies, K zones, N agents, L slots, T game steps, n values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_saf.inspection.calibration import Calibration, reliability
+from sb3_saf.inspection.knowledge import Attention
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Doubles = npt.NDArray[np.float64]
+Colour = tuple[float, float, float]
+
+_BLUE: Final = "#0072B2"
+_ORANGE: Final = "#D55E00"
+_GREY: Final = "#666666"
+_SCATTERED: Final = 1500
+_STYLE: Final[dict[Any, Any]] = {
+    "font.size": 12,
+    "axes.titlesize": 13,
+    "axes.labelsize": 12,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+
+
+def _figure(width: float, height: float, rows: int = 1, title: str = "") -> tuple[Figure, list[Axes]]:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+        axes = figure.subplots(rows, 1, squeeze=False, sharex=True)
+    if title:
+        figure.suptitle(title, fontsize=13)
+    return figure, list(axes.flat)
+
+
+def _heat_map(axes: Axes, table: Doubles, unit: str, vmax: float | None = None, percent: bool = True) -> None:
+    """Draw a table with its numbers in it."""
+    highest = vmax or max(float(np.nanmax(table, initial=0.0)), 1e-9)
+    image = axes.imshow(np.ma.masked_invalid(table), cmap="cividis", vmin=0, vmax=highest, aspect="auto")
+    size = 12 if table.size <= 60 else 9
+    if table.size <= 150:
+        for (row, column), value in np.ndenumerate(table):
+            if np.isfinite(value):
+                text = f"{100 * value:.0f}" if percent else f"{value:.2f}"
+                ink = "black" if value > 0.55 * highest else "white"
+                axes.text(column, row, text, ha="center", va="center", fontsize=size, color=ink)
+    axes.spines[:].set_visible(False)
+    bar = axes.figure.colorbar(image, ax=axes, pad=0.02, label=unit)
+    bar.outline.set_visible(False)
+    if percent:
+        from matplotlib.ticker import PercentFormatter
+
+        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+
+
+def _ticks(axes: Axes, rows: Sequence[str], columns: Sequence[str]) -> None:
+    axes.set_yticks(range(len(rows)), rows)
+    axes.set_xticks(range(len(columns)), columns)
+    axes.tick_params(length=0)
+
+
+def _numbers(count: int) -> list[str]:
+    """0, 1, 2 ...; of many, every so many."""
+    step = 1 + count // 16
+    return [str(index) if index % step == 0 else "" for index in range(count)]
+
+
+def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
+    """
+    How often each policy is chosen in each zone.
+
+    :param table: (K, U)
+    :param colours: of the zones
+    """
+    n_zones, n_policies = table.shape
+    figure, (axes,) = _figure(5.6, 1.8 + 0.55 * max(3, n_zones), title="Which policy acts in which zone")
+    _heat_map(axes, table, "chosen", vmax=1.0)
+    _ticks(axes, [f"zone {zone}" for zone in range(n_zones)], [f"policy {policy}" for policy in range(n_policies)])
+    if colours is not None:
+        from matplotlib.patches import Rectangle
+
+        # A band of the zone's colour, as agents in it are drawn, between the labels and the table.
+        for zone in range(n_zones):
+            axes.add_patch(Rectangle((-0.58, zone - 0.5), 0.07, 1, color=colours[zone], clip_on=False))
+        axes.tick_params(axis="y", pad=10)
+    return figure
+
+
+def chosen_by_agent(table: Doubles) -> Figure:
+    """
+    How often each policy is chosen by each agent.
+
+    :param table: (N, U)
+    """
+    n_agents, n_policies = table.shape
+    figure, (axes,) = _figure(5.6, min(12.0, 1.8 + 0.42 * max(3, n_agents)), title="Which policy acts for which agent")
+    _heat_map(axes, table, "chosen", vmax=1.0)
+    _ticks(axes, _numbers(n_agents), [f"policy {policy}" for policy in range(n_policies)])
+    axes.set_ylabel("agent")
+    return figure
+
+
+def policy_differences(table: Doubles) -> Figure:
+    """
+    How differently policies act.
+
+    :param table: (U, U) Hellinger distances
+    """
+    names = [f"policy {policy}" for policy in range(len(table))]
+    figure, (axes,) = _figure(5.6, 4.4, title="How differently policies act (0 alike, 1 never alike)")
+    _heat_map(axes, table, "Hellinger distance", vmax=1.0, percent=False)
+    _ticks(axes, names, names)
+    return figure
+
+
+def attention(write: Attention, read: Attention) -> Figure:
+    """
+    Who writes to which slot, and who reads which.
+
+    :param write: (L, N)
+    :param read: (N, L)
+    """
+    n_slots, n_agents = write.mean.shape
+    width, height = min(14.0, 4.2 + 0.28 * n_agents), 2.4 + 0.7 * n_slots
+    figure, (above, below) = _figure(width, height, 2, title="Knowledge source: mean attention")
+    _heat_map(above, write.mean, "attention")
+    above.set_title("writing: each row sums to 100 %")
+    _heat_map(below, read.mean.T, "attention")
+    below.set_title("reading: each column sums to 100 %")
+    for axes in (above, below):
+        _ticks(axes, [f"slot {slot}" for slot in range(n_slots)], _numbers(n_agents))
+    below.set_xlabel("agent")
+    return figure
+
+
+def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
+    """
+    Who writes to which slot, step by step, in one episode.
+
+    :param write: (T, L, N)
+    """
+    n_steps, n_slots, n_agents = write.shape
+    n_shown = min(n_slots, 6)
+    height = 1.4 + n_shown * (0.35 + 0.12 * min(n_agents, 20))
+    figure, panels = _figure(5.6, height, n_shown, title="Who writes to which slot, in one episode")
+    highest = float(write.max())
+    for slot, axes in enumerate(panels):
+        picture = axes.imshow(
+            write[:, slot].T,
+            cmap="cividis",
+            vmin=0,
+            vmax=highest,
+            aspect="auto",
+            interpolation="nearest",
+            extent=(0, n_steps, n_agents - 0.5, -0.5),
+        )
+        axes.set_ylabel(f"slot {slot}\nagent")
+        axes.set_yticks([0, n_agents - 1])
+    panels[-1].set_xlabel("game step")
+    from matplotlib.ticker import PercentFormatter
+
+    figure.colorbar(
+        picture, ax=panels, label="attention", pad=0.02, aspect=25, format=PercentFormatter(1.0, decimals=0)
+    )
+    return figure
+
+
+def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Calibration, unit: str | None) -> Figure:
+    """
+    Values against the returns that followed.
+
+    :param values: (n,)
+    :param returns: (n,)
+    :param found: what they agree on
+    :param unit: what returns count
+    """
+    figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
+    few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
+    axes.scatter(values[few], returns[few], s=6, alpha=0.25, color=_GREY, linewidths=0, label="single steps")
+    ends = [float(min(values.min(), returns.min())), float(max(values.max(), returns.max()))]
+    axes.plot(ends, ends, color="black", linestyle="--", linewidth=1, label="value = return")
+    bins = reliability(values, returns)
+    axes.errorbar(
+        [each.value for each in bins],
+        [each.mean for each in bins],
+        yerr=[each.std for each in bins],
+        fmt="o",
+        markersize=7,
+        color=_BLUE,
+        ecolor=_BLUE,
+        elinewidth=1.5,
+        capsize=3,
+        label="tenths: mean ± standard deviation",
+    )
+    of_unit = f" ({unit} per agent)" if unit else ""
+    axes.set(xlabel=f"value{of_unit}", ylabel=f"discounted return{of_unit}")
+    axes.set_title(_summary(found), fontsize=11, color=_ORANGE)
+    axes.legend(loc="upper left", fontsize=10, frameon=False)
+    return figure
+
+
+def _summary(found: Calibration) -> str:
+    parts = [
+        ("explained variance", found.explained_variance, ".2f"),
+        ("slope", found.slope, ".2f"),
+        ("bias", found.bias, "+.2g"),
+    ]
+    return ", ".join(f"{name} {value:{form}}" for name, value, form in parts if value is not None)

@@ -1,0 +1,8 @@
+"""Train or tune a team by name: ``python -m sb3_saf.train --help``."""
+
+from __future__ import annotations
+
+from sb3_saf.zoo.train import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Evaluation, checkpoints and tuning while training: all in game steps, none touching the generators of training."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import set_random_seed
+
+from sb3_saf.common.callbacks import TeamEvalCallback
+from sb3_saf.common.evaluation import EvaluationResult
+from sb3_saf.common.game_steps import game_steps
+from sb3_saf.zoo.seeds import MAX_SEED, evaluation_seed
+
+
+@contextmanager
+def own_generators(seed: int) -> Iterator[None]:
+    """
+    Seed the global generators of Python, NumPy and torch for a while, then put them back where they were.
+
+    SB3 samples actions from them: without this, a run with evaluations would differ from the same run without.
+
+    :param seed: of what happens inside
+    """
+    python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
+    with th.random.fork_rng():
+        set_random_seed(seed % MAX_SEED, using_cuda=th.cuda.is_available())
+        try:
+            yield
+        finally:
+            random.setstate(python_state)
+            np.random.set_state(numpy_state)  # noqa: NPY002
+
+
+class ZooEvalCallback(TeamEvalCallback):
+    """
+    ``TeamEvalCallback`` that leaves training as it would be without it, and evaluates the final policy too.
+
+    :param args: as ``TeamEvalCallback``
+    :param seed: the run's seed
+    :param kwargs: as ``TeamEvalCallback``
+    """
+
+    def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._seed = evaluation_seed(seed)
+        self._n_evaluations = 0
+        self._evaluated_at = -1
+        self._has_started = False
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._has_started = True
+
+    def _evaluate(self) -> bool:
+        self._n_evaluations += 1
+        self._evaluated_at = self._game_steps()
+        with own_generators(self._seed + self._n_evaluations):
+            return super()._evaluate()
+
+    def _on_training_end(self) -> None:
+        # RL-Zoo3 ends its first callback once more, and ends it even if training never began.
+        if self._has_started and self.eval_freq > 0 and self._evaluated_at != self._game_steps():
+            self._evaluate()
+
+
+class TrialCallback(ZooEvalCallback):
+    """
+    Evaluation of an Optuna trial: reports every evaluation, and stops what the pruner gives up.
+
+    :param args: as ``ZooEvalCallback``
+    :param trial: the trial
+    :param kwargs: as ``ZooEvalCallback``
+    """
+
+    def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.trial = trial
+        self.is_pruned = False
+
+    def _react(self, result: EvaluationResult) -> bool:
+        go_on = super()._react(result)
+        self.trial.report(result.mean, self._n_evaluations)
+        self.is_pruned = self.trial.should_prune()
+        return go_on and not self.is_pruned
+
+    def _on_training_end(self) -> None:
+        if not self.is_pruned:
+            super()._on_training_end()
+
+
+class CheckpointInGameSteps(BaseCallback):
+    """
+    Save the model every so many game steps, as ``rl_model_<game steps>_steps.zip``.
+
+    :param save_freq: game steps between checkpoints, summed over all parallel games
+    :param folder: where to
+    :param verbose: 1 to say so
+    """
+
+    def __init__(self, save_freq: int, folder: str | Path, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.save_freq = save_freq
+        self.folder = Path(folder)
+        self._next = 0
+
+    def _game_steps(self) -> int:
+        steps = game_steps(self.model)
+        assert steps is not None, "the zoo trains on teams only"
+        return steps
+
+    def _on_training_start(self) -> None:
+        self._next = (self._game_steps() // self.save_freq + 1) * self.save_freq
+
+    def _on_step(self) -> bool:
+        steps = self._game_steps()
+        if steps >= self._next:
+            self._next = (steps // self.save_freq + 1) * self.save_freq
+            path = self.folder / f"rl_model_{steps}_steps.zip"
+            self.model.save(path)
+            if self.verbose > 0:
+                print(f"Saved {path}")
+        return True

@@ -1,0 +1,178 @@
+"""Runs in a log folder, ``FOLDER/ALGO/ENV_NUMBER``: what they were, and their results as tidy tables."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import pandas as pd
+
+from sb3_saf.zoo.names import unknown_name
+from sb3_saf.zoo.settings import Settings, saved_settings
+from sb3_saf.zoo.yaml_files import load_yaml
+
+#: Where scores come from: evaluation games, or the games that were trained on.
+Source = Literal["evaluation", "training"]
+
+#: Points of a curve of training episodes.
+_N_BINS: Final = 50
+#: The part of training whose episodes count as its result.
+_FINAL_PART: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    A folder that ``sb3_saf.train`` has left.
+
+    :param folder: the folder
+    :param env_id: the environment
+    :param number: of the run, counted for each algorithm and environment
+    """
+
+    folder: Path
+    env_id: str
+    number: int
+
+    @cached_property
+    def config(self) -> Mapping[str, Any]:
+        """``config.yml``."""
+        path = self.folder / self.env_id / "config.yml"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} is no run of sb3_saf.train: there is no {path}")
+        config = load_yaml(path.read_text(encoding="utf-8"), str(path))
+        if not isinstance(config, dict) or "seed" not in config:
+            raise ValueError(f"{path} does not hold the settings of a run of sb3_saf.train")
+        return config
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What was trained."""
+        return saved_settings(self.config)
+
+    def curve(self, source: Source) -> pd.DataFrame:
+        """
+        Team return along training.
+
+        :param source: where scores come from
+        :return: columns ``game_steps``, ``score``
+        :raises ValueError: if there are no results
+        """
+        return self._evaluations() if source == "evaluation" else self._training()
+
+    def final_score(self, source: Source) -> float:
+        """
+        Mean team return at the end: of the last evaluation, or of the last tenth of training.
+
+        :param source: where scores come from
+        """
+        curve = self.curve(source)
+        if source == "evaluation":
+            return float(curve["score"].iloc[-1])
+        late = curve["game_steps"] > (1 - _FINAL_PART) * curve["game_steps"].iloc[-1]
+        return float(curve["score"][late].mean())
+
+    def _evaluations(self) -> pd.DataFrame:
+        path = self.folder / "evaluations.npz"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} has no evaluations; train with --eval-freq, or plot --source training")
+        with np.load(path) as arrays:
+            return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
+
+    def _training(self) -> pd.DataFrame:
+        path = self.folder / "monitor.csv"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} has no monitor.csv; train with sb3_saf.train")
+        episodes = pd.read_csv(path, comment="#")
+        if episodes.empty:
+            raise ValueError(f"no episode has ended in {self.folder}; train longer")
+        steps = episodes["l"].cumsum()
+        bins = np.ceil(steps / steps.iloc[-1] * _N_BINS).astype(int)
+        means = episodes["r"].groupby(bins).mean()
+        return pd.DataFrame({"game_steps": means.index * steps.iloc[-1] / _N_BINS, "score": means.to_numpy()})
+
+
+def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
+    """
+    Runs in a log folder.
+
+    :param folder: the log folder
+    :param algos: only these; all if empty
+    :param env_ids: only these; all if empty
+    :raises ValueError: if there is no folder or no run, or an algorithm has none
+    """
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}; give the -f that sb3_saf.train was given")
+    found: dict[str, list[Run]] = {}
+    for config in sorted(folder.glob("*/*_*/*/config.yml")):
+        run_folder, env_id = config.parent.parent, config.parent.name
+        number = run_folder.name.removeprefix(f"{env_id}_")
+        if number.isdigit() and (not env_ids or env_id in env_ids):
+            found.setdefault(run_folder.parent.name, []).append(Run(run_folder, env_id, int(number)))
+    if not found:
+        of = f" of {', '.join(env_ids)}" if env_ids else ""
+        raise ValueError(f"there are no runs{of} in {folder}; train some: python -m sb3_saf.train -f {folder}")
+    for algo in algos:
+        if algo not in found:
+            raise unknown_name(f"algorithm among the runs in {folder}:", algo, found)
+    runs = [run for algo in (algos or found) for run in found[algo]]
+    return sorted(runs, key=lambda run: run.number)
+
+
+def describe(runs: Sequence[Run]) -> pd.DataFrame:
+    """
+    What tells runs apart.
+
+    :param runs: the runs
+    :return: columns ``run``, ``method``, ``seed``, ``env``, ``size``, ``n_treasures`` and the parameters of the level;
+        a method's name says which of its hyperparameters differ among the runs. Of runs that are alike but for their
+        number only the latest is there.
+    """
+    rows = []
+    for run in runs:
+        settings = run.settings
+        identity = {"method": settings.algo, "env": settings.env_id, "size": settings.size, "seed": run.config["seed"]}
+        rows.append({**identity, **settings.env_kwargs, "run": run})
+    table = pd.DataFrame(rows)
+    table["method"] = _method_names(runs)
+    repeated = [column for column in table.columns if column != "run"]
+    return table.drop_duplicates(repeated, keep="last", ignore_index=True)
+
+
+def _method_names(runs: Sequence[Run]) -> list[str]:
+    """The algorithm, and what differs from others of the same algorithm at the same size."""
+    flat = [{**_flat(run.settings.plain), "n_envs": run.settings.n_envs} for run in runs]
+    names = []
+    for run, own in zip(runs, flat, strict=True):
+        same = (run.settings.algo, run.settings.size)
+        peers = [
+            other for other, peer in zip(flat, runs, strict=True) if (peer.settings.algo, peer.settings.size) == same
+        ]
+        keys = sorted({key for peer in peers for key in peer})
+        # The size of a minibatch follows from the number of agents.
+        varying = [key for key in keys if key != "batch_size" and len({repr(peer.get(key)) for peer in peers}) > 1]
+        names.append(" ".join([run.settings.algo, *(f"{key}={own.get(key)}" for key in varying)]))
+    return names
+
+
+def _flat(plain: Mapping[str, Any]) -> dict[str, Any]:
+    return {**plain, **plain.get("policy_kwargs", {}), "policy_kwargs": None}
+
+
+def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
+    """
+    A name for the games of each row: the environment, and the parameters in which the rows differ.
+
+    :param table: from :func:`describe`
+    :param without: parameters that shall not be named
+    """
+    named = {"method", "seed", "env", "run", *without}
+    varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
+    return [
+        ", ".join([row["env"].removesuffix("-v0"), *(f"{column} {row[column]}" for column in varying)])
+        for _, row in table.iterrows()
+    ]

@@ -1,0 +1,161 @@
+"""Files of checkpoints: what they hold, damage, full disks, other formats, two runs in one folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_saf.checkpoints.data import decode, encode
+from sb3_saf.checkpoints.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
+from sb3_saf.checkpoints.store import CheckpointFolder
+
+TREE: dict[str, Any] = {
+    "numbers": [1, -1.5, float("-inf"), True, None, 2**127, "text"],
+    "by number": {0: "a", 1: (1, 2.0)},
+    "array": np.arange(6, dtype=np.uint64).reshape(2, 3),
+    "no axes": np.array(3.0),
+    "scalar": np.float32(0.1),
+    "tensor": th.arange(4.0),
+    "$": "a key that marks nothing",
+}
+ROUNDS = int(os.environ.get("CHECKPOINT_DAMAGES", "200"))
+
+
+def test_what_goes_in_comes_out() -> None:
+    tree = decode(encode(TREE, "1.2"))
+    assert tree["numbers"] == TREE["numbers"] and tree["by number"] == TREE["by number"] and tree["$"] == TREE["$"]
+    assert list(map(type, tree["numbers"])) == list(map(type, TREE["numbers"]))
+    for name in ("array", "no axes", "scalar", "tensor"):
+        assert type(tree[name]) is type(TREE[name])
+        assert tree[name].dtype == TREE[name].dtype and tree[name].shape == TREE[name].shape
+        assert bool((tree[name] == TREE[name]).all())
+    assert tree["array"].flags.writeable
+    assert decode(encode(deque([1, 2]), "1.2")) == [1, 2]
+
+
+@pytest.mark.parametrize("value", [object(), np.array([object()]), {"a": {1, 2}}])
+def test_what_is_no_data_is_named(value: Any) -> None:
+    with pytest.raises(CheckpointError, match=r"state\['here'\]"):
+        encode({"here": value}, "1.2")
+
+
+def test_every_truncation_and_bit_flip_is_recognised() -> None:
+    data = encode(TREE, "1.2")
+    rng = np.random.default_rng(0)
+    for _ in range(ROUNDS):
+        flipped = bytearray(data)
+        flipped[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+        for damaged in (bytes(flipped), data[: rng.integers(len(data))], data + b"x"):
+            with pytest.raises(DamagedCheckpointError):
+                decode(damaged)
+
+
+def test_wrong_content_with_a_right_checksum_is_an_error_of_ours() -> None:
+    for content in (b"", b"sb3_saf checkpoint, format 1, written by sb3_saf 1.2\nnonsense", b"something else"):
+        with pytest.raises(DamagedCheckpointError):
+            decode(content + hashlib.sha256(content).digest())
+
+
+def in_format_9() -> bytes:
+    content = b"sb3_saf checkpoint, format 9, written by sb3_saf 7.5.0\nwhatever that is"
+    return content + hashlib.sha256(content).digest()
+
+
+def test_an_unknown_format_says_who_wrote_it(tmp_path: Path) -> None:
+    folder = CheckpointFolder(tmp_path)
+    folder.write(encode(1, "1.2"), 10)
+    folder.write(in_format_9(), 20)
+    with pytest.raises(UnknownFormatError, match=r"checkpoint-000000000020.*format 9.*sb3_saf 7\.5\.0.*format 1"):
+        folder.newest()
+
+
+def test_the_last_ones_are_kept_and_the_newest_is_read(tmp_path: Path) -> None:
+    folder = CheckpointFolder(tmp_path / "new" / "folder", keep=2)
+    assert folder.newest() is None
+    for steps in (5, 30, 100, 999_999_999_999):
+        folder.write(encode(steps, "1.2"), steps)
+    assert [int(path.stem.split("-")[1]) for path in folder.checkpoints()] == [999_999_999_999, 100]
+    loaded = folder.newest()
+    assert loaded is not None and loaded.tree == 999_999_999_999
+
+
+def test_a_damaged_file_is_passed_over_with_a_warning_that_names_both(tmp_path: Path) -> None:
+    folder = CheckpointFolder(tmp_path)
+    for steps in (10, 20):
+        folder.write(encode(steps, "1.2"), steps)
+    newest, before = folder.checkpoints()
+    newest.write_bytes(newest.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match=rf"{newest}.*checksum.*Going back to {before}"):
+        loaded = folder.newest()
+    assert loaded is not None and loaded.tree == 10
+    before.write_bytes(b"")
+    with (
+        pytest.warns(UserWarning, match="Going back"),
+        pytest.raises(DamagedCheckpointError, match=f"no checkpoint in {tmp_path}"),
+    ):
+        folder.newest()
+
+
+def test_a_damaged_newer_file_does_not_push_out_what_is_written_after_it(tmp_path: Path) -> None:
+    folder = CheckpointFolder(tmp_path, keep=1)
+    (tmp_path / "checkpoint-000000000020.ckpt").write_bytes(b"damaged")
+    folder.write(encode(10, "1.2"), 10)
+    folder.write(encode(15, "1.2"), 15)
+    with pytest.warns(UserWarning, match="Going back to .*15.ckpt"):
+        loaded = folder.newest()
+    assert loaded is not None and loaded.tree == 15
+
+
+def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = CheckpointFolder(tmp_path)
+    folder.write(encode(1, "1.2"), 10)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(CheckpointError, match=r"No space left.*last good one is .*checkpoint-000000000010"):
+        folder.write(encode(2, "1.2"), 20)
+    monkeypatch.undo()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-000000000010.ckpt"]
+    loaded = folder.newest()
+    assert loaded is not None and loaded.tree == 1
+
+
+def test_what_a_killed_write_left_is_removed_and_never_read(tmp_path: Path) -> None:
+    (tmp_path / ".writing-abc").write_bytes(b"half")
+    folder = CheckpointFolder(tmp_path)
+    assert folder.newest() is None
+    folder.write(encode(1, "1.2"), 10)
+    assert not (tmp_path / ".writing-abc").exists()
+
+
+HOLD_THE_LOCK = """
+import sys
+from sb3_saf.checkpoints.store import CheckpointFolder
+CheckpointFolder(sys.argv[1]).acquire()
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_one_run_per_folder_and_a_killed_one_does_not_block(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLD_THE_LOCK, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"held\n"
+        with pytest.raises(CheckpointError, match=rf"process {other.pid}\).*{tmp_path}"):
+            CheckpointFolder(tmp_path).acquire()
+        other.kill()
+        other.wait()
+    mine = CheckpointFolder(tmp_path)
+    mine.acquire()
+    mine.release()

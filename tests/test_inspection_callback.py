@@ -1,0 +1,478 @@
+"""The inspection callback in real training: what it writes, what it leaves out, and that training never notices."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch as th
+from gymnasium import spaces
+from PIL import Image
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import nn
+
+from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamMonitor, TeamRolloutBuffer, make_team_env
+from sb3_saf.common.policies import TeamPolicy
+from sb3_saf.common.teams import TeamSpaces
+from sb3_saf.inspection import film
+from sb3_saf.inspection.calibration import calibrate, lambda_returns
+from sb3_saf.inspection.doors import zone_function
+from sb3_saf.inspection.episodes import Played, Player
+from sb3_saf.inspection.report import critic_scalars, message_scalars, pool_scalars
+from sb3_saf.ippo.policies import IPPOPolicy
+from sb3_saf.saf.critic import SAFCritic
+from sb3_saf.saf.policies import SAFPolicy
+from sb3_saf.saf.policy_pool import PolicyPool, PoolOutput
+from tests.contrib_teams import MaskedTeams
+from tests.probe_envs import ConstantReward, DelayedReward, Message, Probe
+from tests.team_venv import TeamVenv
+from tests.test_active import ACTIVE, LIVES
+from tests.test_monitor import RETURN_OF_GAME_0, RETURN_OF_GAME_1
+from tests.test_probes import train as train_on_probe
+from tests.toy_envs import TellingEnv
+from tests.toy_teams import ToyTeams
+
+LEVEL: dict[str, Any] = {"n_agents": 3, "grid_size": 9, "n_treasures": 30, "heterogeneity": 2, "max_cycles": 6}
+SMALL: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8}}
+SMALL_SAF: dict[str, Any] = SMALL | {"latent_dim": 8, "projection_arch": (16,), "n_policies": 3, "n_slots": 2}
+
+
+def learn(
+    folder: Path | None,
+    callback: InspectionCallback | None,
+    policy: str = "SAFPolicy",
+    algorithm: Any = PPO,
+    env: Any = None,
+    n_updates: int = 2,
+    **policy_kwargs: Any,
+) -> Any:
+    """Four games of five steps a rollout."""
+    env = env or ToyTeams()
+    extra: dict[str, Any] = {}
+    if algorithm is not A2C:
+        extra |= {"batch_size": 5 * env.num_envs, "n_epochs": 2}
+    if algorithm is PPO:
+        extra["rollout_buffer_class"] = TeamRolloutBuffer
+    sizes = SMALL_SAF if policy.startswith("SAF") else SMALL
+    model = algorithm(
+        policy,
+        env,
+        n_steps=5,
+        gamma=0.9,
+        seed=1,
+        device="cpu",
+        tensorboard_log=None if folder is None else str(folder),
+        policy_kwargs=sizes | policy_kwargs,
+        **extra,
+    )
+    return model.learn(5 * env.num_envs * n_updates, callback=callback)
+
+
+def events(folder: Path) -> EventAccumulator:
+    (file,) = folder.rglob("events.*")
+    return EventAccumulator(
+        str(file), size_guidance=dict.fromkeys(("scalars", "images", "histograms", "tensors"), 0)
+    ).Reload()
+
+
+def scalars_of(folder: Path) -> dict[str, list[float]]:
+    found = events(folder)
+    return {tag: [event.value for event in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
+
+
+def groups(tags: Any) -> set[str]:
+    return {tag.split("/")[0] for tag in tags} - {"rollout", "time", "train"}
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> EventAccumulator:
+    """SAF on a small HECOGrid, everything on."""
+    folder = tmp_path_factory.mktemp("page")
+    env = make_team_env("TeamSupport", n_envs=4, seed=0, **LEVEL)
+    eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
+    callback = InspectionCallback(eval_env, every_game_steps=20, n_eval_episodes=3, hparams={"task": "TeamSupport"})
+    learn(folder, callback, env=env, n_updates=3)
+    return events(folder)
+
+
+class TestPage:
+    def test_scalars(self, page: EventAccumulator) -> None:
+        expected = {
+            *("team/return", "team/return_low", "team/return_high", "team/episode_length", "team/share_of_treasures"),
+            *(f"pool/chosen/policy_{policy}" for policy in range(3)),
+            *("pool/entropy", "pool/entropy_of_mean", "pool/difference", "pool/zone_dependence"),
+            *(f"pool_by_zone/zone_{zone}/policy_{policy}" for zone in range(2) for policy in range(3)),
+            *(f"knowledge_source/{way}_entropy{of}" for way in ("write", "read") for of in ("", "_of_mean")),
+            *(f"knowledge_source/read/slot_{slot}" for slot in range(2)),
+            *(f"message/value_error{without}" for without in ("", "_zeroed", "_shuffled")),
+            *("critic/mean_value", "critic/mean_return", "critic/bias", "critic/error", "critic/td_error"),
+            *("critic/slope", "critic/explained_variance", "critic/explained_variance_of_target"),
+            *("time/game_steps", "time/game_steps_per_second", "time/inspection_seconds", "time/inspection_share"),
+        }
+        assert expected <= set(page.Tags()["scalars"])
+
+    def test_pictures(self, page: EventAccumulator) -> None:
+        assert set(page.Tags()["images"]) == {
+            *("pool/by_zone", "pool/by_agent", "pool/differences"),
+            *("knowledge_source/attention", "knowledge_source/one_episode"),
+            *("critic/calibration", "episode/strip", "episode/film"),
+        }
+        for tag in page.Tags()["images"]:
+            image = Image.open(io.BytesIO(page.Images(tag)[-1].encoded_image_string))
+            assert image.width > 100 and image.height > 100
+        movie = Image.open(io.BytesIO(page.Images("episode/film")[-1].encoded_image_string))
+        assert (movie.format, movie.n_frames) == ("GIF", LEVEL["max_cycles"])  # type: ignore[attr-defined]
+
+    def test_returns_of_episodes(self, page: EventAccumulator) -> None:
+        assert [event.histogram_value.num for event in page.Histograms("team/return_of_each_episode")] == [3] * 4
+        assert "rollout/team_return_of_each_episode" in page.Tags()["histograms"]
+
+    def test_layout_and_hyperparameters(self, page: EventAccumulator) -> None:
+        layout = page.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0].decode(errors="replace")
+        for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1"):
+            assert name in layout
+        told = page.PluginTagToContent("hparams")
+        for word in (b"TeamSupport", b"n_policies", b"learning_rate"):
+            assert word in told["_hparams_/session_start_info"]
+        assert b"team/return" in told["_hparams_/experiment"]
+
+    def test_before_during_and_after_training(self, page: EventAccumulator) -> None:
+        # 20 games' steps a rollout, three agents' steps each.
+        assert [event.step for event in page.Scalars("team/return")] == [0, 60, 120, 180]
+
+    def test_the_same_episodes_every_time(self, tmp_path: Path) -> None:
+        still = InspectionCallback(ToyTeams(), every_game_steps=20, n_eval_episodes=6, pictures=False)
+        learn(tmp_path, still, optimizer_class=_NoOptimizer)
+        returns = scalars_of(tmp_path)["team/return"]
+        assert len(returns) == 3 and len(set(returns)) == 1
+
+
+class _NoOptimizer(th.optim.SGD):
+    """Learns nothing."""
+
+    def __init__(self, params: Any, lr: float, eps: float = 0.0):
+        super().__init__(params, lr)
+
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
+        return None
+
+
+@pytest.mark.parametrize(
+    ("policy", "settings"),
+    [
+        ("SAFPolicy", {}),
+        ("SAFPolicy", {"selection": "gumbel"}),
+        ("SAFPolicy", {"normalize_values": True}),
+        ("MAPPOPolicy", {}),
+    ],
+)
+def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settings: dict[str, Any]) -> None:
+    alone = learn(None, None, policy, n_updates=3, **settings).policy.state_dict()
+    callback = InspectionCallback(ToyTeams(), every_game_steps=7, n_eval_episodes=2, pictures=False)
+    with pytest.warns(UserWarning, match="writes no TensorBoard file"):
+        watched = learn(None, callback, policy, n_updates=3, **settings).policy.state_dict()
+    assert callback.seconds > 0
+    assert alone.keys() == watched.keys()
+    for name, weights in alone.items():
+        assert th.equal(weights, watched[name]), name
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy", "settings", "expected"),
+    [
+        (PPO, "SAFPolicy", {}, {"pool", "knowledge_source", "message"}),
+        (A2C, "SAFPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
+        (PPO, "SAFPolicy", {"n_policies": 1}, {"knowledge_source", "message"}),
+        (PPO, "SAFPolicy", {"knowledge_source": False}, {"pool"}),
+        (PPO, "MAPPOPolicy", {}, set()),
+        (PPO, "IPPOPolicy", {"heads": "per_agent"}, set()),
+        (RecurrentPPO, "SAFLstmPolicy", {}, {"pool", "knowledge_source", "message"}),
+        (RecurrentPPO, "SAFLstmPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
+        (RecurrentPPO, "SAFLstmPolicy", {"enable_critic_lstm": False}, {"pool", "knowledge_source", "message"}),
+        (RecurrentPPO, "IPPOLstmPolicy", {}, set()),
+        (MaskablePPO, "SAFMaskablePolicy", {}, {"pool", "knowledge_source", "message"}),
+    ],
+)
+def test_what_a_policy_lacks_is_left_out(
+    algorithm: type[BaseAlgorithm], policy: str, settings: dict[str, Any], expected: set[str], tmp_path: Path
+) -> None:
+    env = MaskedTeams(spaces.Discrete(3)) if algorithm is MaskablePPO else ToyTeams()
+    eval_env = type(env)(spaces.Discrete(3)) if isinstance(env, MaskedTeams) else ToyTeams()
+    learn(tmp_path, InspectionCallback(eval_env, n_eval_episodes=4), policy, algorithm, env, n_updates=1, **settings)
+    if isinstance(eval_env, MaskedTeams):
+        assert eval_env.n_forbidden == 0 < eval_env.n_actions
+    found = events(tmp_path)
+    assert groups(found.Tags()["scalars"]) == {"team", "critic"} | expected
+    assert groups(found.Tags()["images"]) == {"critic"} | (expected - {"message"})
+    for tag in found.Tags()["scalars"]:
+        assert all(math.isfinite(event.value) for event in found.Scalars(tag)), tag
+
+
+def test_reward_normalisation_is_that_of_training(tmp_path: Path) -> None:
+    callback = InspectionCallback(ToyTeams(), n_eval_episodes=4, pictures=False)
+    env = VecNormalize(ToyTeams(), norm_obs=False, clip_reward=1e9)
+    learn(tmp_path, callback, env=env, n_updates=4)
+    plain, scale = Player(ToyTeams(), 4, 20_000, False, None), math.sqrt(env.ret_rms.var + env.epsilon)
+    model = callback.model
+    th.manual_seed(20_000)
+    game = plain.play(model.policy)  # type: ignore[arg-type]
+    found = scalars_of(tmp_path)
+    assert found["team/return"][-1] == pytest.approx(np.mean(game.returns), rel=1e-5)
+    mean_return = lambda_returns(game._replace(rewards=game.rewards / scale), 0.9)[game.counted].mean()
+    assert found["critic/mean_return"][-1] == pytest.approx(mean_return, rel=1e-4)
+    assert abs(scale - 1) > 0.01
+
+
+# --- hand-made policies -----------------------------------------------------------------------------------------------
+
+
+def hand_made(policy_class: type[TeamPolicy], env: Any, **kwargs: Any) -> Any:
+    """A policy whose features are the observation."""
+    return policy_class(
+        env.observation_space, env.action_space, lambda _: 0.0, features_extractor_class=FlattenExtractor, **kwargs
+    )
+
+
+def play(env: Any, policy: TeamPolicy, n_episodes: int = 64, zones: Any = None) -> Played:
+    th.manual_seed(0)
+    return Player(env, n_episodes, seed=3, deterministic=False, zones=zone_function(env, zones)).play(policy)
+
+
+class ExactCritic(nn.Module):
+    """Of DelayedReward with three steps: gamma ** steps_left times the number seen."""
+
+    reads_agent = False
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        steps_left = 2 - features[:, 1] - 2 * features[:, 2]
+        return features[:, 0] * 0.5**steps_left
+
+
+class Always(nn.Module):
+    reads_agent = False
+
+    def __init__(self, value: float):
+        super().__init__()
+        self.value = value
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        return th.full((len(features),), self.value)
+
+
+class TestCritic:
+    def test_an_exact_critic_is_calibrated(self) -> None:
+        env = make_team_env(DelayedReward(length=3), n_envs=8)
+        policy = hand_made(IPPOPolicy, env)
+        policy.value_net = ExactCritic()
+        game = play(env, policy)
+        returns = lambda_returns(game, 0.5)
+        assert set(np.abs(returns[game.counted]).tolist()) == {0.25, 0.5, 1.0}
+        found = calibrate(game.values[game.counted], returns[game.counted])
+        assert found == pytest.approx((1, 1, 0, 0))
+        scalars = critic_scalars(game, 0.5, 0.9)
+        assert scalars["critic/td_error"] == pytest.approx(0)
+        assert scalars["critic/explained_variance_of_target"] == pytest.approx(1)
+
+    @pytest.mark.parametrize(("time_limit", "bias"), [("bootstrap", 0.0), ("terminal", 2 - (1.5 + 1) / 2)])
+    def test_time_limits_are_those_of_training(self, time_limit: Any, bias: float) -> None:
+        """1 at every step is worth 2 if the time limit is no end, 1.5 and then 1 if it is."""
+        env = make_team_env(ConstantReward(length=2), n_envs=4, time_limit=time_limit)
+        policy = hand_made(IPPOPolicy, env)
+        policy.value_net = Always(2.0)
+        assert critic_scalars(play(env, policy), 0.5, 1.0)["critic/bias"] == pytest.approx(bias)
+
+    def test_values_are_the_policys(self) -> None:
+        env = ToyTeams()
+        policy = hand_made(SAFPolicy, env)
+        game = play(env, policy, n_episodes=4)
+        env.seed(3)
+        obs = env.reset()
+        with th.no_grad():
+            values = policy.predict_values({key: th.as_tensor(value) for key, value in obs.items()})  # type: ignore
+        np.testing.assert_allclose(game.values[0], values.flatten().numpy(), rtol=1e-6)
+
+
+class TestWhatCounts:
+    def test_each_game_plays_its_share_of_episodes(self) -> None:
+        """Three episodes in two games of three and two steps: one and two."""
+        env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
+        game = play(env, hand_made(IPPOPolicy, env), n_episodes=3)
+        assert game.counted[:, ::3].T.tolist() == [[True, True, True, False], [True] * 4]
+        assert game.returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1]
+        assert game.lengths == [2, 3, 2]
+
+    def test_agents_that_take_no_part_do_not_count(self) -> None:
+        """Illegal actions stop this environment; agents die and join."""
+        env = make_team_env(TellingEnv(**LIVES), n_envs=2)
+        policy = hand_made(SAFPolicy, env)
+        game = play(env, policy, n_episodes=2)
+        active = np.array(ACTIVE, dtype=bool)
+        np.testing.assert_array_equal(game.counted, np.tile(active, 2))
+        # Agent 0 ends with step 3, and all with step 5; who is not there yet has nothing to end.
+        assert game.ends[:, 0].tolist() == [False, False, True, True, True]
+        assert game.ends[:, 2].tolist() == [False, False, False, False, True]
+        assert game.write is not None and game.actions is not None
+        assert ((game.write > 0) == active[:, np.newaxis, np.newaxis]).all()
+        legal = np.array(
+            [[(action + agent + step) % 2 == 0 for action in range(4)] for agent in (0,) for step in (0, 1)]
+        )
+        assert ((game.actions[:2, 0, 0] > -1e7) == legal).all()
+
+
+class ZonedProbe(Probe):
+    """Two zones, told by the sign of what an agent sees."""
+
+    def rewards(self, bits: Any, actions: npt.NDArray[np.int64], time: int) -> Any:
+        return bits[:, 0]
+
+    @property
+    def agent_zones(self) -> npt.NDArray[np.int64]:
+        return (self.bits[:, 0] > 0).astype(np.int64)
+
+
+class PoolByZone(PolicyPool):
+    """Weights 0.2 and 0.8 in zone 0, 0.9 and 0.1 in zone 1."""
+
+    def evaluate(self, features: th.Tensor) -> PoolOutput:
+        weights = th.tensor([[0.2, 0.8], [0.9, 0.1]])[(features[:, 0] > 0).long()]
+        return PoolOutput(weights.log(), super().evaluate(features).actions)
+
+
+class TestZones:
+    EXPECTED = {
+        "pool_by_zone/zone_0/policy_0": 0.2,
+        "pool_by_zone/zone_0/policy_1": 0.8,
+        "pool_by_zone/zone_1/policy_0": 0.9,
+        "pool_by_zone/zone_1/policy_1": 0.1,
+    }
+
+    @pytest.mark.parametrize("how", ["attribute", "function", "none"])
+    def test_a_pool_with_known_choices_gives_the_known_table(self, how: str) -> None:
+        env = make_team_env(ZonedProbe(length=2), n_envs=16)
+        policy = hand_made(SAFPolicy, env, n_policies=2)
+        policy.actor.__class__ = PoolByZone
+
+        def other_way_round(env: Any) -> Any:
+            return 1 - np.concatenate(env.get_attr("agent_zones", indices=range(0, env.num_envs, 2)))
+
+        zones = {"attribute": None, "function": other_way_round, "none": False}[how]
+        scalars = pool_scalars(play(env, policy, 32, zones), env.action_space)
+        found = {tag: value for tag, value in scalars.items() if tag.startswith("pool_by_zone")}
+        expected = self.EXPECTED
+        if how == "function":
+            expected = {
+                tag.translate(
+                    str.maketrans("01", "10"),
+                ): 1 - value
+                for tag, value in expected.items()
+            }
+        assert found == pytest.approx({} if how == "none" else expected)
+
+    def test_hecogrids_zones_are_those_of_the_agents_columns(self) -> None:
+        env = make_team_env("TeamTogether", n_envs=5, seed=0, n_agents=4, grid_size=12, heterogeneity=3, n_treasures=4)
+        env.reset()
+        function = zone_function(env, None)
+        assert function is not None
+        columns = np.concatenate(
+            [state["agent_pos"][:, 0] for state in env.env_method("get_state", indices=range(0, 20, 4))]
+        )
+        np.testing.assert_array_equal(function(env), columns // 4)
+        assert len(env.get_attr("zone_colours", indices=[0])[0]) == 3
+
+    def test_zones_that_are_no_zones_are_refused(self) -> None:
+        env = make_team_env(ZonedProbe(), n_envs=2)
+        policy = hand_made(SAFPolicy, env)
+        for wrong, got in (([0, 1], r"got shape \(2,\)"), ([0.0] * 4, "dtype float64"), ([-2] * 4, "with -2")):
+            with pytest.raises(ValueError, match=rf"expected zones to give whole numbers .* of shape \(4,\).*{got}"):
+                play(env, policy, zones=lambda env, wrong=wrong: np.array(wrong))
+
+
+class TestMessages:
+    def test_a_critic_that_needs_messages_is_wrong_without(self) -> None:
+        """The value is what the next agent sees, -1 or 1: no guess without the message has an error below 1."""
+        policy = train_on_probe("SAFPolicy", Message(n_agents=3), n_updates=25)
+        scalars = message_scalars(play(make_team_env(Message(n_agents=3), n_envs=64), policy, 128), gamma=0.9)
+        assert scalars["message/value_error"] < 0.3
+        assert scalars["message/value_error_zeroed"] > 0.9
+        assert scalars["message/value_error_shuffled"] > 0.9
+
+    def test_a_critic_that_does_not_read_messages_is_as_good_without(self) -> None:
+        env = make_team_env(Message(n_agents=3), n_envs=16)
+        policy = hand_made(SAFPolicy, env, latent_dim=8)
+        critic = policy.value_net
+        assert isinstance(critic, SAFCritic)
+        first = critic.combine_net[0]
+        assert isinstance(first, nn.Linear)
+        first.weight.data[:, 8:] = 0  # the half that reads m
+        scalars = message_scalars(play(env, policy), gamma=0.9)
+        assert scalars["message/value_error_zeroed"] == pytest.approx(scalars["message/value_error"], rel=1e-5)
+        assert scalars["message/value_error_shuffled"] == pytest.approx(scalars["message/value_error"], rel=1e-5)
+
+    def test_a_critic_without_messages_reports_none(self) -> None:
+        env = make_team_env(Message(n_agents=3), n_envs=4)
+        assert message_scalars(play(env, hand_made(IPPOPolicy, env)), gamma=0.9) == {}
+
+    def test_a_single_game_has_nobody_to_shuffle_with(self) -> None:
+        env = make_team_env(Message(n_agents=3), n_envs=1)
+        assert set(message_scalars(play(env, hand_made(SAFPolicy, env), 4), 0.9)) == {
+            "message/value_error",
+            "message/value_error_zeroed",
+        }
+
+
+# --- arguments --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"every_game_steps": 0}, "every_game_steps must be an integer of at least 1, got 0"),
+        ({"n_eval_episodes": 2.5}, "n_eval_episodes must be an integer of at least 1, got 2.5"),
+        ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+        ({"zones": "agent_zones"}, "zones must be a function from the environment .*; got 'agent_zones'"),
+    ],
+)
+def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        InspectionCallback(ToyTeams(), **arguments)
+
+
+def test_environments_that_do_not_fit() -> None:
+    env = ToyTeams()
+    with pytest.raises(ValueError, match="eval_env is the training environment"):
+        learn(None, InspectionCallback(env), env=env)
+    with pytest.raises(ValueError, match="expected eval_env to have the observation_space of the training environment"):
+        learn(None, InspectionCallback(ToyTeams(n_agents=2)), env=env)
+    probes = [make_team_env(DelayedReward(), n_envs=1, time_limit=limit) for limit in ("terminal", "bootstrap")]
+    with pytest.raises(ValueError, match=r"as training does \(time_limit='terminal'\), got 'bootstrap'"):
+        learn(None, InspectionCallback(probes[1]), env=probes[0])
+
+
+def test_policies_of_others_are_refused() -> None:
+    model = PPO("MultiInputPolicy", ToyTeams(), n_steps=5, batch_size=60, device="cpu")
+    with pytest.raises(ValueError, match=r"expected a policy of sb3_saf such as .*, got MultiInputActorCriticPolicy"):
+        model.learn(60, callback=InspectionCallback(ToyTeams()))
+
+
+def test_a_strip_has_six_moments_in_two_rows() -> None:
+    frames = [np.full((40, 30, 3), shade, dtype=np.uint8) for shade in range(50)]
+    strip = film.strip(frames)
+    assert strip.shape == (2 * 40 + 6, 3 * 30 + 2 * 6, 3)
+    assert strip[0, ::36, 0].tolist() == [0, 10, 20]
+    assert strip[46, ::36, 0].tolist() == [29, 39, 49]
+    assert film.strip(frames[:2]).shape == (40, 2 * 30 + 6, 3)
+
+
+def test_spaces_of_toys_are_teams() -> None:
+    """The toys are what the callback takes them for."""
+    assert TeamSpaces.from_observation_space(ToyTeams().observation_space).n_agents == 3

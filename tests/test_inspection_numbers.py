@@ -1,0 +1,218 @@
+"""Inspection's arithmetic, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from gymnasium import spaces
+
+from sb3_saf.inspection.calibration import calibrate, lambda_returns, reliability
+from sb3_saf.inspection.doors import ReturnScale
+from sb3_saf.inspection.episodes import Played
+from sb3_saf.inspection.knowledge import attention_of
+from sb3_saf.inspection.pool import (
+    chosen_by,
+    differences,
+    mean_difference,
+    selection_entropy,
+    zone_dependence,
+)
+from sb3_saf.inspection.report import pool_scalars, team_scalars
+
+Array = npt.NDArray[Any]
+
+
+def played(**changes: Any) -> Played:
+    """Two agents of one game, one episode of three steps."""
+    usual = Played(
+        n_agents=2,
+        counted=np.ones((3, 2), dtype=bool),
+        rewards=np.array([[1, 0], [2, 0], [4, 8]], dtype=np.float32),
+        ends=np.array([[False] * 2, [False] * 2, [True] * 2]),
+        last_values=np.zeros((3, 2), dtype=np.float32),
+        values=np.zeros((3, 2), dtype=np.float32),
+        zones=None,
+        weights=None,
+        actions=None,
+        write=None,
+        read=None,
+        values_without={},
+        returns=[15.0],
+        lengths=[3],
+        pictures=[],
+    )
+    return usual._replace(**changes)
+
+
+class TestReturns:
+    def test_discounted_returns(self) -> None:
+        returns = lambda_returns(played(), gamma=0.5)
+        # 1 + 2 / 2 + 4 / 4 and 8 / 4; 2 + 4 / 2 and 8 / 2; 4 and 8.
+        assert returns.tolist() == [[3, 2], [4, 4], [4, 8]]
+
+    def test_nothing_comes_back_from_the_next_episode(self) -> None:
+        ends = np.array([[True] * 2, [False] * 2, [True] * 2])
+        assert lambda_returns(played(ends=ends), gamma=0.5).tolist() == [[1, 0], [4, 4], [4, 8]]
+
+    def test_a_time_limit_that_is_no_true_end_is_followed_by_a_value(self) -> None:
+        last = np.array([[0, 0], [0, 0], [8, 16]], dtype=np.float32)
+        assert lambda_returns(played(last_values=last), gamma=0.5).tolist() == [[4, 4], [6, 8], [8, 16]]
+
+    def test_an_agents_own_end_ends_its_return_alone(self) -> None:
+        ends = np.array([[False, True], [False, False], [True, True]])
+        assert lambda_returns(played(ends=ends), gamma=0.5).tolist() == [[3, 0], [4, 4], [4, 8]]
+
+    def test_one_step_targets(self) -> None:
+        values = np.array([[100, 200], [10, 20], [30, 40]], dtype=np.float32)
+        assert lambda_returns(played(values=values), gamma=0.5, lam=0).tolist() == [[6, 10], [17, 20], [4, 8]]
+
+    def test_targets_in_between_are_gae_plus_values(self) -> None:
+        rng = np.random.default_rng(0)
+        values = rng.normal(size=(3, 2)).astype(np.float32)
+        targets = lambda_returns(played(values=values), gamma=0.9, lam=0.7)
+        advantage = np.zeros(2)
+        for t in (2, 1, 0):
+            following = values[t + 1] if t < 2 else np.zeros(2)
+            advantage = played().rewards[t] + 0.9 * following - values[t] + 0.9 * 0.7 * advantage * (t < 2)
+            np.testing.assert_allclose(targets[t], advantage + values[t], rtol=1e-6)
+
+
+class TestCalibration:
+    def test_a_perfect_critic(self) -> None:
+        returns = np.array([1.0, 2.0, 5.0])
+        found = calibrate(returns, returns)
+        assert found == (1.0, 1.0, 0.0, 0.0)
+
+    def test_a_critic_that_exaggerates_and_promises_too_much(self) -> None:
+        returns = np.array([1.0, 2.0, 3.0])
+        found = calibrate(2 * returns + 1, returns)
+        assert found.slope == pytest.approx(0.5)
+        assert found.bias == pytest.approx(3)
+        assert found.rmse == pytest.approx(math.sqrt((2**2 + 3**2 + 4**2) / 3))
+        assert found.explained_variance == pytest.approx(0)
+
+    def test_what_is_constant_has_no_slope_and_no_variance_to_explain(self) -> None:
+        assert calibrate(np.ones(3), np.arange(3.0)).slope is None
+        assert calibrate(np.arange(3.0), np.ones(3)).explained_variance is None
+
+    def test_bins_hold_equally_many_values(self) -> None:
+        bins = reliability(np.array([4.0, 1.0, 2.0, 3.0]), np.array([40.0, 10.0, 20.0, 30.0]), n_bins=2)
+        assert bins == [(1.5, 15.0, 5.0), (3.5, 35.0, 5.0)]
+
+
+class TestSelection:
+    #: Zone 0 takes policy 0, zone 2 policies 0 and 1 alike; nobody is in zone 1, one row is in no zone.
+    WEIGHTS = np.array([[1, 0], [1, 0], [0.5, 0.5], [0, 1]])
+    ZONES = np.array([0, 0, 2, -1])
+
+    def test_the_table_of_zones(self) -> None:
+        table = chosen_by(self.WEIGHTS, self.ZONES, 3)
+        np.testing.assert_array_equal(table, [[1, 0], [np.nan, np.nan], [0.5, 0.5]])
+
+    @pytest.mark.parametrize(
+        ("weights", "each", "mean"),
+        [
+            ([[1, 0], [1, 0]], 0, 0),  # collapsed
+            ([[1, 0], [0, 1]], 0, 1),  # confident, and different
+            ([[0.5, 0.5], [0.5, 0.5]], 1, 1),  # blended
+        ],
+    )
+    def test_entropies_tell_collapse_confidence_and_blending_apart(
+        self, weights: list[list[float]], each: float, mean: float
+    ) -> None:
+        assert selection_entropy(np.array(weights)) == pytest.approx((each, mean))
+
+    def test_dependence_on_zones(self) -> None:
+        zones = np.array([0, 0, 1, 1])
+        assert zone_dependence(np.array([[1, 0], [1, 0], [0, 1], [0, 1]]), zones) == pytest.approx(1)
+        assert zone_dependence(np.array([[1, 0], [0, 1], [1, 0], [0, 1]]), zones) == pytest.approx(0)
+        assert zone_dependence(self.WEIGHTS, np.zeros(4, dtype=int)) is None
+
+    def test_a_pool_with_known_choices_has_these_scalars(self) -> None:
+        weights = np.array([[[0.75, 0.25], [0, 1]], [[0.25, 0.75], [0, 1]], [[1, 0], [1, 0]]])
+        counted = np.array([[True] * 2, [True] * 2, [False] * 2])
+        game = played(
+            counted=counted,
+            weights=weights,
+            zones=np.array([[0, 1], [0, 1], [1, 0]]),
+            actions=np.zeros((3, 2, 2, 3)),
+        )
+        scalars = pool_scalars(game, spaces.Discrete(3))
+        expected = {
+            "pool/chosen/policy_0": 0.25,
+            "pool/chosen/policy_1": 0.75,
+            "pool_by_zone/zone_0/policy_0": 0.5,
+            "pool_by_zone/zone_0/policy_1": 0.5,
+            "pool_by_zone/zone_1/policy_0": 0.0,
+            "pool_by_zone/zone_1/policy_1": 1.0,
+            "pool/difference": 0.0,
+        }
+        assert {tag: scalars[tag] for tag in expected} == pytest.approx(expected)
+        bits = lambda p: -(p * math.log2(p) + (1 - p) * math.log2(1 - p))  # noqa: E731
+        assert scalars["pool/entropy"] == pytest.approx(bits(0.25) / 2)
+        assert scalars["pool/entropy_of_mean"] == pytest.approx(bits(0.25))
+        assert scalars["pool/zone_dependence"] == pytest.approx(bits(0.25) - 0.5)
+
+
+class TestDifferences:
+    def test_discrete(self) -> None:
+        logits = np.log(np.array([[[0.5, 0.5, 1e-30], [0.5, 0.5, 1e-30], [1e-30, 1e-30, 1]]]))
+        table = differences(spaces.Discrete(3), logits)
+        np.testing.assert_allclose(table, [[0, 0, 1], [0, 0, 1], [1, 1, 0]], atol=1e-6)
+        assert mean_difference(table) == pytest.approx(2 / 3)
+
+    @pytest.mark.parametrize(
+        ("space", "one", "other", "joint"),
+        [
+            (spaces.MultiDiscrete([2, 2]), [0, 0, 0, 0], [0, math.log(3), math.log(3), 0], (4, 4)),
+            (spaces.MultiBinary(2), [0, 0], [math.log(3), -math.log(3)], (4, 4)),
+        ],
+    )
+    def test_several_dimensions_are_those_of_joint_actions(
+        self, space: spaces.Space[Any], one: list[float], other: list[float], joint: tuple[int, int]
+    ) -> None:
+        table = differences(space, np.array([[one, other]], dtype=float))
+        # Both spaces: (1/2, 1/2) twice against (1/4, 3/4) and (3/4, 1/4): four joint actions of probability 1/4.
+        p, q = np.full(4, 0.25), np.array([3, 1, 9, 3]) / 16
+        assert table[0, 1] == pytest.approx(math.sqrt(1 - np.sqrt(p * q).sum()))
+
+    def test_gaussians_by_integration(self) -> None:
+        x = np.linspace(-30, 30, 200_001)
+        p = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
+        q = np.exp(-((x - 1) ** 2) / 8) / math.sqrt(8 * math.pi)
+        overlap = np.sqrt(p * q).sum() * (x[1] - x[0])
+        table = differences(spaces.Box(-1, 1, (1,)), np.array([[[0, 0], [1, math.log(2)]]]))
+        assert table[0, 1] == pytest.approx(math.sqrt(1 - overlap), rel=1e-6)
+
+
+class TestAttention:
+    def test_entropy_of_one_and_of_the_mean(self) -> None:
+        # The slot attends to agent 0, then to agent 1: decided each time, even on average.
+        found = attention_of(np.array([[[1.0, 0.0]], [[0.0, 1.0]]]))
+        assert found.mean.tolist() == [[0.5, 0.5]]
+        assert found.entropy == pytest.approx(0)
+        assert found.entropy_of_mean == pytest.approx(1)
+
+    def test_queries_without_sources_are_left_out(self) -> None:
+        found = attention_of(np.array([[[0.5, 0.5]], [[0.0, 0.0]]]))
+        assert found.mean.tolist() == [[0.5, 0.5]]
+        assert found.entropy == pytest.approx(1)
+
+    def test_a_single_source_has_no_entropy(self) -> None:
+        assert attention_of(np.ones((2, 3, 1)))[1:] == (None, None)
+
+
+def test_team_scalars() -> None:
+    game = played(returns=[10.0, 20.0], lengths=[3, 5])
+    scalars = team_scalars(game, ReturnScale("treasures", 30))
+    assert scalars["team/return"] == 15
+    assert scalars["team/episode_length"] == 4
+    assert scalars["team/share_of_treasures"] == 0.5
+    # Student's t for one degree of freedom: 12.706 standard errors of 5.
+    assert scalars["team/return_high"] == pytest.approx(15 + 12.7062 * 5, rel=1e-4)
+    assert "team/share_of_best_return" not in team_scalars(game, ReturnScale(None, None))
+    assert "team/return_low" not in team_scalars(played(), ReturnScale(None, None))

@@ -1,0 +1,254 @@
+"""Runs that end early and go on: equal to the undisturbed run, bit for bit."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import sb3_saf
+from sb3_saf import CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
+from tests.kill_harness import kill_until_done, start, undisturbed_seconds
+
+N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
+ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
+TASK: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 7, "n_treasures": 3, "coordination": 1, "max_cycles": 10}
+LIGHT = {"features_extractor_class": sb3_saf.LightEncoder, "net_arch": [8]}
+
+
+MADE: list[OnPolicyAlgorithm] = []
+
+
+@pytest.fixture(autouse=True)
+def _close_what_was_made() -> Iterator[None]:
+    yield
+    for model in MADE:
+        assert model.env is not None
+        model.env.close()
+    MADE.clear()
+
+
+class Lightning(BaseCallback):
+    """Ends the process's training in the middle of a rollout, as a crash would."""
+
+    def __init__(self, after_calls: int, error: type[BaseException] = RuntimeError) -> None:
+        super().__init__()
+        self.strikes_in = after_calls
+        self.error = error
+
+    def _on_step(self) -> bool:
+        self.strikes_in -= 1
+        if self.strikes_in == 0:
+            raise self.error
+        return True
+
+
+def make(folder: Path | None = None, algorithm: Any = PPO, policy: str = "SAFPolicy", **arguments: Any) -> Any:
+    """A model as a user's script makes it at every start."""
+    env = sb3_saf.make_team_env(
+        "TeamTogether", N_GAMES, seed=3, monitor_dir=None if folder is None else str(folder), **TASK
+    )
+    settings: dict[str, Any] = {"n_steps": N_STEPS, "seed": 3, "policy_kwargs": LIGHT} | arguments
+    if algorithm is PPO:
+        settings = {
+            "batch_size": ROLLOUT // 2,
+            "n_epochs": 2,
+            "rollout_buffer_class": sb3_saf.TeamRolloutBuffer,
+        } | settings
+    model = algorithm(
+        policy, settings.pop("env", env), tensorboard_log=None if folder is None else str(folder / "tb"), **settings
+    )
+    MADE.append(model)
+    return model
+
+
+def weights(model: OnPolicyAlgorithm) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in model.policy.state_dict().items()}
+
+
+def evaluation(folder: Path | None = None) -> TeamEvalCallback:
+    env = sb3_saf.make_team_env("TeamTogether", 2, seed=50, **TASK)
+    path = None if folder is None else str(folder)
+    return TeamEvalCallback(env, n_eval_episodes=2, eval_freq=40, deterministic=False, verbose=0, log_path=path)
+
+
+def struck(folder: Path, make_model: Callable[[], Any], after_calls: int, others: Any = ()) -> None:
+    """A run that ends in the middle of a rollout."""
+    with pytest.raises(RuntimeError):
+        resumable_learn(
+            make_model(), 10 * ROLLOUT, folder, [*others, Lightning(after_calls)], every_game_steps=1, tb_log_name="run"
+        )
+
+
+def go_on(folder: Path, model: Any, others: Any = (), rollouts: int = 10) -> Any:
+    no_lightning = Lightning(-1)
+    return resumable_learn(
+        model, rollouts * ROLLOUT, folder, [*others, no_lightning], every_game_steps=1, tb_log_name="run"
+    )
+
+
+MODELS: dict[str, Callable[[], Any]] = {
+    "PPO": make,
+    "schedules and normalised values": lambda: make(
+        learning_rate=lambda progress: 1e-2 * progress,
+        clip_range=lambda progress: 0.2 * progress,
+        policy_kwargs=LIGHT | {"normalize_values": True},
+    ),
+    "A2C": lambda: make(algorithm=A2C, policy="MAPPOPolicy"),
+    "RecurrentPPO": lambda: make(algorithm=RecurrentPPO, policy="SAFLstmPolicy", batch_size=ROLLOUT, n_epochs=1),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: Path) -> None:
+    undisturbed = go_on(tmp_path / "undisturbed", MODELS[name]())
+    struck(tmp_path / "run", MODELS[name], after_calls=3 * N_STEPS + 2)
+    struck(tmp_path / "run", MODELS[name], after_calls=2 * N_STEPS + 1)
+    np.random.seed(77)  # noqa: NPY002 - another process has other states
+    th.manual_seed(77)
+    model = go_on(tmp_path / "run", MODELS[name]())
+    assert model.num_timesteps == 10 * ROLLOUT and model._n_updates == undisturbed._n_updates
+    assert weights(model) == weights(undisturbed)
+    assert weights(model) != weights(MODELS[name]())
+
+
+def test_checkpoints_do_not_change_the_run(tmp_path: Path) -> None:
+    assert weights(go_on(tmp_path, make())) == weights(make().learn(10 * ROLLOUT))
+
+
+def test_what_is_normalised_goes_on(tmp_path: Path) -> None:
+    def normalised() -> Any:
+        native = sb3_saf.make_team_env("TeamTogether", N_GAMES, **TASK).venv
+        return make(env=sb3_saf.CentralizedValueWrapper(VecNormalize(native, norm_obs=False), n_agents=N_AGENTS))
+
+    undisturbed = go_on(tmp_path / "undisturbed", normalised())
+    struck(tmp_path / "run", normalised, after_calls=30)
+    assert weights(go_on(tmp_path / "run", normalised())) == weights(undisturbed)
+
+
+def test_evaluations_monitor_and_tensorboard_go_on_without_gap_or_repetition(tmp_path: Path) -> None:
+    for folder, strikes in ((tmp_path / "undisturbed", ()), (tmp_path / "run", (28, 21))):
+        for calls in strikes:
+            struck(folder / "checkpoints", lambda: make(folder), calls, [evaluation(folder)])  # noqa: B023
+        others = [evaluation(folder)]
+        go_on(folder / "checkpoints", make(folder), others)
+    one, other = tmp_path / "undisturbed", tmp_path / "run"
+    with np.load(one / "evaluations.npz") as a, np.load(other / "evaluations.npz") as b:
+        assert len(a["results"]) == 6 and all(np.array_equal(a[name], b[name]) for name in a.files)
+    lines = [
+        [line.rsplit(",", 1)[0] for line in (f / "monitor.csv").read_text().splitlines()[1:]] for f in (one, other)
+    ]
+    assert lines[0] == lines[1] and len(lines[0]) == 1 + N_GAMES * (10 * N_STEPS // TASK["max_cycles"])
+    assert [path.name for path in (other / "tb").iterdir()] == ["run_1"]
+    for tag in ("train/loss", "rollout/ep_rew_mean", "eval/mean_reward"):
+        assert scalars(one, tag) == scalars(other, tag) != []
+
+
+def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
+    events = EventAccumulator(str(folder / "tb" / "run_1")).Reload()
+    return [(event.step, event.value) for event in events.Scalars(tag)]
+
+
+def test_resume_alone(tmp_path: Path) -> None:
+    undisturbed = make().learn(6 * ROLLOUT)
+    checkpoints = TeamCheckpointCallback(tmp_path, every_game_steps=1)
+    with pytest.raises(RuntimeError):
+        make().learn(6 * ROLLOUT, [checkpoints, Lightning(20)])
+    checkpoints.store.release()  # a process that ends does so
+    model = make()
+    path = resume(tmp_path, model)
+    assert path.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"
+    model.learn(6 * ROLLOUT - model.num_timesteps, TeamCheckpointCallback(tmp_path), reset_num_timesteps=False)
+    assert weights(model) == weights(undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "difference"),
+    [
+        ({"gamma": 0.5}, "gamma is 0.99 there and 0.5 in the model"),
+        ({"learning_rate": 0.1}, "lr_schedule is"),
+        ({"policy_kwargs": LIGHT | {"net_arch": [9]}}, "policy's net_arch"),
+        ({"policy": "MAPPOPolicy"}, "policy is 'SAFPolicy' there and 'MAPPOPolicy'"),
+        ({"n_epochs": 5}, "n_epochs is 2 there and 5"),
+    ],
+)
+def test_the_first_difference_is_named(arguments: dict[str, Any], difference: str, tmp_path: Path) -> None:
+    go_on(tmp_path, make(), rollouts=1)
+    with pytest.raises(CheckpointError, match=difference):
+        resume(tmp_path, make(**arguments))
+
+
+def test_other_games_and_callbacks_are_named(tmp_path: Path) -> None:
+    go_on(tmp_path, make(), rollouts=1)
+    env = sb3_saf.make_team_env("TeamTogether", N_GAMES, **{**TASK, "coordination": 2})
+    with pytest.raises(CheckpointError, match=r"coordination=2, got a state with coordination=1"):
+        resume(tmp_path, make(env=env), Lightning(-1))
+    with pytest.raises(CheckpointError, match=r"callbacks \['Lightning'\], got \['TeamEvalCallback'\]"):
+        resume(tmp_path, make(), evaluation())
+    with pytest.raises(CheckpointError, match="found none"):
+        resume(tmp_path / "elsewhere", make())
+
+
+def test_another_run_does_not_go_into_the_folder(tmp_path: Path) -> None:
+    go_on(tmp_path, make(), rollouts=1)
+    with pytest.raises(CheckpointError, match="has checkpoints of another run"):
+        make().learn(ROLLOUT, TeamCheckpointCallback(tmp_path))
+
+
+def test_a_damaged_checkpoint_costs_a_rollout_and_no_bit(tmp_path: Path) -> None:
+    undisturbed = go_on(tmp_path / "undisturbed", make())
+    struck(tmp_path / "run", make, after_calls=30)
+    newest = max((tmp_path / "run").glob("*.ckpt"))
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.warns(UserWarning, match="Going back to"):
+        model = go_on(tmp_path / "run", make())
+    assert weights(model) == weights(undisturbed)
+
+
+def test_foreign_games_are_refused_or_begin_anew(tmp_path: Path) -> None:
+    def supersuit() -> Any:
+        return make(env=sb3_saf.make_team_env("TeamTogether", N_GAMES, backend="supersuit", **TASK))
+
+    with pytest.raises(CheckpointError, match=r"SuperSuitVecEnv cannot give the state.*exact=False"):
+        resumable_learn(supersuit(), ROLLOUT, tmp_path / "exact")
+    with pytest.raises(RuntimeError):
+        resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(20), every_game_steps=1, exact=False)
+    model = resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", exact=False)
+    assert model.num_timesteps == 4 * ROLLOUT
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        resumable_learn(make(), 10 * ROLLOUT, tmp_path, Lightning(20, KeyboardInterrupt), every_game_steps=10**9)
+    assert (
+        f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt is saved; start the same command again"
+        in capsys.readouterr().out
+    )
+    assert weights(go_on(tmp_path, make())) == weights(make().learn(10 * ROLLOUT))
+
+
+def test_sigterm_saves_and_ends_with_its_status(tmp_path: Path) -> None:
+    process = start(tmp_path, 10_000)
+    while not list(tmp_path.glob("checkpoints/*.ckpt")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=60) == 128 + signal.SIGTERM
+
+
+def test_killed_runs_end_bit_equal(tmp_path: Path) -> None:
+    seconds = undisturbed_seconds(tmp_path, rollouts=30)
+    result = kill_until_done(tmp_path, 30, [0.6 * seconds, 0.75 * seconds])
+    assert result.kills == 2 and result.equal
