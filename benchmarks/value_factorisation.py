@@ -33,15 +33,16 @@ def main() -> None:
     parser.add_argument("--algorithm", choices=list(ALGORITHMS), default="qplex")
     parser.add_argument("--task", default="TeamSupport")
     parser.add_argument("--coordination", type=int, default=1)
-    parser.add_argument("--game-steps", type=int, default=200_000)
+    parser.add_argument("--game-steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--attached-state", action="store_true", help="let the mixer's gradient into the encoder")
+    parser.add_argument("--gamma", type=float, default=0.9)
+    parser.add_argument("--detach-state", action="store_true", help="keep the mixer's gradient from the encoder")
     options = parser.parse_args()
     level = {**SMALL, "coordination": options.coordination}
     env = make_team_env(options.task, n_envs=N_GAMES, seed=options.seed, **level)
     policy, mixer = ALGORITHMS[options.algorithm]
-    kwargs = {"features_extractor_class": LightEncoder, "detach_state": not options.attached_state}
-    model = QPLEX(policy, env, mixer=mixer, seed=options.seed, verbose=0, device="cpu", policy_kwargs=kwargs)
+    kwargs = {"features_extractor_class": LightEncoder, "detach_state": options.detach_state}
+    model = QPLEX(policy, env, mixer=mixer, gamma=options.gamma, seed=options.seed, device="cpu", policy_kwargs=kwargs)
     start = time.perf_counter()
     model.learn(options.game_steps * env.n_agents)
     speed = options.game_steps / (time.perf_counter() - start)

@@ -11,6 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.zoo.names import unknown_name
 
 
@@ -47,6 +48,10 @@ ALGOS: Final[dict[str, AlgorithmSpec]] = {
     "saf-lstm": AlgorithmSpec(RecurrentPPO, "SAFLstmPolicy", "saf-lstm"),
     "mappo-lstm": AlgorithmSpec(RecurrentPPO, "MAPPOLstmPolicy", "mappo-lstm"),
     "ippo-lstm": AlgorithmSpec(RecurrentPPO, "IPPOLstmPolicy", "ippo-lstm"),
+    "qplex": AlgorithmSpec(QPLEX, "QPLEXPolicy", "qplex", {"mixer": "qplex"}),
+    "qplex-pool": AlgorithmSpec(QPLEX, "QPLEXPoolPolicy", "qplex", {"mixer": "qplex"}),
+    "qmix": AlgorithmSpec(QPLEX, "QPLEXPolicy", "qplex", {"mixer": "qmix"}),
+    "vdn": AlgorithmSpec(QPLEX, "QPLEXPolicy", "qplex", {"mixer": "vdn"}),
 }
 
 
