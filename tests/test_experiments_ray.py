@@ -28,6 +28,17 @@ IMPATIENT = {
 }
 
 
+# First: the cluster of another test answers for a moment after its end.
+def test_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("ray")
+    words = ["run", "joint", "--size", "smoke", "--address", "auto", "-f", str(tmp_path)]
+    assert cli.main(words) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "no Ray cluster at --address auto" in error
+    assert "start one with `ray start --head`" in error
+
+
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """A head that runs nothing and two nodes of one processor each."""
@@ -105,13 +116,3 @@ def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys:
         "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install "
         "'sb3-saf[ray]', or leave --ray out to run in processes of this machine\n"
     )
-
-
-def test_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("ray")
-    words = ["run", "joint", "--size", "smoke", "--address", "auto", "-f", str(tmp_path)]
-    assert cli.main(words) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "no Ray cluster at --address auto" in error
-    assert "start one with `ray start --head`" in error

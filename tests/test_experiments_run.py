@@ -16,7 +16,8 @@ from sb3_saf.experiments import cli
 from sb3_saf.experiments import run as run_module
 from sb3_saf.experiments.cells import Cell, Choice, Protocol, Shard
 from sb3_saf.experiments.definitions import Level, find_experiment
-from sb3_saf.experiments.results import Results, differences
+from sb3_saf.experiments.files import differences
+from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine, Summary, run
 from sb3_saf.experiments.table import Row
 from sb3_saf.experiments.work import Work, curve, do
@@ -105,6 +106,13 @@ def test_seeds_and_methods_differ(undisturbed: Path) -> None:
         if row["coordination"] == "2"
     }
     assert len(set(returns.values())) == len(returns)
+
+
+def test_the_table_grows_with_what_is_asked_for(undisturbed: Path, tmp_path: Path) -> None:
+    for seed in (0, 1):
+        run_inline(tmp_path, Choice((seed,), ("ippo", "mappo")))
+    ours, theirs = (read_table(folder / "joint" / "table.csv") for folder in (tmp_path, undisturbed))
+    assert ours == theirs
 
 
 def test_finished_cells_are_never_run_again(undisturbed: Path) -> None:

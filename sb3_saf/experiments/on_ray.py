@@ -108,7 +108,7 @@ def _answer(ray: ModuleType, reference: Any) -> tuple[bytes | None, str | None]:
     try:
         answer: tuple[bytes | None, str | None] = ray.get(reference)
     except ray.exceptions.RayError as error:
-        return None, f"lost by Ray ({type(error).__name__}): {error}\n"
+        return None, f"{error}\n\nlost by Ray ({type(error).__name__}): {_first_line(error)}\n"
     return answer
 
 

@@ -13,8 +13,9 @@ import pandas as pd
 from sb3_saf.experiments.cells import Cell, LeftOut, Protocol
 from sb3_saf.experiments.comparisons import FEWEST_SEEDS, compare
 from sb3_saf.experiments.definitions import RANDOM, Experiment, View
+from sb3_saf.experiments.files import write_text
 from sb3_saf.experiments.options import PROGRAM
-from sb3_saf.experiments.results import FAILED, Results, write_text
+from sb3_saf.experiments.results import FAILED, Results
 from sb3_saf.experiments.selection import complete, of_view, strata, with_levels
 from sb3_saf.zoo.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 

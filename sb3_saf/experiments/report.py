@@ -9,12 +9,12 @@ from typing import NamedTuple
 import pandas as pd
 from matplotlib.figure import Figure
 
-from sb3_saf.experiments.cells import Cell, Choice, LeftOut, Protocol, expand, merge
+from sb3_saf.experiments.cells import Cell, Choice
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
 from sb3_saf.experiments.page import Content, write_page
-from sb3_saf.experiments.results import Results, write_text
+from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.selection import complete, of_view, strata
-from sb3_saf.experiments.table import Row, rows, to_csv
+from sb3_saf.experiments.table import Row, requested, rows, write_table
 from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels
 from sb3_saf.zoo.statistics import score_matrices
 
@@ -44,12 +44,13 @@ def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Re
     """
     protocol = results.protocol()
     assert protocol is not None
-    cells, left_out = _requested(experiment, results, protocol, wanted)
+    asked = requested(experiment, results)
+    cells = [cell for cell in asked.cells if _is_wanted(cell, wanted)]
     finished = rows(results, cells)
     if not finished:
         raise ValueError(f"{results.folder} has no finished cell of {experiment.name!r} among those to be shown")
     folder = results.folder / experiment.name
-    write_text(folder / "table.csv", to_csv(finished))
+    write_table(experiment, results)
     table = _frame(finished)
     curves = _curves(results, cells)
     figures = [
@@ -58,23 +59,17 @@ def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Re
         *_draw_curves(experiment, curves, table, folder),
     ]
     missing = [cell for cell in cells if results.missing_tests(cell)]
-    content = Content(experiment, protocol, results, cells, missing, left_out, table, figures)
+    content = Content(experiment, protocol, results, cells, missing, asked.left_out, table, figures)
     return Report(write_page(content, folder / "report.md"), figures, missing, len(cells))
 
 
-def _requested(
-    experiment: Experiment, results: Results, protocol: Protocol, wanted: Choice
-) -> tuple[list[Cell], list[LeftOut]]:
-    """All cells that were asked for in this folder, without those that are not to be shown."""
-    grids = [expand(experiment, request, protocol) for request in results.requests(experiment.name)]
-    cells = [
-        cell
-        for cell in merge(cell for grid in grids for cell in grid.cells)
-        if (not wanted.seeds or cell.seed in wanted.seeds)
+def _is_wanted(cell: Cell, wanted: Choice) -> bool:
+    """Whether a cell is to be shown; the random team always is, on what is."""
+    return (
+        (not wanted.seeds or cell.seed in wanted.seeds)
         and (not wanted.tasks or cell.task in wanted.tasks)
         and (not wanted.methods or cell.method in wanted.methods or not cell.is_trained)
-    ]
-    return cells, list(dict.fromkeys(left_out for grid in grids for left_out in grid.left_out))
+    )
 
 
 def _frame(finished: Iterable[Row]) -> pd.DataFrame:

@@ -16,13 +16,11 @@ The folder of results. One cell is one folder, which appears at once and complet
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import shutil
 import tempfile
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -32,6 +30,7 @@ import filelock
 
 from sb3_saf.experiments.cells import Cell, Choice, Protocol, Shard
 from sb3_saf.experiments.definitions import Level
+from sb3_saf.experiments.files import differences, pack_texts, plain, read_json, to_json, unpack, write_text
 
 FINISHED: Final = "finished"
 FAILED: Final = "failed"
@@ -53,7 +52,7 @@ class Results:
 
     def protocol(self) -> Protocol | None:
         """What the folder's cells have in common; None for a folder without results."""
-        stored = _read_json(self.folder / "settings.json")
+        stored = read_json(self.folder / "settings.json")
         return None if stored is None else Protocol(**stored)
 
     def agree(self, protocol: Protocol) -> None:
@@ -62,7 +61,7 @@ class Results:
 
         :raises ValueError: with what differs
         """
-        stored, wanted = _read_json(self.folder / "settings.json"), _plain(asdict(protocol))
+        stored, wanted = read_json(self.folder / "settings.json"), plain(asdict(protocol))
         if stored is None:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_text(self.folder / "settings.json", to_json(wanted))
@@ -96,15 +95,15 @@ class Results:
 
     def status(self, cell: Cell) -> dict[str, Any]:
         """How a cell ended; empty if it has not."""
-        return _read_json(self.cell_folder(cell) / "status.json") or {}
+        return read_json(self.cell_folder(cell) / "status.json") or {}
 
     def config(self, cell: Cell) -> dict[str, Any]:
         """What a cell was trained with; empty before."""
-        return _read_json(self.cell_folder(cell) / "config.json") or {}
+        return read_json(self.cell_folder(cell) / "config.json") or {}
 
     def versions(self, cell: Cell) -> dict[str, str]:
         """What a cell ran on; empty before."""
-        return _read_json(self.cell_folder(cell) / "versions.json") or {}
+        return read_json(self.cell_folder(cell) / "versions.json") or {}
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether a cell is trained."""
@@ -121,7 +120,7 @@ class Results:
 
     def test(self, cell: Cell, level: Level) -> dict[str, Any] | None:
         """What a test has found; None before it."""
-        return _read_json(self._test_file(cell, level)) if self.is_finished(cell) else None
+        return read_json(self._test_file(cell, level)) if self.is_finished(cell) else None
 
     def model(self, cell: Cell) -> bytes | None:
         """A trained model's file; None before it, and for random teams."""
@@ -174,15 +173,14 @@ class Results:
         self.scratch.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder:
             fresh = Path(folder) / "cell"
-            with zipfile.ZipFile(io.BytesIO(archive)) as packed:
-                packed.extractall(fresh)
+            unpack(archive, fresh)
             yield fresh
 
     # Requests
 
     def add_request(self, experiment: str, choice: Choice) -> None:
         """Remember what was asked for."""
-        text = to_json(_plain(asdict(choice)))
+        text = to_json(plain(asdict(choice)))
         name = hashlib.sha256(text.encode()).hexdigest()[:12]
         folder = self.folder / experiment / "requests"
         folder.mkdir(parents=True, exist_ok=True)
@@ -190,9 +188,10 @@ class Results:
 
     def requests(self, experiment: str) -> list[Choice]:
         """Everything that was asked for."""
-        paths = sorted((self.folder / experiment / "requests").glob("*.json"))
+        paths = (self.folder / experiment / "requests").glob("*.json")
         stored = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-        return [Choice(*(tuple(entry[key]) for key in ("seeds", "methods", "tasks"))) for entry in stored]
+        choices = [Choice(*(tuple(entry[key]) for key in ("seeds", "methods", "tasks"))) for entry in stored]
+        return sorted(choices, key=lambda choice: (choice.seeds, choice.methods, choice.tasks))
 
     # Only one run at a time
 
@@ -232,70 +231,4 @@ def config_of(cell: Cell, protocol: Protocol) -> dict[str, Any]:
     if not cell.is_trained:
         settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
     test = {"episodes": protocol.episodes, "deterministic": protocol.deterministic}
-    return _plain({**settings, "test": test})
-
-
-def differences(old: Mapping[str, Any], new: Mapping[str, Any], most: int = 3) -> str:
-    """
-    What differs between two mappings, with dotted names.
-
-    :param most: named differences
-    """
-    before, after = dict(_flat(old)), dict(_flat(new))
-    changed = [key for key in {**before, **after} if before.get(key) != after.get(key)]
-    named = [f"{key} was {before.get(key)!r}, now {after.get(key)!r}" for key in changed[:most]]
-    more = len(changed) - len(named)
-    return ", ".join(named) + (f", and {more} more" if more else "")
-
-
-def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in nested.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def pack(folder: Path) -> bytes:
-    """The files of a folder as one archive; models are compressed already."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as packed:
-        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-            packed.write(path, path.relative_to(folder).as_posix())
-    return buffer.getvalue()
-
-
-def pack_texts(files: Mapping[str, str]) -> bytes:
-    """Texts by file name as one archive."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as packed:
-        for name, text in files.items():
-            packed.writestr(name, text)
-    return buffer.getvalue()
-
-
-def to_json(value: object) -> str:
-    """Readable, with a line's end."""
-    return json.dumps(value, indent=2) + "\n"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file that is there as a whole, or as it was before."""
-    with tempfile.NamedTemporaryFile(
-        "w", dir=path.parent, prefix=f".{path.name}-", delete=False, encoding="utf-8", newline=""
-    ) as file:
-        file.write(text)
-    os.replace(file.name, path)
-
-
-def _plain(value: Any) -> Any:
-    """As JSON gives it back: tuples are lists."""
-    return json.loads(json.dumps(value, default=str))
-
-
-def _read_json(path: Path) -> dict[str, Any] | None:
-    try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    return content
+    return plain({**settings, "test": test})

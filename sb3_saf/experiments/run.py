@@ -14,8 +14,8 @@ from tqdm import tqdm
 from sb3_saf.experiments.cells import Cell, Choice, Grid, Protocol, Shard, expand
 from sb3_saf.experiments.definitions import Experiment
 from sb3_saf.experiments.engine import Ending, Engine, Job
-from sb3_saf.experiments.results import Results, write_text
-from sb3_saf.experiments.table import rows, to_csv
+from sb3_saf.experiments.results import Results
+from sb3_saf.experiments.table import write_table
 from sb3_saf.experiments.work import Work, do
 
 
@@ -73,7 +73,7 @@ def run(
         todo = [cell for cell in cells if results.missing_tests(cell)]
         print(_opening(experiment, grid, cells, todo, shard, results))
         summary = _run_all(todo, protocol, results, engine, machine)
-    write_table(experiment, grid.cells, results)
+    write_table(experiment, results)
     return summary
 
 
@@ -137,10 +137,3 @@ def _line(cell: Cell, ended: Ending, results: Results, count: str) -> str:
     if ended.final:
         return f"[{count}] {cell}: FAILED: {reason}; see {results.cell_folder(cell) / 'error.txt'}"
     return f"[{count}] {cell}: attempt {ended.attempt} failed, trying again: {reason}"
-
-
-def write_table(experiment: Experiment, cells: Sequence[Cell], results: Results) -> None:
-    """Write ``table.csv`` from the cells that are finished."""
-    folder = results.folder / experiment.name
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "table.csv", to_csv(rows(results, cells)))

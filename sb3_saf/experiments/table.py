@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sb3_saf.experiments.cells import Cell
-from sb3_saf.experiments.definitions import Level
+from sb3_saf.experiments.cells import Cell, Grid, expand, merge
+from sb3_saf.experiments.definitions import Experiment, Level
+from sb3_saf.experiments.files import write_text
 from sb3_saf.experiments.results import Results
 
 #: Columns that differ between two runs of the same cells; all others are equal, bit for bit.
@@ -75,6 +76,20 @@ class Row(NamedTuple):
         return Level(self.coordination, self.heterogeneity)
 
 
+def requested(experiment: Experiment, results: Results) -> Grid:
+    """
+    All cells that were ever asked for in a folder, random teams last.
+
+    :param results: a folder with a protocol
+    """
+    protocol = results.protocol()
+    assert protocol is not None
+    grids = [expand(experiment, choice, protocol) for choice in results.requests(experiment.name)]
+    cells = merge(cell for grid in grids for cell in grid.cells)
+    left_out = dict.fromkeys(left_out for grid in grids for left_out in grid.left_out)
+    return Grid(sorted(cells, key=lambda cell: not cell.is_trained), list(left_out))
+
+
 def rows(results: Results, cells: Iterable[Cell]) -> list[Row]:
     """
     What is finished of some cells.
@@ -121,3 +136,9 @@ def to_csv(table: Sequence[Row]) -> str:
     writer.writerow(Row._fields)
     writer.writerows(table)
     return buffer.getvalue()
+
+
+def write_table(experiment: Experiment, results: Results) -> None:
+    """Write ``table.csv`` from all that was ever asked for and is finished."""
+    folder = results.folder / experiment.name
+    write_text(folder / "table.csv", to_csv(rows(results, requested(experiment, results).cells)))

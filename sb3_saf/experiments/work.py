@@ -21,7 +21,8 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_saf import RandomPolicy, evaluate_team
 from sb3_saf.experiments.cells import Cell, Protocol
 from sb3_saf.experiments.definitions import Level
-from sb3_saf.experiments.results import FINISHED, config_of, pack, to_json
+from sb3_saf.experiments.files import pack, to_json
+from sb3_saf.experiments.results import FINISHED, config_of
 from sb3_saf.zoo.seeds import evaluation_seed
 from sb3_saf.zoo.versions import software_versions
 

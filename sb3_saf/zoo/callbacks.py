@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ import optuna
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.utils import set_random_seed
+from tqdm import TqdmExperimentalWarning
 from tqdm.rich import tqdm
 
 from sb3_saf.common.callbacks import TeamEvalCallback
@@ -104,7 +106,9 @@ class GameStepsProgressBar(ProgressBarCallback):
     def _on_training_start(self) -> None:
         n_agents = require_n_agents(self.training_env)
         total = self.locals["total_timesteps"] - self.model.num_timesteps
-        self.pbar = tqdm(total=total // n_agents, unit=" game steps")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TqdmExperimentalWarning)
+            self.pbar = tqdm(total=total // n_agents, unit=" game steps")
 
     def _on_step(self) -> bool:
         self.pbar.update(self.training_env.num_envs // require_n_agents(self.training_env))

@@ -1,0 +1,90 @@
+"""Files that are there as a whole or not at all, and folders as bytes."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+
+def pack(folder: Path) -> bytes:
+    """The files of a folder as one archive; models are compressed already."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            packed.write(path, path.relative_to(folder).as_posix())
+    return buffer.getvalue()
+
+
+def pack_texts(files: Mapping[str, str]) -> bytes:
+    """Texts by file name as one archive."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
+        for name, text in files.items():
+            packed.writestr(name, text)
+    return buffer.getvalue()
+
+
+def unpack(archive: bytes, folder: Path) -> None:
+    """
+    The opposite of :func:`pack`.
+
+    :param folder: made if it is not there
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(io.BytesIO(archive)) as packed:
+        packed.extractall(folder)
+
+
+def to_json(value: object) -> str:
+    """Readable, with a line's end."""
+    return json.dumps(value, indent=2) + "\n"
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """What a file holds; None if it is not there."""
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    return content
+
+
+def plain(value: Any) -> Any:
+    """As JSON gives it back: tuples are lists."""
+    return json.loads(json.dumps(value, default=str))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file that is there as a whole, or as it was before."""
+    with tempfile.NamedTemporaryFile(
+        "w", dir=path.parent, prefix=f".{path.name}-", delete=False, encoding="utf-8", newline=""
+    ) as file:
+        file.write(text)
+    os.replace(file.name, path)
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], most: int = 3) -> str:
+    """
+    What differs between two mappings, with dotted names.
+
+    :param most: named differences
+    """
+    before, after = dict(_flat(old)), dict(_flat(new))
+    changed = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+    named = [f"{key} was {before.get(key)!r}, now {after.get(key)!r}" for key in changed[:most]]
+    more = len(changed) - len(named)
+    return ", ".join(named) + (f", and {more} more" if more else "")
+
+
+def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in nested.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
