@@ -40,7 +40,7 @@ class NoTuple(CounterEnv):
 class Unseeded(CounterEnv):
     """Has a reset without arguments."""
 
-    def reset(self) -> Any:  # type: ignore[override]
+    def reset(self) -> Any:
         return super().reset()
 
 
@@ -55,7 +55,7 @@ class SpaceTable(CounterEnv):
     """Has a dict where PettingZoo has a method."""
 
     @property
-    def observation_space(self) -> Any:  # type: ignore[override]
+    def observation_space(self) -> Any:
         return dict.fromkeys(self.possible_agents, self._observation_space)
 
 

@@ -31,6 +31,9 @@ _HOW_TO_STACK: Final = (
     "agent. sb3_saf.export_actors gives each agent an actor of its own"
 )
 
+#: How PettingZoo's environments give masks.
+_CLASSIC: Final = {"observation", ACTION_MASK_KEY}
+
 
 class TeamRowsPolicy(BasePolicy):
     """
@@ -90,10 +93,13 @@ class TeamRowsPolicy(BasePolicy):
         """
         Make tensors of NumPy observations.
 
-        :param observation: rows, some of their entries, or own observations alone; a batch or a single one
+        :param observation: rows, some of their entries, or own observations alone; a batch or a single one. Where
+            there are masks, also in PettingZoo's form {"observation", "action_mask"}
         :return: dict of tensors with a batch axis, and whether the observation was a batch
         """
         entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
+        if set(entries) == _CLASSIC and self.team_spaces.action_mask is not None:
+            entries = {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
         keys = self.team_spaces.keys
         unknown = [key for key in entries if key not in keys]
         if unknown:

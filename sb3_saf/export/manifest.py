@@ -29,7 +29,9 @@ SCRIPT_FILE: Final = "act.py"
 #: Files whose checksums a manifest states.
 DATA_FILES: Final = (WEIGHTS_FILE, ONNX_FILE)
 
-ENCODER_NAMES: Final = ("LightEncoder", "MLPEncoder", "PaperCNN")
+ENCODER_NAMES: Final = ("LightEncoder", "MLPEncoder", "NatureEncoder", "PaperCNN")
+#: Least side of a picture, in pixels, that the convolutions of an encoder need.
+_LEAST_SIDE: Final = {"PaperCNN": 8, "NatureEncoder": 36}
 ACTOR_NAMES: Final = ("AgentPolicies", "PolicyPool", "SinglePolicy")
 ACTIVATION_NAMES: Final = (
     "ELU",
@@ -354,8 +356,9 @@ def _check_encoder(net: EncoderNet, space: SpaceRecord) -> None:
     if space.kind != "box" or (space.atlas is None and len(space.shape) != 3):
         _refuse(f"{net.name} reads pictures or tile codes, got a {space.kind} of shape {space.shape}")
     _, height, width = picture_shape(space)
-    if net.name == "PaperCNN" and min(height, width) < 8:
-        _refuse(f"PaperCNN needs at least 8 x 8 pixels, got {height} x {width}")
+    least = _LEAST_SIDE.get(net.name, 1)
+    if min(height, width) < least:
+        _refuse(f"{net.name} needs at least {least} x {least} pixels, got {height} x {width}")
     tile = net.tile_size if space.atlas is None else space.atlas[1]
     if net.name == "LightEncoder" and (height % tile or width % tile or tile != net.tile_size):
         _refuse(f"LightEncoder needs whole tiles of {net.tile_size} pixels, got {height} x {width} in tiles of {tile}")

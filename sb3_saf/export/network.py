@@ -83,6 +83,44 @@ class PaperCNN(nn.Module):
         return features
 
 
+class NatureEncoder(nn.Module):
+    """See ``sb3_saf.NatureEncoder``."""
+
+    def __init__(self, space: SpaceRecord, net: EncoderNet):
+        super().__init__()
+        self.pixels = Pictures(space, net.divide_by_255)
+        self.nature = _NatureCNN(self.pixels.shape, net.features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) raw observations to (K, d)."""
+        features: th.Tensor = self.nature(self.pixels(observations))
+        return features
+
+
+class _NatureCNN(nn.Module):
+    """Stable-Baselines3's, without Stable-Baselines3."""
+
+    def __init__(self, shape: tuple[int, int, int], features_dim: int):
+        super().__init__()
+        channels, height, width = shape
+        out = [(((size - 8) // 4 + 1 - 4) // 2 + 1 - 3) + 1 for size in (height, width)]
+        self.cnn = nn.Sequential(
+            nn.Conv2d(channels, 32, kernel_size=8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, kernel_size=3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        self.linear = nn.Sequential(nn.Linear(64 * prod(out), features_dim), nn.ReLU())
+
+    def forward(self, pictures: th.Tensor) -> th.Tensor:
+        """(K, C, H, W) to (K, d)."""
+        features: th.Tensor = self.linear(self.cnn(pictures))
+        return features
+
+
 class LightEncoder(nn.Module):
     """See ``sb3_saf.LightEncoder``."""
 
@@ -142,6 +180,7 @@ class MLPEncoder(nn.Module):
 ENCODERS: Final[dict[str, Callable[[SpaceRecord, EncoderNet], nn.Module]]] = {
     "LightEncoder": LightEncoder,
     "MLPEncoder": MLPEncoder,
+    "NatureEncoder": NatureEncoder,
     "PaperCNN": PaperCNN,
 }
 

@@ -18,7 +18,14 @@ from stable_baselines3.common.preprocessing import is_image_space, preprocess_ob
 from torch import nn
 
 from sb3_saf.common.actor import ActionHead, SinglePolicy
-from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN, is_tile_space
+from sb3_saf.common.encoders import (
+    LightEncoder,
+    MLPEncoder,
+    NatureEncoder,
+    ObservationEncoder,
+    PaperCNN,
+    is_tile_space,
+)
 from sb3_saf.common.networks import AgentHeads
 from sb3_saf.common.policies import TeamActorCriticPolicy
 from sb3_saf.export.errors import ExportError
@@ -228,8 +235,8 @@ def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
     own, encoder = policy.team_spaces.own, _inner_encoder(policy)
     divide = bool(policy.normalize_images and isinstance(own, spaces.Box) and is_image_space(own))
     features_dim = policy.features_dim
-    if type(encoder) is PaperCNN:
-        return EncoderNet("PaperCNN", features_dim, divide)
+    if type(encoder) in (PaperCNN, NatureEncoder):
+        return EncoderNet(type(encoder).__name__, features_dim, divide)
     if type(encoder) is MLPEncoder:
         return EncoderNet("MLPEncoder", features_dim, divide, hidden=_hidden(encoder.net)[0])
     if type(encoder) is LightEncoder:
