@@ -301,9 +301,9 @@ class LoneAgent:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
         )
 
-    def ask(self, observation: np.ndarray) -> None:
+    def ask(self, observation: np.ndarray, **more: Any) -> None:
         assert self.process.stdin
-        question = {"observation": observation.tolist(), "dtype": str(observation.dtype)}
+        question = {"observation": observation.tolist(), "dtype": str(observation.dtype), **more}
         self.process.stdin.write(json.dumps(question) + "\n")
         self.process.stdin.flush()
 
@@ -509,7 +509,7 @@ def test_nothing_is_unpickled(export: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
-    "format version 2": lambda m: m.update(format_version=2),
+    "format version 3": lambda m: m.update(format_version=3),
     "is not of an exported actor": lambda m: m.update(format="pickle"),
     "encoder.name must be one of": lambda m: m["encoder"].update(name="os.system"),
     "actor.name must be one of": lambda m: m["actor"].update(name="builtins.eval"),

@@ -84,7 +84,7 @@ def parallel(**kwargs: Any) -> TurnsInParallel:
 def test_who_waits_has_one_action_that_nobody_reads(kwargs: dict[str, Any]) -> None:
     env = parallel(**kwargs)
     observations, infos = env.reset(seed=2**40)
-    moves = []
+    moves: list[int] = []
     while env.agents:
         mover, waiter = ("first", "second") if len(moves) % 2 == 0 else ("second", "first")
         masks = {
@@ -132,8 +132,11 @@ def test_players_learn_to_win_from_each_other() -> None:
     model.learn(32 * 32 * 12)
     taken = {}
     for pile in (7, 3, 2, 1):
-        rows = {"obs": np.array([pile, 1], np.float32), "action_mask": (np.arange(1, 4) <= pile).astype(np.int8)}
-        taken[pile] = int(model.predict(rows, deterministic=True)[0]) + 1
+        own: dict[str, np.ndarray] = {
+            "obs": np.array([pile, 1], np.float32),
+            "action_mask": (np.arange(1, 4) <= pile).astype(np.int8),
+        }
+        taken[pile] = int(model.predict(own, deterministic=True)[0]) + 1
     assert taken == {7: 3, 3: 3, 2: 2, 1: 1}, "who leaves 4 stones, or none, wins"
 
 

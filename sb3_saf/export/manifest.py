@@ -20,7 +20,7 @@ import numpy.typing as npt
 from sb3_saf.export.errors import ExportError
 
 FORMAT: Final = "sb3_saf.actor"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 
 MANIFEST_FILE: Final = "actor.json"
 WEIGHTS_FILE: Final = "actor.safetensors"
@@ -46,6 +46,8 @@ ACTIVATION_NAMES: Final = (
     "Softplus",
     "Tanh",
 )
+#: Whether an actor can, or must, be told which actions are legal.
+ACTION_MASKS: Final = ("none", "optional", "required")
 SELECTIONS: Final = ("mixture", "gumbel", "greedy")
 KINDS: Final = ("box", "discrete", "multi_discrete", "multi_binary")
 DTYPES: Final = tuple(
@@ -236,6 +238,31 @@ class ActorNet:
 
 
 @dataclass(frozen=True)
+class MemoryNet:
+    """
+    The LSTM between encoder and policies.
+
+    :param hidden_size: H
+    :param n_layers: layers, one on top of the other
+    :param bias: whether it has biases
+    """
+
+    hidden_size: int
+    n_layers: int
+    bias: bool
+
+    @classmethod
+    def parse(cls, value: object, where: str) -> MemoryNet:
+        """Read and check."""
+        entries = _Entries(value, where)
+        net = cls(entries.size("hidden_size"), entries.size("n_layers", _MAX_LENGTH), entries.flag("bias"))
+        entries.finish()
+        if net.hidden_size * net.n_layers > _MAX_SIZE:
+            _refuse(f"{where} has {net.n_layers} layers of {net.hidden_size}, more than {_MAX_SIZE} numbers")
+        return net
+
+
+@dataclass(frozen=True)
 class DataFile:
     """
     A file beside the manifest.
@@ -270,12 +297,14 @@ class Manifest:
     :param policy: name of the policy class it was trained with, for people
     :param n_agents: N
     :param reads_agent: whether every agent has a policy of its own
+    :param action_mask: whether actions may be masked: ``"none"``, ``"optional"`` or ``"required"``
     :param selection: ``"mixture"`` or ``"gumbel"``; ``"greedy"`` if parameters are values of actions, of which the best
         is taken
     :param observation: space of one own observation
     :param action: action space
     :param encoder: the encoder; None if only the ONNX file knows
     :param actor: the policies; None if only the ONNX file knows
+    :param memory: the LSTM; None without memory
     :param files: what lies beside the manifest
     """
 
@@ -283,11 +312,13 @@ class Manifest:
     policy: str
     n_agents: int
     reads_agent: bool
+    action_mask: str
     selection: str
     observation: SpaceRecord
     action: SpaceRecord
     encoder: EncoderNet | None
     actor: ActorNet | None
+    memory: MemoryNet | None
     files: Mapping[str, DataFile]
 
     @property
@@ -317,11 +348,13 @@ class Manifest:
             policy=entries.text("policy"),
             n_agents=entries.size("n_agents"),
             reads_agent=entries.flag("reads_agent"),
+            action_mask=entries.word("action_mask", ACTION_MASKS),
             selection=entries.word("selection", SELECTIONS),
             observation=SpaceRecord.parse(entries.raw("observation"), "observation"),
             action=SpaceRecord.parse(entries.raw("action"), "action"),
             encoder=entries.optional("encoder", EncoderNet.parse),
             actor=entries.optional("actor", ActorNet.parse),
+            memory=entries.optional("memory", MemoryNet.parse),
             files=_parse_files(entries.raw("files")),
         )
         entries.finish()
@@ -343,6 +376,8 @@ class Manifest:
             _refuse(f"reads_agent must say whether the actor is AgentPolicies, got {self.reads_agent}")
         if self.selection == "greedy" and self.action.kind != "discrete":
             _refuse(f"selection 'greedy' needs discrete actions, got {self.action.kind}")
+        if self.action_mask != "none" and self.action.kind == "box":
+            _refuse("actions of a box cannot be masked")
         if self.encoder is not None:
             _check_encoder(self.encoder, self.observation)
 
