@@ -14,7 +14,6 @@ import pytest
 import torch as th
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf import Actor, ExportError, MAPPOPolicy, SAFPolicy, export_actors, make_team_env
 from sb3_saf.common.policies import TeamActorCriticPolicy
@@ -149,8 +148,8 @@ def test_with_a_memory_it_acts_as_the_model(name: str, kwargs: dict[str, Any], a
             expected, state = policy.predict(rows, state, starts, deterministic=True)
             likelihoods = actor.log_prob(obs, expected, memory=memory)
             np.testing.assert_array_equal(actor.act(obs, memory=memory), expected)
-            np.testing.assert_allclose(memory.hidden, state[0], atol=1e-6)
-            np.testing.assert_allclose(memory.cell, state[1], atol=1e-6)
+            np.testing.assert_allclose(np.asarray(memory.hidden), state[0], atol=1e-6)
+            np.testing.assert_allclose(np.asarray(memory.cell), state[1], atol=1e-6)
             singly = [actor.act(own, memory=mine) for own, mine in zip(obs, alone, strict=False)]
             np.testing.assert_allclose(singly, expected[:5], atol=1e-5)
             starts[:] = False
@@ -236,7 +235,7 @@ def test_onnx_with_a_memory(tmp_path: Path) -> None:
         obs = samples(VECTOR, 9, seed=step)
         expected = by_torch.act(obs, memory=memories[0])
         np.testing.assert_array_equal(by_onnx.act(obs, memory=memories[1]), expected)
-        np.testing.assert_allclose(memories[1].hidden, memories[0].hidden, atol=1e-5)
+        np.testing.assert_allclose(np.asarray(memories[1].hidden), np.asarray(memories[0].hidden), atol=1e-5)
         episode.append((obs, expected))
     seen, done = (np.stack(part, axis=1) for part in zip(*episode, strict=True))  # (9, steps, ...)
     row = int(np.argmax([len(set(actions)) for actions in done.tolist()]))
@@ -265,7 +264,7 @@ def test_onnx_with_masks(tmp_path: Path) -> None:
     ],
 )
 def test_agents_in_processes_of_their_own_play_as_the_model_would(
-    algorithm: type[OnPolicyAlgorithm], policy: str, runtime: str, tmp_path: Path
+    algorithm: Any, policy: str, runtime: str, tmp_path: Path
 ) -> None:
     env = make_team_env(lambda: TellingEnv(n_agents=2, max_cycles=6), n_envs=1, seed=0)
     sizes = {"lstm_hidden_size": 8} if algorithm is RecurrentPPO else {}
@@ -275,7 +274,7 @@ def test_agents_in_processes_of_their_own_play_as_the_model_would(
             parameter.add_(0.3 * th.randn_like(parameter))
     folder = export_actors(model, tmp_path / "actor", onnx=runtime == "onnx")
     agents = [LoneAgent(folder, runtime, agent) for agent in range(2)]
-    rows, state, starts = cast("dict[str, np.ndarray]", env.reset()), None, np.ones(2, bool)
+    rows, state, starts = env.reset(), None, np.ones(2, bool)
     seen = []
     for _ in range(12):  # two episodes
         own = {key: rows[key] for key in ("obs", "agent", "action_mask")}

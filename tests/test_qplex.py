@@ -383,10 +383,10 @@ def test_exported_actors_keep_to_masks(tmp_path: Path) -> None:
             parameter.add_(th.randn_like(parameter))
     actor = Actor.load(export_actors(model, tmp_path / "actor", onnx=False))
     rng = np.random.default_rng(0)
-    own = model.get_env().reset()["obs"]  # type: ignore[union-attr, call-overload, index]
+    own = model.get_env().reset()["obs"]  # type: ignore[union-attr, call-overload]
     chosen = set()
     for _ in range(20):
-        masks = (rng.random((len(own), model.action_space.n)) < 0.5).astype(np.int8)  # type: ignore[attr-defined]
+        masks = (rng.random((len(own), model.action_space.n)) < 0.5).astype(np.int8)
         masks[np.arange(len(own)), rng.integers(masks.shape[1], size=len(own))] = 1
         expected = model.predict({"obs": own, "action_mask": masks})[0]
         np.testing.assert_array_equal(actor.act(own, action_mask=masks), expected)
