@@ -9,9 +9,9 @@ from contextlib import contextmanager
 
 import torch as th
 
+from sb3_saf.export.comparison import check_close
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.network import ActorNetwork
-from sb3_saf.export.writer import check_close
 
 _OPSET = 18
 

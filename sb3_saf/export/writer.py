@@ -6,7 +6,7 @@ import copy
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,7 @@ from sb3_saf.common.networks import AgentHeads
 from sb3_saf.common.policies import TeamPolicy
 from sb3_saf.contrib.maskable import TeamMaskablePolicy
 from sb3_saf.contrib.recurrent import TeamRecurrentPolicy
+from sb3_saf.export.comparison import ExportablePolicy, compare, some_inputs
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import write_folder
 from sb3_saf.export.manifest import (
@@ -48,13 +49,6 @@ from sb3_saf.export.manifest import (
 from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor, make_memory
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.saf.policy_pool import PolicyPool
-
-#: Policies whose actors read one agent's own observation, mask and memory, and nothing else.
-ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy
-
-#: Largest difference between the model's and the exported network's outputs, beside the outputs' own size.
-_TOLERANCE = 1e-4
-_N_CHECKED = 16
 
 
 def export_actors(
@@ -92,8 +86,8 @@ def export_actors(
     policy = _checked_policy(model)
     described = _Described.of(policy)
     network = described.network(policy)
-    inputs = _some_inputs(policy, described.memory)
-    expected = _compare(policy, network, inputs)
+    inputs = some_inputs(policy, described.memory)
+    expected = compare(policy, network, inputs)
     data: dict[str, bytes] = {}
     if described.encoder is not None and described.actor_name_is_known:
         data[WEIGHTS_FILE] = save({name: tensor.contiguous() for name, tensor in network.state_dict().items()})
@@ -353,60 +347,3 @@ def _merged(number: Any, word: Any) -> Bound:
         return [_merged(*pair) for pair in zip(number, word, strict=True)]
     result: Bound = word or number
     return result
-
-
-# --- checking ---------------------------------------------------------------------------------------------------------
-
-
-def _some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str, th.Tensor]:
-    """Random inputs of the network, by name; the space's own generator and torch's are left alone."""
-    space = copy.deepcopy(policy.team_spaces.own)
-    space.seed(0)
-    inputs = {"observation": th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))}
-    if policy.actor.reads_agent:
-        inputs["agent"] = th.arange(_N_CHECKED) % policy.team_spaces.n_agents
-    if memory is not None:
-        generator = th.Generator().manual_seed(0)
-        for name in ("hidden", "cell"):
-            inputs[name] = th.randn(memory.n_layers, _N_CHECKED, memory.hidden_size, generator=generator)
-    return inputs
-
-
-def _compare(policy: ExportablePolicy, network: ActorNetwork, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
-    """The exported network's outputs, once they are known to be the model's."""
-    was_training = policy.training
-    policy.set_training_mode(False)
-    with th.no_grad():
-        expected, states = _of_model(policy, {name: value.to(policy.device) for name, value in inputs.items()})
-        outputs = network(**inputs)
-    policy.set_training_mode(was_training)
-    n_outputs = len(outputs) - len(states)
-    found = outputs[n_outputs - 1].flatten(1)
-    if not isinstance(policy.actor, PolicyPool):
-        found = outputs[1].flatten(1)
-    elif found.shape != expected.shape:
-        found = th.cat([outputs[0], outputs[1].flatten(1)], dim=1)
-    otherwise = f"{type(policy).__name__} does more than its encoder and actor show"
-    check_close(found, expected.cpu(), otherwise)
-    for state, wanted in zip(outputs[n_outputs:], states, strict=True):
-        check_close(state, wanted.cpu(), otherwise)
-    return tuple(outputs)
-
-
-def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
-    """What the model's own actor gives, and what it remembers then."""
-    latent = policy.extract_features(inputs["observation"])
-    states: tuple[th.Tensor, ...] = ()
-    if isinstance(policy, TeamRecurrentPolicy):
-        latent, states = policy.remember(latent, (inputs["hidden"], inputs["cell"]))
-    return policy.actor(latent, inputs.get("agent")), states
-
-
-def check_close(found: th.Tensor, expected: th.Tensor, otherwise: str) -> None:
-    """
-    Compare outputs.
-
-    :raises ExportError: if they differ by more than rounding does
-    """
-    if found.shape != expected.shape or not th.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
-        raise ExportError(f"the exported network does not give the model's numbers: {otherwise}")
