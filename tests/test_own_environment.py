@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 
 from sb3_saf import RandomPolicy, make_team_env
 from sb3_saf.common.stock_policies import warn_of_stock_policies
-from tests.toy_envs import CounterEnv
+from tests.toy_envs import CounterEnv, TellingEnv
 
 
 class SilentReset(CounterEnv):
@@ -129,6 +129,23 @@ def test_observations_by_agent_are_refused_with_what_to_pass(policy: str) -> Non
     assert stacked[1] == alone
     with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a mistake in it is no dict of agents
         model.predict({"obs": observations["agent_1"], "team_view": observations["agent_1"]})
+
+
+def test_masks_in_pettingzoos_form_are_understood() -> None:
+    env = make_team_env(lambda: TellingEnv(n_agents=2), n_envs=1, seed=0)
+    model = PPO("MAPPOPolicy", env, device="cpu", seed=0)
+    observations, _ = TellingEnv(n_agents=2).reset(seed=0)
+    for agent in ("agent_0", "agent_1"):
+        given = observations[agent]
+        action, _ = model.predict(given, deterministic=True)
+        assert given["action_mask"][action] == 1
+        assert (
+            action
+            == model.predict({"obs": given["observation"], "action_mask": given["action_mask"]}, None, None, True)[0]
+        )
+    unmasked = PPO("MAPPOPolicy", make_team_env(CounterEnv, seed=0), device="cpu")
+    with pytest.raises(ValueError, match=r"got 'observation'"):
+        unmasked.predict(given)
 
 
 def test_a_random_policy_of_an_environment() -> None:
