@@ -17,6 +17,7 @@ from sb3_saf.experiments.files import write_text
 from sb3_saf.experiments.options import PROGRAM
 from sb3_saf.experiments.results import FAILED, Results
 from sb3_saf.experiments.selection import complete, of_view, strata, with_levels
+from sb3_saf.zoo.algorithms import ALGOS
 from sb3_saf.zoo.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
 #: Missing cells that are named.
@@ -68,14 +69,16 @@ def _head(content: Content) -> str:
     trained = table[table["method"] != RANDOM]
     methods = list(dict.fromkeys(trained["method"]))
     steps = " or ".join(f"{count:,}" for count in sorted(trained["game_steps"].unique()))
-    action = "their most likely actions" if protocol.deterministic else "sampled actions"
+    actions = "their most likely actions" if protocol.deterministic else "sampled actions"
+    if not protocol.deterministic and not all(ALGOS[method].draws_actions for method in methods):
+        actions += " (the best ones of methods that learn values)"
     lines = [
         f"# {experiment.name}: {experiment.question}",
         "",
         f"Size `{protocol.size}`: {_numbers(table['n_agents'])} agents, {_numbers(table['n_treasures'])} treasures, "
         f"{steps} game steps of training. {', '.join(methods) or 'No method'} and a random team, seeds "
         f"{_numbers(table['seed'])}. Each number is a team return (treasures collected) over {protocol.episodes} "
-        f"episodes with {action}, in games that no run trains on and that are the same for all methods of a seed.",
+        f"episodes with {actions}, in games that no run trains on and that are the same for all methods of a seed.",
     ]
     if protocol.overrides:
         lines += ["", f"Settings in the place of the zoo's: `{dict(protocol.overrides)}`."]

@@ -12,11 +12,17 @@ from typing import Any, Final
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
-from sb3_saf.common.policies import TeamPolicy
 from sb3_saf.common.teams import require_n_agents
+from sb3_saf.inspection.kinds import OurPolicy
 
 #: Formats that hold numbers only.
 _NOT_FOR: Final = ("stdout", "log", "json", "csv")
+
+#: Hyperparameters that are shown, of algorithms that have them.
+_NUMBERS: Final = (
+    *("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
+    *("buffer_size", "learning_starts", "update_interval", "target_update_interval", "exploration_fraction"),
+)
 
 #: Charts of the custom scalars page: group, chart, regular expressions of tags.
 _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
@@ -39,6 +45,14 @@ _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
         "explained variance and slope (1 is right)": [r"critic/explained_variance.*", r"critic/slope"],
         "mean value and mean return": [r"critic/mean_value", r"critic/mean_return"],
         "error (root mean square)": [r"critic/error", r"critic/td_error"],
+    },
+}
+#: Charts of algorithms that learn Q_tot.
+_VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
+    "Mixer": {
+        "weight of each agent's advantage (lambda)": [r"lambda/agent_\d+"],
+        "training: Q_tot and its error": [r"train/q_tot", r"train/td_error"],
+        "training: share of random actions": [r"rollout/exploration_rate"],
     },
 }
 
@@ -78,15 +92,16 @@ class Page:
             writer = board.writer._get_file_writer()
             writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
-    def arrange(self, tags: Mapping[str, float]) -> None:
+    def arrange(self, tags: Mapping[str, float], value_based: bool) -> None:
         """
         Lay out the custom scalars page, leaving out groups that this run has nothing for.
 
         :param tags: of the run's first inspection
+        :param value_based: whether the run learns Q_tot
         """
-        groups = {tag.split("/")[0] for tag in tags} | {"rollout", "time"}
+        groups = {tag.split("/")[0] for tag in tags} | {"rollout", "time", "train", "lambda"}
         layout: dict[str, dict[str, list[Any]]] = {}
-        for category, charts in _CHARTS.items():
+        for category, charts in {**_CHARTS, **(_VALUE_CHARTS if value_based else {})}.items():
             kept = {
                 name: ["Multiline", [f"^{pattern}$" for pattern in patterns]]
                 for name, patterns in charts.items()
@@ -119,7 +134,7 @@ class Page:
         self._logger.dump(step)
 
 
-def hyperparameters(model: BaseAlgorithm, policy: TeamPolicy, more: Mapping[str, object]) -> dict[str, Any]:
+def hyperparameters(model: BaseAlgorithm, policy: OurPolicy, more: Mapping[str, object]) -> dict[str, Any]:
     """
     What describes a run: the algorithm's numbers, the fields of the policy's parts, the sizes.
 
@@ -141,7 +156,7 @@ def hyperparameters(model: BaseAlgorithm, policy: TeamPolicy, more: Mapping[str,
         "learning_rate": model.lr_schedule(1.0),
         "seed": model.seed,
     }
-    for name in ("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"):
+    for name in _NUMBERS:
         found[name] = getattr(model, name, None)
     found |= asdict(policy.parts) | dict(more)
     return {name: _plain(value) for name, value in found.items() if value is not None}

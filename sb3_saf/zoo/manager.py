@@ -27,9 +27,16 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.callbacks import CheckpointInGameSteps, GameStepsProgressBar, TrialCallback, ZooEvalCallback
+from sb3_saf.zoo.callbacks import (
+    CheckpointInGameSteps,
+    GameStepsProgressBar,
+    TrialCallback,
+    ZooEvalCallback,
+)
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
+from sb3_saf.zoo.inspection import frequency, inspection
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
 from sb3_saf.zoo.settings import Settings
@@ -64,7 +71,7 @@ class TeamExperimentManager(ExperimentManager):
     ):
         super().__init__(args, algo, env_id, log_folder, *rest, **kwargs)
         self.request = request
-        self.deterministic_eval = request.deterministic_eval
+        self.deterministic_eval = request.deterministic_eval or not ALGOS[algo].draws_actions
         # RL-Zoo3 would divide these by the number of games.
         self.eval_freq = self.save_freq = -1
         self._envs: list[VecEnv] = []
@@ -188,28 +195,36 @@ class TeamExperimentManager(ExperimentManager):
         return env
 
     def create_callbacks(self) -> None:
-        """Add the progress bar, checkpoints and evaluation."""
+        """Add the progress bar, checkpoints, evaluation, and a look into the policy."""
         if self.optimize_hyperparameters:
             return  # trials have callbacks of their own
         if self.show_progress:
             self.callbacks.append(GameStepsProgressBar())
         if self.request.save_freq > 0:
             self.callbacks.append(CheckpointInGameSteps(self.request.save_freq, self.save_path, self.verbose))
-        eval_freq = self.request.eval_freq
-        if eval_freq is None:
-            eval_freq = max(1, self.settings.game_steps // 20)
+        eval_freq = frequency(self.request.eval_freq, self.settings.game_steps)
         if eval_freq > 0:
-            evaluation = ZooEvalCallback(
-                self.create_envs(self.n_eval_envs, eval_env=True),
-                seed=self.seed,
-                best_model_save_path=self.save_path,
-                log_path=self.save_path,
-                n_eval_episodes=self.n_eval_episodes,
-                eval_freq=eval_freq,
-                deterministic=self.deterministic_eval,
-                verbose=self.verbose,
-            )
-            self.callbacks.append(evaluation)
+            self.callbacks.append(self._evaluation(eval_freq))
+        inspect_freq = frequency(self.request.inspect_freq, self.settings.game_steps)
+        if self.tensorboard_log is not None and inspect_freq > 0:
+            self.callbacks.append(self._inspection(inspect_freq))
+
+    def _evaluation(self, eval_freq: int) -> ZooEvalCallback:
+        return ZooEvalCallback(
+            self.create_envs(self.n_eval_envs, eval_env=True),
+            seed=self.seed,
+            best_model_save_path=self.save_path,
+            log_path=self.save_path,
+            n_eval_episodes=self.n_eval_episodes,
+            eval_freq=eval_freq,
+            deterministic=self.deterministic_eval,
+            verbose=self.verbose,
+        )
+
+    def _inspection(self, inspect_freq: int) -> InspectionCallback:
+        callback = inspection(self.settings, self.seed, inspect_freq)
+        self._envs.append(callback.eval_env)
+        return callback
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Keep what was used and asked for; RL-Zoo3's ``args.yml`` and command would be those it was called with."""
