@@ -460,7 +460,7 @@ def test_environments_that_do_not_fit() -> None:
 
 def test_policies_of_others_are_refused() -> None:
     model = PPO("MultiInputPolicy", ToyTeams(), n_steps=5, batch_size=60, device="cpu")
-    with pytest.raises(ValueError, match=r"expected a policy of sb3_saf such as .*, got MultiInputActorCriticPolicy"):
+    with pytest.raises(ValueError, match=r"expected a policy of sb3_saf such as .*, got MultiInputActorCritic"):
         model.learn(60, callback=InspectionCallback(ToyTeams()))
 
 
