@@ -216,7 +216,7 @@ def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None
 def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
     fake_run(tmp_path, 1)
     fake_run(tmp_path, 2, game_steps=80, batch_size=80)
-    many = {"gamma": 0.9123456, "ent_coef": 0.02, "policy_kwargs": {"n_slots": 3, "n_policies": 2}}
+    many: dict[str, Any] = {"gamma": 0.9123456, "ent_coef": 0.02, "policy_kwargs": {"n_slots": 3, "n_policies": 2}}
     fake_run(tmp_path, 3, **many)
     fake_run(tmp_path, 4, seed=1, **many)
     fake_run(tmp_path, 5, **{**many, "gamma": 0.8})

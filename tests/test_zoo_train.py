@@ -92,7 +92,7 @@ def test_value_based_algorithms_are_evaluated_without_exploring(tmp_path: Path) 
     """QPLEX explores with every second action at this point; SAF's drawn actions are what it learns."""
     run = train(tmp_path, "--eval-freq", "40", "-n", "40", "-params", "exploration_final_eps:0.5", algo="qplex")
     games = load_settings("qplex", ENV, "smoke").make_env(3, evaluation=True, n_envs=4)
-    expected = evaluate_team(QPLEX.load(run / f"{ENV}.zip"), games, 4, deterministic=True)
+    expected = evaluate_team(QPLEX.load(run / "best_model.zip"), games, 4, deterministic=True)
     with np.load(run / "evaluations.npz") as arrays:
         assert arrays["results"].tolist() == [expected.returns]
 

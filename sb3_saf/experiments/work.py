@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shlex
 import socket
 import subprocess
@@ -23,6 +22,7 @@ from sb3_saf.experiments.cells import Cell, Protocol
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import pack, to_json
 from sb3_saf.experiments.results import FINISHED, config_of
+from sb3_saf.zoo.commands import option_words
 from sb3_saf.zoo.inspection import frequency, inspection
 from sb3_saf.zoo.seeds import evaluation_seed
 from sb3_saf.zoo.versions import software_versions
@@ -187,10 +187,8 @@ def command(cell: Cell, protocol: Protocol) -> str:
     words = ["python", "-m", "sb3_saf.train", "--algo", cell.method, "--env", settings.env_id]
     words += ["--size", protocol.size, "--seed", str(cell.seed)]
     env_kwargs = {**protocol.overrides.get("env_kwargs", {}), **cell.env_kwargs(cell.level)}
-    words += ["--env-kwargs", *(f"{key}:{json.dumps(value)}" for key, value in env_kwargs.items())]
     own = {key: value for key, value in protocol.overrides.items() if key not in ("env_kwargs", "game_steps")}
-    if own:
-        words += ["--hyperparams", *(f"{key}:{json.dumps(value)}" for key, value in own.items())]
+    words += [*option_words("--env-kwargs", env_kwargs), *option_words("--hyperparams", own)]
     if "game_steps" in protocol.overrides:
         words += ["--game-steps", str(protocol.overrides["game_steps"])]
     return shlex.join(words)

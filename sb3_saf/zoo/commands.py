@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, NoReturn
@@ -61,6 +62,17 @@ class KeyValues(argparse.Action):
             except ValueError as error:
                 parser.error(str(error))
         setattr(namespace, self.dest, pairs)
+
+
+def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
+    """
+    The words that give pairs to an option of :class:`KeyValues`.
+
+    :param option: such as ``"--env-kwargs"``
+    :param pairs: plain data
+    :return: empty if there are none
+    """
+    return [option, *(f"{key}:{json.dumps(value)}" for key, value in pairs.items())] if pairs else []
 
 
 def run_command(program: str, command: Callable[[], None]) -> None:
