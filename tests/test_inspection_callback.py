@@ -139,8 +139,9 @@ class TestPage:
 
     def test_layout_and_hyperparameters(self, page: EventAccumulator) -> None:
         layout = page.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0].decode(errors="replace")
-        for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1"):
+        for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1", "share of"):
             assert name in layout
+        assert "Mixer" not in layout
         told = page.PluginTagToContent("hparams")
         for word in (b"TeamSupport", b"n_policies", b"learning_rate"):
             assert word in told["_hparams_/session_start_info"]

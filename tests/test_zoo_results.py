@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +140,7 @@ def test_a_window_needs_a_display(
         (["--gif", "film.mp4"], "a file that ends with .gif"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--gif", "a.gif", "--text"], "not allowed with"),
+        (["--gif", "/dev/null/a.gif"], "Not a directory"),
     ],
 )
 def test_mistakes_in_enjoy_are_one_line(
@@ -145,6 +148,15 @@ def test_mistakes_in_enjoy_are_one_line(
 ) -> None:
     quiet = [] if "--gif" in options else ["--no-render"]
     assert words in failed(zoo_enjoy.main, ["-f", str(logs), *quiet, *options], capsys)
+
+
+def test_a_reader_may_leave(logs: Path) -> None:
+    """As ``| head -1`` does."""
+    words = ["-m", "sb3_saf.enjoy", "-f", str(logs), "--env", ENV, "--episodes", "2", "--text"]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        assert command.stdout is not None and command.stderr is not None
+        command.stdout.close()
+        assert command.stderr.read() == b""
 
 
 def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -258,6 +270,7 @@ def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Pat
         (["aggregate", "-o", "a.png"], "aggregates"),
         (["bars", "-o", "a.png"], "invalid choice"),
         (["curves"], "--output"),
+        (["curves", "--algos", "saf", "-o", "/dev/null/a.png"], "Not a directory"),
     ],
 )
 def test_mistakes_in_plot_are_one_line(

@@ -257,6 +257,8 @@ def failed(options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         (["--trial-id", "1", "--storage", "s.log", "--study-name", "s"], ("there is no study file s.log",)),
         (["-optimize", "--storage", "study"], ("--storage must be",)),
         (["--sampler", "grid"], ("invalid choice", "--help")),
+        (["-f", "/dev/null/logs"], ("Not a directory", "/dev/null/logs")),
+        (["-tb", "/dev/null/tb"], ("Not a directory", "/dev/null/tb")),
         (["--game-step", "5"], ("unrecognized arguments", "--help")),
     ],
 )
@@ -270,6 +272,13 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     line = failed(["--size", "smoke", *options], capsys)
     assert all(word in line for word in words), line
+    assert not list(Path("logs").rglob("*.yml"))  # it would pass for the latest run
+
+
+def test_help_tells_defaults_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
+    text = zoo_train.make_parser().format_help()
+    assert "(default: saf)" in text
+    assert not any(f"(default: {empty})" in text for empty in ("None", "{}", "", "False"))
 
 
 def test_strings_are_not_evaluated(

@@ -6,7 +6,8 @@ A logger of our own in front of the model's formats, so that what training has r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -27,9 +28,10 @@ _NUMBERS: Final = (
 #: Charts of the custom scalars page: group, chart, regular expressions of tags.
 _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
     "Team": {
+        "evaluation: share of the largest return": [r"team/share_of_.+"],
         "training: mean return of the last 100 episodes": [r"rollout/ep_rew_mean"],
-        "evaluation: episode length (game steps)": [r"team/episode_length"],
         "training: game steps per second": [r"time/game_steps_per_second"],
+        "evaluation: episode length (game steps)": [r"team/episode_length"],
     },
     "Policy pool": {
         "how often each policy is chosen": [r"pool/chosen/policy_\d+"],
@@ -47,6 +49,8 @@ _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
         "error (root mean square)": [r"critic/error", r"critic/td_error"],
     },
 }
+#: Groups that algorithms log themselves, later than the layout is made.
+_OF_ALGORITHMS: Final = ("rollout/", "time/", "train/", "lambda/")
 #: Charts of algorithms that learn Q_tot.
 _VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
     "Mixer": {
@@ -94,18 +98,17 @@ class Page:
 
     def arrange(self, tags: Mapping[str, float], value_based: bool) -> None:
         """
-        Lay out the custom scalars page, leaving out groups that this run has nothing for.
+        Lay out the custom scalars page, leaving out charts that this run has nothing for.
 
         :param tags: of the run's first inspection
         :param value_based: whether the run learns Q_tot
         """
-        groups = {tag.split("/")[0] for tag in tags} | {"rollout", "time", "train", "lambda"}
         layout: dict[str, dict[str, list[Any]]] = {}
         for category, charts in {**_CHARTS, **(_VALUE_CHARTS if value_based else {})}.items():
             kept = {
                 name: ["Multiline", [f"^{pattern}$" for pattern in patterns]]
                 for name, patterns in charts.items()
-                if any(pattern.split("/")[0] in groups for pattern in patterns)
+                if any(_is_coming(pattern, tags) for pattern in patterns)
             }
             if kept:
                 layout[category] = kept
@@ -132,6 +135,11 @@ class Page:
         :param step: of the x-axis: agents' steps, as everything that SB3 writes
         """
         self._logger.dump(step)
+
+
+def _is_coming(pattern: str, tags: Iterable[str]) -> bool:
+    """Whether a run has scalars for a pattern: among what is inspected, or from the algorithm's own logs."""
+    return pattern.startswith(_OF_ALGORITHMS) or any(re.fullmatch(pattern, tag) for tag in tags)
 
 
 def hyperparameters(model: BaseAlgorithm, policy: OurPolicy, more: Mapping[str, object]) -> dict[str, Any]:

@@ -133,17 +133,18 @@ class TeamExperimentManager(ExperimentManager):
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Make folder, environments, callbacks and model; if that fails, nothing is left."""
         try:
-            with user_errors(AssertionError, TypeError):  # SB3's checks of what it is given
+            # SB3's checks of what it is given, and folders that cannot be written
+            with user_errors(AssertionError, TypeError, OSError):
                 prepared = super().setup_experiment()
+                if prepared is not None:
+                    model, _ = prepared
+                    # SB3 would call every run PPO.
+                    model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
         except CommandError:
             self._close_envs()
             if self._has_folder:
                 shutil.rmtree(self.save_path)  # it would pass for the latest run
             raise
-        if prepared is not None:
-            model, _ = prepared
-            # SB3 would call every run PPO.
-            model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
         return prepared
 
     def learn(self, model: BaseAlgorithm) -> None:

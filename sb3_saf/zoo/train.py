@@ -12,7 +12,16 @@ from pathlib import Path
 from typing import Final
 
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.commands import CommandError, KeyValues, OneLineParser, replaced, require_zoo, run_command, user_errors
+from sb3_saf.zoo.commands import (
+    CommandError,
+    DefaultsFormatter,
+    KeyValues,
+    OneLineParser,
+    replaced,
+    require_zoo,
+    run_command,
+    user_errors,
+)
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.seeds import MAX_SEED, check_seed
 from sb3_saf.zoo.settings import ENV_IDS
@@ -49,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OneLineParser(
         prog=PROGRAM,
         description="Train or tune a team by name, on RL-Zoo3. Steps are steps of the game, summed over all games.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
         allow_abbrev=False,
     )
     _add_what(parser)
