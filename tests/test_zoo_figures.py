@@ -9,6 +9,8 @@ from matplotlib.colors import to_hex
 
 pytest.importorskip("rliable")
 
+from rliable import metrics
+
 from sb3_saf import confidence_interval
 from sb3_saf.zoo.algorithms import ALGOS
 from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels, method_styles
@@ -106,6 +108,12 @@ def test_interquartile_mean_and_its_interval() -> None:
     assert estimate.low >= 0.5 and estimate.high <= 6.5
     alone = interquartile_means({"saf": scores[:1]})["saf"]
     assert np.isnan([alone.low, alone.high]).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 9), (5, 7)])
+def test_the_interquartile_mean_is_rliables(shape: tuple[int, int]) -> None:
+    scores = np.random.default_rng(0).normal(size=shape)
+    assert interquartile_means({"saf": scores})["saf"].value == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
 
 
 def test_seeds_without_spread_have_an_interval_without_width() -> None:

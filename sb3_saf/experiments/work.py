@@ -23,7 +23,7 @@ from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import pack, to_json
 from sb3_saf.experiments.results import FINISHED, config_of
 from sb3_saf.zoo.commands import option_words
-from sb3_saf.zoo.inspection import frequency, inspection
+from sb3_saf.zoo.inspection import inspection
 from sb3_saf.zoo.seeds import evaluation_seed
 from sb3_saf.zoo.versions import software_versions
 
@@ -103,7 +103,7 @@ def _train(work: Work, folder: Path) -> BaseAlgorithm:
     env = settings.make_env(work.cell.seed, monitor_dir=folder)
     logs = str(folder / "tb") if work.tensorboard else None
     model = settings.make_model(env, work.cell.seed, device=work.device, tensorboard_log=logs)
-    look = inspection(settings, work.cell.seed, frequency(None, settings.game_steps)) if work.tensorboard else None
+    look = inspection(settings, work.cell.seed) if work.tensorboard else None
     model.learn(settings.total_timesteps, callback=look, tb_log_name=work.cell.method)
     if look is not None:
         look.eval_env.close()

@@ -10,28 +10,20 @@ from sb3_saf.zoo.settings import Settings
 
 #: Team episodes that are played to look into a policy, each in a game of its own.
 INSPECTED_EPISODES: Final = 16
-#: Evaluations and inspections of a run, unless a frequency is given.
-PER_RUN: Final = 20
+#: Inspections of a run, unless a frequency is given.
+INSPECTIONS: Final = 10
 
 
-def frequency(given: int | None, game_steps: int) -> int:
-    """
-    Game steps from one look at the policy to the next.
-
-    :param given: by the user; 0 or less for none, None for so many that there are 20 in a run
-    :param game_steps: of the run
-    """
-    return max(1, game_steps // PER_RUN) if given is None else given
-
-
-def inspection(settings: Settings, seed: int, every_game_steps: int) -> InspectionCallback:
+def inspection(settings: Settings, seed: int, every_game_steps: int | None = None) -> InspectionCallback:
     """
     What looks into the policy for TensorBoard, on games that no run trains on, and shows the level beside it.
 
     :param settings: of the run
     :param seed: of the run
-    :param every_game_steps: game steps between inspections
+    :param every_game_steps: game steps between inspections; None for so many that there are 10 in a run
     """
+    if every_game_steps is None:
+        every_game_steps = max(1, settings.game_steps // INSPECTIONS)
     games = settings.make_env(seed, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode="rgb_array")
     return InspectionCallback(
         games,

@@ -36,7 +36,7 @@ from sb3_saf.zoo.callbacks import (
     ZooEvalCallback,
 )
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
-from sb3_saf.zoo.inspection import frequency, inspection
+from sb3_saf.zoo.inspection import inspection
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
 from sb3_saf.zoo.settings import Settings
@@ -203,11 +203,13 @@ class TeamExperimentManager(ExperimentManager):
             self.callbacks.append(GameStepsProgressBar())
         if self.request.save_freq > 0:
             self.callbacks.append(CheckpointInGameSteps(self.request.save_freq, self.save_path, self.verbose))
-        eval_freq = frequency(self.request.eval_freq, self.settings.game_steps)
+        eval_freq = self.request.eval_freq
+        if eval_freq is None:
+            eval_freq = max(1, self.settings.game_steps // 20)
         if eval_freq > 0:
             self.callbacks.append(self._evaluation(eval_freq))
-        inspect_freq = frequency(self.request.inspect_freq, self.settings.game_steps)
-        if self.tensorboard_log is not None and inspect_freq > 0:
+        inspect_freq = self.request.inspect_freq
+        if self.tensorboard_log is not None and (inspect_freq is None or inspect_freq > 0):
             self.callbacks.append(self._inspection(inspect_freq))
 
     def _evaluation(self, eval_freq: int) -> ZooEvalCallback:
@@ -222,7 +224,7 @@ class TeamExperimentManager(ExperimentManager):
             verbose=self.verbose,
         )
 
-    def _inspection(self, inspect_freq: int) -> InspectionCallback:
+    def _inspection(self, inspect_freq: int | None) -> InspectionCallback:
         callback = inspection(self.settings, self.seed, inspect_freq)
         self._envs.append(callback.eval_env)
         return callback

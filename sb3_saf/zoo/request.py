@@ -25,7 +25,7 @@ class Request:
     :param config: a file in place of the algorithm's
     :param eval_freq: game steps between evaluations; 0 or less for none, None for 20 in a run
     :param save_freq: game steps between checkpoints; 0 or less for none
-    :param inspect_freq: game steps between looks into the policy for TensorBoard, as ``eval_freq``
+    :param inspect_freq: game steps between looks into the policy for TensorBoard; 0 or less for none, None for 10
     :param deterministic_eval: whether evaluation takes the most likely actions
     :param trial: number of the trial to train again, or ``"best"``
     :param options: all options as given, to be kept

@@ -110,7 +110,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--inspect-freq",
         type=int,
-        help="game steps between looks into the policy for TensorBoard, -1 for none; by default 20 a run",
+        help="game steps between looks into the policy for TensorBoard, -1 for none; by default 10 a run",
     )
     group.add_argument("--log-interval", type=int, default=-1, help="rollouts between logs, -1 for SB3's")
     group.add_argument("--num-threads", type=int, default=-1, help="threads of torch, -1 for its own choice")
