@@ -23,6 +23,8 @@ from sb3_saf.zoo.statistics import Estimate, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
 
 pytest.importorskip("rliable")
+#: Seconds, of a busy machine too: the first test waits for 72 cells.
+pytestmark = pytest.mark.timeout(900)
 LEVELS = [f"{task}-c{c}-h1" for task in ("TeamTogether", "TeamSupport", "KeyForTreasure") for c in (1, 2, 3)]
 
 

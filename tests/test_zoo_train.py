@@ -138,9 +138,8 @@ def test_evaluation_may_have_a_level_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
-    run = train(
-        tmp_path, "-tb", str(tmp_path / "tb"), "-params", "gamma:0.9", "policy_kwargs:{n_slots: 3}", algo="saf-no-pool"
-    )
+    logs = ("-tb", str(tmp_path / "tb"), "--inspect-freq", "-1")
+    run = train(tmp_path, *logs, "-params", "gamma:0.9", "policy_kwargs:{n_slots: 3}", algo="saf-no-pool")
     assert run == tmp_path / "saf-no-pool" / f"{ENV}_1"
     config, given, versions = (
         yaml.safe_load((run / ENV / f"{name}.yml").read_text()) for name in ("config", "args", "versions")
