@@ -47,8 +47,10 @@ def encode(tree: Tree, version: str) -> bytes:
     text = json.dumps(_pack(tree, arrays, "state"), separators=(",", ":"))
     arrays[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
     header = f"sb3_saf checkpoint, format {FORMAT}, written by sb3_saf {version}\n".encode()
-    content = header + save(arrays)
-    return content + hashlib.sha256(content).digest()
+    body = save(arrays)
+    digest = hashlib.sha256(header)
+    digest.update(body)
+    return b"".join((header, body, digest.digest()))  # one copy: it may hold a replay buffer
 
 
 def decode(data: bytes) -> Tree:
@@ -101,7 +103,7 @@ def _pack_array(kind: str, array: Array, arrays: dict[str, Array], where: str) -
     if array.dtype.kind not in "biuf":
         raise CheckpointError(f"{where} has the dtype {array.dtype}, which a checkpoint cannot hold")
     name = str(len(arrays))
-    arrays[name] = np.array(array, order="C")
+    arrays[name] = array.copy() if array.ndim == 0 else np.ascontiguousarray(array)
     return {_KIND: kind, "is": name}
 
 

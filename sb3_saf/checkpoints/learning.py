@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.checkpoints.callback import TeamCheckpointCallback, enter_run
 from sb3_saf.checkpoints.callbacks import all_callbacks, load_callback_states
@@ -22,14 +23,14 @@ from sb3_saf.checkpoints.environments import load_environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.generators import load_generator_states
 from sb3_saf.checkpoints.logs import continue_logs
-from sb3_saf.checkpoints.models import check_description, load_model_state
+from sb3_saf.checkpoints.models import check_description, is_off_policy, load_model_state, require_resumable
 from sb3_saf.checkpoints.software import warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
 
 
 def resume(
     folder: str | os.PathLike[str],
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     callback: BaseCallback | Sequence[BaseCallback] | None = None,
 ) -> Path:
     """
@@ -46,6 +47,7 @@ def resume(
     :raises CheckpointError: if there is no good checkpoint, or model, environment or callbacks differ from those of the
         first start, naming the first difference
     """
+    require_resumable(model)
     loaded = CheckpointFolder(folder).newest()
     if loaded is None:
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
@@ -63,7 +65,7 @@ def resume(
     return loaded.path
 
 
-def _load_environment(model: OnPolicyAlgorithm, state: Tree) -> None:
+def _load_environment(model: BaseAlgorithm, state: Tree) -> None:
     assert model.env is not None
     if state is not None:
         load_environment_state(model.env, state)
@@ -74,7 +76,7 @@ def _load_environment(model: OnPolicyAlgorithm, state: Tree) -> None:
 
 
 def resumable_learn(
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     total_timesteps: int,
     folder: str | os.PathLike[str],
     callback: BaseCallback | Sequence[BaseCallback] | None = None,
@@ -83,7 +85,7 @@ def resumable_learn(
     keep: int = 3,
     exact: bool = True,
     **learn_arguments: Any,
-) -> OnPolicyAlgorithm:
+) -> BaseAlgorithm:
     """
     ``model.learn`` with checkpoints: started again after whatever ended it, the same script goes on where it was.
 
@@ -111,7 +113,7 @@ def resumable_learn(
                 print(f"Going on from {path}")
             learn_arguments["reset_num_timesteps"] = False
             total_timesteps -= model.num_timesteps
-        with _saved_on_interrupt(checkpoints):
+        with _saved_on_interrupt(checkpoints, is_off_policy(model)):
             model.learn(total_timesteps, [checkpoints, *given], **learn_arguments)
     finally:
         checkpoints.store.release()
@@ -119,8 +121,14 @@ def resumable_learn(
 
 
 @contextmanager
-def _saved_on_interrupt(checkpoints: TeamCheckpointCallback) -> Iterator[None]:
-    with _sigterm_raises():
+def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool) -> Iterator[None]:
+    """
+    Save when something stops training.
+
+    :param at_rollout: signals stop it at the start of the next rollout only, where its state can be taken
+    """
+    signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
+    with _handled(signals, _Stopper(checkpoints, at_rollout)):
         try:
             yield
         except (KeyboardInterrupt, SystemExit):
@@ -131,17 +139,39 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback) -> Iterator[None]:
             raise
 
 
-def _stop(number: int, frame: FrameType | None) -> NoReturn:
+class _Stopper:
+    """
+    What a signal does: it raises, at once or at the start of the next rollout; the second one at once.
+
+    :param checkpoints: of the run
+    :param at_rollout: whether the first one waits
+    """
+
+    def __init__(self, checkpoints: TeamCheckpointCallback, at_rollout: bool) -> None:
+        self._checkpoints = checkpoints
+        self._waits = at_rollout
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not self._waits:
+            _stop(number)
+        self._waits = False
+        self._checkpoints.stop_soon(partial(_stop, number))
+
+
+def _stop(number: int) -> NoReturn:
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
     raise SystemExit(128 + number)
 
 
 @contextmanager
-def _sigterm_raises() -> Iterator[None]:
+def _handled(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
         yield
         return
-    before = signal.signal(signal.SIGTERM, _stop)
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, kept in before.items():
+            signal.signal(number, kept)
