@@ -30,6 +30,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.common.centralized import CentralizedValueWrapper
     from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.common.env import make_team_env
+    from sb3_saf.common.errors import NonFiniteError
     from sb3_saf.common.evaluation import (
         EvaluationResult,
         RandomPolicy,
@@ -37,6 +38,7 @@ if _is_installed("stable_baselines3"):
         evaluate_policy,
         evaluate_team,
     )
+    from sb3_saf.common.finite import FiniteCallback
     from sb3_saf.common.monitor import TeamMonitor
     from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
@@ -72,6 +74,7 @@ __all__ = [
     "CheckpointError",
     "EvaluationResult",
     "ExportError",
+    "FiniteCallback",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -81,6 +84,7 @@ __all__ = [
     "MAPPOMaskablePolicy",
     "MAPPOPolicy",
     "MLPEncoder",
+    "NonFiniteError",
     "ObservationEncoder",
     "PaperCNN",
     "QPLEXLstmPolicy",

@@ -184,6 +184,14 @@ def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: 
     assert weights(model) != weights(MODELS[name]())
 
 
+def test_what_agents_remember_goes_on(tmp_path: Path) -> None:
+    done, resumed = go_on(tmp_path, MODELS["QPLEX with memory"](), rollouts=2), MODELS["QPLEX with memory"]()
+    resume(tmp_path, resumed, Lightning(-1))
+    assert resumed._agent_state[0].any()
+    for part, expected in zip(resumed._agent_state, done._agent_state, strict=True):
+        assert np.array_equal(part, expected)
+
+
 def test_checkpoints_do_not_change_the_run(tmp_path: Path) -> None:
     assert weights(go_on(tmp_path, make())) == weights(make().learn(10 * ROLLOUT))
 

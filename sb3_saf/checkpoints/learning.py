@@ -26,6 +26,8 @@ from sb3_saf.checkpoints.logs import continue_logs
 from sb3_saf.checkpoints.models import check_description, is_off_policy, load_model_state, require_resumable
 from sb3_saf.checkpoints.software import warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.common.errors import NonFiniteError
+from sb3_saf.common.finite import FiniteCallback
 
 
 def resume(
@@ -84,12 +86,14 @@ def resumable_learn(
     every_game_steps: int = 100_000,
     keep: int = 3,
     exact: bool = True,
+    finite: bool = True,
     **learn_arguments: Any,
 ) -> BaseAlgorithm:
     """
     ``model.learn`` with checkpoints: started again after whatever ended it, the same script goes on where it was.
 
-    Ctrl-C and SIGTERM write the last state between two rollouts before the process ends.
+    Ctrl-C and SIGTERM write the last state between two rollouts before the process ends. So does NaN or infinity in
+    observations, rewards, losses or gradients, which ends training.
 
     :param model: made the same way at every start
     :param total_timesteps: agents' steps of the whole run, as SB3 counts them
@@ -98,13 +102,16 @@ def resumable_learn(
     :param every_game_steps: see :class:`TeamCheckpointCallback`
     :param keep: see :class:`TeamCheckpointCallback`
     :param exact: see :class:`TeamCheckpointCallback`
+    :param finite: whether to look for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
     :param learn_arguments: of ``model.learn``
     :return: the model
     :raises CheckpointError: see :func:`resume`; also if another run is at work in the folder
+    :raises NonFiniteError: at NaN or infinity, naming the step, what it is in, and the last good checkpoint
     """
     others = list(all_callbacks(callback))
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
     checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, others, exact, verbose=model.verbose)
+    before: list[BaseCallback] = [FiniteCallback()] if finite else []  # first: what is written has been looked at
     checkpoints.store.acquire()
     try:
         if checkpoints.store.checkpoints():
@@ -114,7 +121,7 @@ def resumable_learn(
             learn_arguments["reset_num_timesteps"] = False
             total_timesteps -= model.num_timesteps
         with _saved_on_interrupt(checkpoints, is_off_policy(model)):
-            model.learn(total_timesteps, [checkpoints, *given], **learn_arguments)
+            model.learn(total_timesteps, [*before, checkpoints, *given], **learn_arguments)
     finally:
         checkpoints.store.release()
     return model
@@ -137,6 +144,11 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool) -
             if newest:
                 print(f"\nStopped. {newest[0]} is saved; start the same command again to go on from there.", flush=True)
             raise
+        except NonFiniteError as error:
+            checkpoints.write_last()  # of before this rollout
+            newest = checkpoints.store.checkpoints()
+            last = f"the last good checkpoint is {newest[0]}" if newest else "there is no checkpoint yet"
+            raise NonFiniteError(f"{error}; {last}") from error
 
 
 class _Stopper:
