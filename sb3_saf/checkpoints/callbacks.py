@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import (
     EvalCallback,
     EventCallback,
     EveryNTimesteps,
+    ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
@@ -36,8 +37,8 @@ Callbacks = BaseCallback | Iterable[BaseCallback] | None
 
 
 def all_callbacks(callback: Callbacks) -> Iterator[BaseCallback]:
-    """Callbacks in lists, and those that others call."""
-    if callback is None:
+    """Callbacks in lists, and those that others call; progress bars, which a terminal alone has, are left out."""
+    if callback is None or isinstance(callback, ProgressBarCallback):
         return
     if not isinstance(callback, BaseCallback):
         for one in callback:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -28,6 +29,9 @@ from sb3_saf.checkpoints.software import warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.common.errors import NonFiniteError
 from sb3_saf.common.finite import FiniteCallback
+
+#: Torch's own words for distributions of actions that weights too large have made of NaN.
+_OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)
 
 
 def resume(
@@ -87,6 +91,7 @@ def resumable_learn(
     keep: int = 3,
     exact: bool = True,
     finite: bool = True,
+    again: str = "start the same command again to go on from there",
     **learn_arguments: Any,
 ) -> BaseAlgorithm:
     """
@@ -103,6 +108,7 @@ def resumable_learn(
     :param keep: see :class:`TeamCheckpointCallback`
     :param exact: see :class:`TeamCheckpointCallback`
     :param finite: whether to look for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
+    :param again: what a message after Ctrl-C and SIGTERM tells to do
     :param learn_arguments: of ``model.learn``
     :return: the model
     :raises CheckpointError: see :func:`resume`; also if another run is at work in the folder
@@ -120,7 +126,7 @@ def resumable_learn(
                 print(f"Going on from {path}")
             learn_arguments["reset_num_timesteps"] = False
             total_timesteps -= model.num_timesteps
-        with _saved_on_interrupt(checkpoints, is_off_policy(model)):
+        with _saved_on_interrupt(checkpoints, is_off_policy(model), again):
             model.learn(total_timesteps, [*before, checkpoints, *given], **learn_arguments)
     finally:
         checkpoints.store.release()
@@ -128,11 +134,12 @@ def resumable_learn(
 
 
 @contextmanager
-def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool) -> Iterator[None]:
+def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, again: str) -> Iterator[None]:
     """
     Save when something stops training.
 
     :param at_rollout: signals stop it at the start of the next rollout only, where its state can be taken
+    :param again: how to go on
     """
     signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
     with _handled(signals, _Stopper(checkpoints, at_rollout)):
@@ -142,13 +149,16 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool) -
             checkpoints.write_last()
             newest = checkpoints.store.checkpoints()
             if newest:
-                print(f"\nStopped. {newest[0]} is saved; start the same command again to go on from there.", flush=True)
+                print(f"\nStopped. {newest[0]} is saved; {again}.", flush=True)
             raise
-        except NonFiniteError as error:
+        except ValueError as error:
+            if not isinstance(error, NonFiniteError) and not _OF_TORCH.match(str(error)):
+                raise
             checkpoints.write_last()  # of before this rollout
             newest = checkpoints.store.checkpoints()
             last = f"the last good checkpoint is {newest[0]}" if newest else "there is no checkpoint yet"
-            raise NonFiniteError(f"{error}; {last}") from error
+            what = str(error).partition("\n")[0].rstrip(":")
+            raise NonFiniteError(f"{what}; {last}") from error
 
 
 class _Stopper:

@@ -17,6 +17,7 @@ from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine
 from sb3_saf.zoo.algorithms import ALGOS
 from sb3_saf.zoo.commands import KeyValues
+from sb3_saf.zoo.devices import check_device
 from sb3_saf.zoo.names import unknown_name
 from sb3_saf.zoo.seeds import check_seed
 from sb3_saf.zoo.yaml_files import SIZES, Size
@@ -153,7 +154,7 @@ def machine_of(options: argparse.Namespace) -> Machine:
     threads = positive("--threads", options.threads)
     if options.retries < 0:
         raise ValueError(f"--retries must be 0 or more, got {options.retries}")
-    return Machine(options.device, threads, options.retries, options.tensorboard, not _is_on_ray(options))
+    return Machine(check_device(options.device), threads, options.retries, options.tensorboard, not _is_on_ray(options))
 
 
 def engine_of(options: argparse.Namespace) -> Engine:
