@@ -142,13 +142,16 @@ def training(algo: str, minutes: float, folder: Path) -> Soak:
 
 
 def draw(soaks: list[Soak], path: Path) -> None:
-    """Memory against steps."""
+    """Memory against steps, one part after the other."""
     figure = Figure(figsize=(7, 3), dpi=110, layout="constrained")
     axes = figure.subplots()
+    begin = 0.0
     for one in soaks:
-        axes.plot(np.array(one.steps) / 1e6, one.memory, label=one.name)
-    axes.set(xlabel="agent-steps (millions)", ylabel="resident memory (MB)", ylim=(0, None))
-    axes.legend()
+        axes.plot((begin + np.array(one.steps)) / 1e6, one.memory, label=one.name)
+        begin += one.steps[-1]
+    top = 1.2 * max(max(one.memory) for one in soaks)
+    axes.set(xlabel="agent-steps (millions)", ylabel="resident memory (MB)", ylim=(0, top))
+    axes.legend(loc="lower right")
     figure.savefig(path)
 
 

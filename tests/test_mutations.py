@@ -172,7 +172,7 @@ def test_mutated_states_are_refused_in_our_own_words_or_can_be_played() -> None:
                 state.pop(name, None)
             elif change == 1:
                 state[rng.choice((1, None, "wall", ("a",), "agent_pos "))] = 1
-            elif isinstance(state.get(name), np.ndarray) and state[name].size:
+            elif isinstance(state.get(name), np.ndarray) and state[name].size and state[name].dtype.kind in "bui":
                 state[name] = odd_array(state[name], rng)
 
         def attempt(
