@@ -61,7 +61,7 @@ def decode(data: bytes) -> Tree:
     :raises DamagedCheckpointError: if a bit was changed or the file was cut short
     :raises UnknownFormatError: if another version wrote it in another format
     """
-    content, digest = data[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]
+    content, digest = memoryview(data)[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]  # no copy: it may hold a replay buffer
     if hashlib.sha256(content).digest() != digest:
         raise DamagedCheckpointError("its checksum does not match: it was cut short or changed")
     header = _HEADER.match(content)
@@ -74,7 +74,7 @@ def decode(data: bytes) -> Tree:
             f"reads format {FORMAT}; install that version to go on"
         )
     try:
-        arrays = load(content[header.end() :])
+        arrays = load(bytes(content[header.end() :]))
         return _unpack(json.loads(arrays.pop(_TREE).tobytes()), arrays)
     except Exception as error:  # a right checksum over wrong content: not written by this package
         raise DamagedCheckpointError(f"its content cannot be read: {error}") from error

@@ -212,6 +212,12 @@ def _check(options: argparse.Namespace) -> None:
             raise CommandError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
     if options.trained_agent and not (options.trained_agent.endswith(".zip") and Path(options.trained_agent).is_file()):
         raise CommandError(f"--trained-agent must be a .zip that is there, got {options.trained_agent!r}")
+    if options.trained_agent:
+        print(
+            f"{options.trained_agent} is unpickled, which can run code from it; from a file that you do not trust take "
+            "the weights alone: sb3_saf.load_weights",
+            file=sys.stderr,
+        )
     if options.trial_id is None:
         return
     if options.storage is None or options.study_name is None:
