@@ -79,7 +79,9 @@ def soak(name: str, agent_steps: int, play: Callable[[], int]) -> Soak:
     :param agent_steps: of all of it
     :param play: does a part and says how many agent-steps it was
     """
-    steps, memory, done, began = [], [], 0, time.perf_counter()
+    steps: list[float] = []
+    memory: list[float] = []
+    done, began = 0, time.perf_counter()
     while done < agent_steps:
         done += play()
         if done >= agent_steps * len(steps) / N_SAMPLES:
@@ -95,7 +97,7 @@ def environments(agent_steps: int) -> Iterator[Soak]:
         actions = np.random.default_rng(0).integers(7, size=(64, venv.num_envs))
         venv.reset()
 
-        def play(venv: object = venv, actions: np.ndarray = actions) -> int:  # type: ignore[type-arg]
+        def play(venv: object = venv, actions: np.ndarray = actions) -> int:
             for row in actions:
                 venv.step(row)  # type: ignore[attr-defined]
             return int(actions.size)

@@ -21,7 +21,18 @@ from sb3_saf.zoo.callbacks import ZooEvalCallback
 from sb3_saf.zoo.settings import load_settings
 
 ENV = "TeamTogether-v0"
-OPTIONS = ("--env", ENV, "--size", "smoke", "--eval-episodes", "2", "--checkpoint-freq", "1")
+OPTIONS = (
+    "--env",
+    ENV,
+    "--size",
+    "smoke",
+    "--eval-episodes",
+    "2",
+    "--checkpoint-freq",
+    "1",
+    "--inspect-freq",
+    "100000",
+)
 
 
 def train(folder: Path, algo: str, *options: str) -> None:

@@ -25,6 +25,7 @@ class Request:
     :param config: a file in place of the algorithm's
     :param eval_freq: game steps between evaluations; 0 or less for none, None for 20 in a run
     :param save_freq: game steps between saved models; 0 or less for none
+    :param inspect_freq: game steps between looks into the policy for TensorBoard; 0 or less for none, None for 10
     :param checkpoint_freq: game steps between checkpoints to go on from; 0 or less for none, None for 10 in a run
     :param resume: folder of a run to go on with; None for a new one
     :param seed: the run's seed; None if any will do
@@ -43,6 +44,7 @@ class Request:
     config: Path | None = None
     eval_freq: int | None = None
     save_freq: int = -1
+    inspect_freq: int | None = None
     checkpoint_freq: int | None = None
     resume: Path | None = None
     seed: int | None = None

@@ -13,7 +13,16 @@ from pathlib import Path
 from typing import Final
 
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.commands import CommandError, KeyValues, OneLineParser, replaced, require_zoo, run_command, user_errors
+from sb3_saf.zoo.commands import (
+    CommandError,
+    DefaultsFormatter,
+    KeyValues,
+    OneLineParser,
+    replaced,
+    require_zoo,
+    run_command,
+    user_errors,
+)
 from sb3_saf.zoo.devices import check_device
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.seeds import MAX_SEED, check_seed
@@ -51,7 +60,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OneLineParser(
         prog=PROGRAM,
         description="Train or tune a team by name, on RL-Zoo3. Steps are steps of the game, summed over all games.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
         allow_abbrev=False,
     )
     _add_what(parser)
@@ -100,6 +109,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--n-eval-envs", type=int, default=32, help="games of an evaluation")
     group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
     group.add_argument("--save-freq", type=int, default=-1, help="game steps between saved models, -1 for none")
+    group.add_argument(
+        "--inspect-freq",
+        type=int,
+        help="game steps between looks into the policy for TensorBoard, -1 for none; by default 10 a run",
+    )
     group.add_argument(
         "--checkpoint-freq", type=int, help="game steps between checkpoints for --resume, -1 for none; 10 a run"
     )
@@ -161,6 +175,7 @@ def train(arguments: Sequence[str] | None = None) -> None:
         config=options.conf_file,
         eval_freq=options.eval_freq,
         save_freq=options.save_freq,
+        inspect_freq=options.inspect_freq,
         checkpoint_freq=options.checkpoint_freq,
         seed=options.seed,
         deterministic_eval=options.deterministic_eval,
