@@ -31,6 +31,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.common.centralized import CentralizedValueWrapper
     from sb3_saf.common.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.common.env import make_team_env
+    from sb3_saf.common.errors import NonFiniteError
     from sb3_saf.common.evaluation import (
         EvaluationResult,
         RandomPolicy,
@@ -38,6 +39,7 @@ if _is_installed("stable_baselines3"):
         evaluate_policy,
         evaluate_team,
     )
+    from sb3_saf.common.finite import FiniteCallback
     from sb3_saf.common.monitor import TeamMonitor
     from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
@@ -73,6 +75,7 @@ __all__ = [
     "CheckpointError",
     "EvaluationResult",
     "ExportError",
+    "FiniteCallback",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -83,6 +86,7 @@ __all__ = [
     "MAPPOPolicy",
     "MLPEncoder",
     "NatureEncoder",
+    "NonFiniteError",
     "ObservationEncoder",
     "PaperCNN",
     "QPLEXLstmPolicy",
