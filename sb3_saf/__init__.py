@@ -22,7 +22,6 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
-    from hecogrid_envs.turns import TurnsInParallel
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
@@ -41,6 +40,7 @@ if _is_installed("stable_baselines3"):
     )
     from sb3_saf.common.finite import FiniteCallback
     from sb3_saf.common.monitor import TeamMonitor
+    from sb3_saf.common.turns import TurnsInParallel
     from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
     from sb3_saf.export.weights import load_weights
