@@ -49,8 +49,8 @@ class SuperSuitVecEnv(VecEnv):
 
     An exception in a game comes out of the bridge as it is, also from a worker process; afterwards call ``reset``.
 
-    :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it,
-        made with cloudpickle
+    :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it.
+        For worker processes it must be possible to pickle it with cloudpickle
     :param n_games: E, number of games
     :param seed: of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
@@ -75,7 +75,7 @@ class SuperSuitVecEnv(VecEnv):
     ):
         _check_count("n_games", n_games)
         _check_count("n_cpus", n_cpus)
-        blueprint = Blueprint.of(make_env, active, action_masks, state)
+        blueprint = Blueprint.of(make_env, active, action_masks, state, int(n_cpus))
         self.possible_agents = list(blueprint.agents)
         self.n_agents = len(self.possible_agents)
         self.n_games = int(n_games)
@@ -112,7 +112,9 @@ class SuperSuitVecEnv(VecEnv):
             seed = cast(int, np.random.SeedSequence().entropy)
         if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
             raise ValueError(f"seed must be an integer, 0 or larger, or None, got {seed!r}")
-        self._seeds = [game_seed for game_seed in game_seeds(int(seed), self.n_games) for _ in range(self.n_agents)]
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training.
+        self.seeded_with = tuple(game_seeds(int(seed), self.n_games))
+        self._seeds = [game_seed for game_seed in self.seeded_with for _ in range(self.n_agents)]
         return self._seeds
 
     def set_options(self, options: list[Info] | Info | None = None) -> None:

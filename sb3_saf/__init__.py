@@ -22,14 +22,16 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
+    from hecogrid_envs.turns import TurnsInParallel
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
     from sb3_saf.common.buffers import TeamRolloutBuffer
     from sb3_saf.common.callbacks import TeamEvalCallback
     from sb3_saf.common.centralized import CentralizedValueWrapper
-    from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
+    from sb3_saf.common.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.common.env import make_team_env
+    from sb3_saf.common.errors import NonFiniteError
     from sb3_saf.common.evaluation import (
         EvaluationResult,
         RandomPolicy,
@@ -37,6 +39,7 @@ if _is_installed("stable_baselines3"):
         evaluate_policy,
         evaluate_team,
     )
+    from sb3_saf.common.finite import FiniteCallback
     from sb3_saf.common.monitor import TeamMonitor
     from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
@@ -72,6 +75,7 @@ __all__ = [
     "CheckpointError",
     "EvaluationResult",
     "ExportError",
+    "FiniteCallback",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -81,6 +85,8 @@ __all__ = [
     "MAPPOMaskablePolicy",
     "MAPPOPolicy",
     "MLPEncoder",
+    "NatureEncoder",
+    "NonFiniteError",
     "ObservationEncoder",
     "PaperCNN",
     "QPLEXLstmPolicy",
@@ -95,6 +101,7 @@ __all__ = [
     "TeamMonitor",
     "TeamReplayBuffer",
     "TeamRolloutBuffer",
+    "TurnsInParallel",
     "confidence_interval",
     "evaluate_policy",
     "evaluate_team",
