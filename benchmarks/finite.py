@@ -33,7 +33,7 @@ def seconds(model: BaseAlgorithm, steps: int, look: bool) -> float:
 
 def main() -> None:
     """Measure and print."""
-    for algo, overrides, steps in (("saf", {"n_envs": 16}, 16 * 5 * 50), ("qplex", {}, 20_000)):
+    for algo, overrides, steps in (("saf", {"n_envs": 16}, 16 * 5 * 50), ("qplex", {"learning_starts": 200}, 20_000)):
         model = make(algo, **overrides)
         seconds(model, steps, look=False)
         ratios = []

@@ -40,14 +40,16 @@ class FiniteCallback(BaseCallback):
         super().__init__()
         self._handles: list[RemovableHandle] = []
         self._sums: dict[str, th.Tensor] = {}
+        self._weights: dict[str, th.Tensor] = {}
         self._checked_update = -1
 
     def _on_training_start(self) -> None:
         self._let_go()
         policy: Any = self.model.policy
-        for name, parameter in policy.named_parameters():
-            if parameter.requires_grad:
-                self._handles.append(parameter.register_post_accumulate_grad_hook(partial(self._note, name)))
+        learning = {name: weight for name, weight in policy.named_parameters() if weight.requires_grad}
+        for name, parameter in learning.items():
+            self._handles.append(parameter.register_post_accumulate_grad_hook(partial(self._note, name)))
+        self._weights = learning
         self._handles.append(policy.optimizer.register_step_pre_hook(self._check_gradients))
         self._handles.append(policy.optimizer.register_step_post_hook(self._check_weights))
 
@@ -79,11 +81,10 @@ class FiniteCallback(BaseCallback):
                 self._stop(f"the gradient of {name}", float(value), losses and f"; {losses}")
 
     def _check_weights(self, *_: object) -> None:
-        weights = dict(self.model.policy.named_parameters())
         with th.no_grad():
-            if math.isfinite(float(th.stack([weight.sum() for weight in weights.values()]).sum())):
+            if math.isfinite(float(th.stack([weight.sum() for weight in self._weights.values()]).sum())):
                 return
-            for name, weight in weights.items():
+            for name, weight in self._weights.items():
                 if not math.isfinite(value := float(weight.sum())):
                     self._stop(f"the weight {name}", value)
 
