@@ -140,7 +140,7 @@ def test_a_window_needs_a_display(
         (["--gif", "film.mp4"], "a file that ends with .gif"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--gif", "a.gif", "--text"], "not allowed with"),
-        (["--gif", "/dev/null/a.gif"], "Not a directory"),
+        (["--gif", "/dev/null/new/a.gif"], "Not a directory"),
     ],
 )
 def test_mistakes_in_enjoy_are_one_line(
@@ -270,7 +270,7 @@ def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Pat
         (["aggregate", "-o", "a.png"], "aggregates"),
         (["bars", "-o", "a.png"], "invalid choice"),
         (["curves"], "--output"),
-        (["curves", "--algos", "saf", "-o", "/dev/null/a.png"], "Not a directory"),
+        (["curves", "--algos", "saf", "-o", "/dev/null/new/a.png"], "Not a directory"),
     ],
 )
 def test_mistakes_in_plot_are_one_line(

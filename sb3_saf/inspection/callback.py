@@ -204,8 +204,7 @@ class InspectionCallback(BaseCallback):
             weights, agents = played.weights[counted], report.counted_agents(played)
             drawn["pool/by_agent"] = figures.chosen_by_agent(chosen_by(weights, agents, self.n_agents))
             table = differences(self.model.action_space, played.actions[counted])
-            difference = "share with other best actions" if played.of_team else "Hellinger distance"
-            drawn["pool/differences"] = figures.policy_differences(table, difference)
+            drawn["pool/differences"] = figures.policy_differences(table)
             if played.zones is not None:
                 drawn["pool/by_zone"] = self._by_zone(played)
         write, read = report.write_attention(played), report.read_attention(played)
