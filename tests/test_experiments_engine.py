@@ -104,6 +104,17 @@ def test_a_killed_driver_leaves_no_worker(driver: tuple[subprocess.Popen[str], i
     wait_until(lambda: not is_running(worker), seconds=20)
 
 
+def test_a_worker_has_control_c_blocked(driver: tuple[subprocess.Popen[str], int]) -> None:
+    process, worker = driver
+    status = Path(f"/proc/{worker}/status")
+    if not status.exists():
+        pytest.skip("no /proc")
+    mask = next(line for line in status.read_text().splitlines() if line.startswith("SigBlk:"))
+    process.kill()
+    process.communicate()
+    assert int(mask.split()[1], 16) >> (signal.SIGINT - 1) & 1
+
+
 def test_control_c_is_the_drivers_alone(driver: tuple[subprocess.Popen[str], int]) -> None:
     process, worker = driver
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to every process of the group
