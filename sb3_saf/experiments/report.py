@@ -39,13 +39,13 @@ def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Re
     """
     Draw and write what is there of an experiment, complete or not.
 
-    :param wanted: the seeds, methods and tasks to show; empty ones for all that were run
+    :param wanted: the seeds, methods, tasks and levels to show; empty ones for all that were run
     :raises ValueError: if nothing is finished
     """
     protocol = results.protocol()
     assert protocol is not None
-    asked = requested(experiment, results)
-    cells = [cell for cell in asked.cells if _is_wanted(cell, wanted)]
+    asked, shown = requested(experiment, results), experiment.at(wanted.levels)
+    cells = [cell for cell in asked.cells if _is_wanted(cell, wanted, shown)]
     finished = rows(results, cells)
     if not finished:
         raise ValueError(f"{results.folder} has no finished cell of {experiment.name!r} among those to be shown")
@@ -54,21 +54,23 @@ def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Re
     table = frame_of_tests(finished)
     curves = frame_of_curves(results, cells)
     figures = [
-        *_draw_views(experiment, table, folder),
-        *_draw_aggregates(experiment, table, folder),
-        *_draw_curves(experiment, curves, table, folder),
+        *_draw_views(shown, table, folder),
+        *_draw_aggregates(shown, table, folder),
+        *_draw_curves(shown, curves, table, folder),
     ]
     missing = [cell for cell in cells if results.missing_tests(cell)]
-    content = Content(experiment, protocol, results, cells, missing, asked.left_out, table, figures)
+    content = Content(shown, protocol, results, cells, missing, asked.left_out, table, figures)
     return Report(write_page(content, folder / "report.md"), figures, missing, len(cells))
 
 
-def _is_wanted(cell: Cell, wanted: Choice) -> bool:
+def _is_wanted(cell: Cell, wanted: Choice, shown: Experiment) -> bool:
     """Whether a cell is to be shown; the random team always is, on what is."""
+    levels = {level for train, tests in shown.settings for level in ((train,) if cell.is_trained else tests)}
     return (
         (not wanted.seeds or cell.seed in wanted.seeds)
         and (not wanted.tasks or cell.task in wanted.tasks)
         and (not wanted.methods or cell.method in wanted.methods or not cell.is_trained)
+        and cell.level in levels
     )
 
 
