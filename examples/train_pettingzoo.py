@@ -16,14 +16,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch as th
 from pettingzoo import ParallelEnv
-from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf import RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import RandomPolicy, TeamRolloutBuffer, TurnsInParallel, evaluate_team, make_team_env
 from sb3_saf.common.centralized import CentralizedValueWrapper
 from sb3_saf.common.evaluation import EvaluationResult
 
@@ -31,39 +29,11 @@ from sb3_saf.common.evaluation import EvaluationResult
 EVALUATION_SEED = 10_000
 
 
-class Turns(BaseParallelWrapper[Any, Any, Any]):
-    """
-    A turn-based game in parallel form: whoever has to wait may do action 0 only, which does nothing.
-
-    :param env: from ``turn_based_aec_to_parallel``, with observations of the form {"observation", "action_mask"}
-    """
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin a game."""
-        # The seeds of games have 63 bits, OpenSpiel's 31.
-        observations, infos = super().reset(None if seed is None else seed % 2**31, options)
-        return self._with_waiting(observations), infos
-
-    def step(self, actions: dict[Any, Any]) -> Any:
-        """Let the agent move whose turn it is."""
-        observations, *rest = super().step(actions)
-        return (self._with_waiting(observations), *rest)
-
-    def _with_waiting(self, observations: dict[Any, Any]) -> dict[Any, Any]:
-        for agent, observation in observations.items():
-            mask = np.asarray(observation["action_mask"])
-            if not mask.any():
-                wait = (np.arange(len(mask)) == 0).astype(mask.dtype)
-                observations[agent] = {**observation, "action_mask": wait}
-        return observations
-
-
 def hanabi(**params: Any) -> ParallelEnv[Any, Any, Any]:
     """Hanabi, whose players take turns, in parallel form."""
     from pettingzoo.classic import hanabi_v5
-    from pettingzoo.utils.conversions import turn_based_aec_to_parallel
 
-    return Turns(turn_based_aec_to_parallel(hanabi_v5.env(**params)))
+    return TurnsInParallel(hanabi_v5.env(**params))
 
 
 def padded(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,21 +10,25 @@ import numpy.typing as npt
 
 from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain, TreasureState
 from hecogrid_envs.core import announce_compilation
-from hecogrid_envs.core.batch_step import reset_games, step_games
+from hecogrid_envs.core.batch_step import reset_games
 from hecogrid_envs.core.generation import clear, draw_level
 from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
+from hecogrid_envs.core.sharing import PICTURES, STEP, TILES, Pictures
 from hecogrid_envs.core.types import Games, RuleBook
-from hecogrid_envs.core.view import draw_pictures, observe_tiles
 from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, TASK_NAMES, HECOGridParams, TaskName, check_task
 from hecogrid_envs.seeding import fresh_seed, generator_word
 from hecogrid_envs.state import StateMapping, check_state
+from hecogrid_envs.threads import Shares
 from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
 
 U8 = npt.NDArray[np.uint8]
 
 #: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
 _SLACK: Final = 64
+
+#: Views of so many columns are lit by a table.
+_TABLED_COLUMNS: Final = 8
 
 
 class GameBatch:
@@ -36,7 +38,7 @@ class GameBatch:
     :param task: ``"TeamTogether"``, ``"TeamSupport"`` or ``"KeyForTreasure"``
     :param params: parameters of all games
     :param n_games: E
-    :param n_threads: threads that share the games; results do not depend on it
+    :param n_threads: threads that share steps and views, the calling one included; results do not depend on it
     :raises ValueError: for an unknown task or objects that do not fit on the map
     """
 
@@ -48,18 +50,35 @@ class GameBatch:
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)
         atlases = turned_atlases(self.task, params.rules, params.view_tile_size)
-        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(_SLACK, dtype=np.uint8)])
-        self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
         self._book = _rule_book(self.task, params)
         self._games = _empty_games(self._book, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
-        n, v = params.n_agents, params.view_size
+        n, v, pixels = params.n_agents, params.view_size, params.view_pixels
+        tiles = params.observation == "tiles"
+        self._observe_task = TILES if tiles else PICTURES
+        self._view_shape = (n, v, v) if tiles else (n, pixels, pixels, 3)
         self._codes = np.zeros((self.n_games, n, v, v), dtype=np.uint8)
-        self._threads: ThreadPoolExecutor | None = None
+        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(_SLACK, dtype=np.uint8)])
+        self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
+        self._shares = self._new_shares()
+
+    def _new_shares(self) -> Shares:
+        pictures = Pictures(
+            codes=self._codes.reshape(-1),
+            facing=self._games.direction.reshape(-1),
+            atlas=self._atlas,
+            turn_bytes=self._turn_bytes,
+            tile=self.params.view_tile_size,
+        )
+        return Shares(self._games, self._book, pictures, self.n_threads)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Threads stay with the process; a copy makes its own.
-        return {**self.__dict__, "_threads": None}
+        # Threads and compiled code stay with the process; a copy makes its own.
+        return {name: value for name, value in self.__dict__.items() if name != "_shares"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._shares = self._new_shares()
 
     def reset(self, which: npt.NDArray[np.bool_] | None = None, seeds: Sequence[int | None] | None = None) -> None:
         """
@@ -71,7 +90,7 @@ class GameBatch:
         chosen = np.ones(self.n_games, dtype=bool) if which is None else np.asarray(which, dtype=bool)
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
-        self._run(reset_games, chosen.astype(np.uint8))
+        reset_games(self._games, self._book, chosen.astype(np.uint8), 0, self.n_games)
 
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:
@@ -87,25 +106,24 @@ class GameBatch:
 
         :param actions: (E, N) integers from 0 to 6
         """
-        self._run(step_games, np.ascontiguousarray(actions, dtype=np.uint8))
+        chosen = np.ascontiguousarray(actions, dtype=np.uint8)
+        if chosen.shape != self._games.x.shape:
+            raise ValueError(f"actions must have shape {self._games.x.shape}, (games, agents), got {chosen.shape}")
+        self._shares.play(STEP, chosen.reshape(-1))
 
     def observe(self, out: U8 | None = None) -> U8:
         """
         Views of all agents.
 
-        :param out: array to write to; a new one by default
+        :param out: contiguous array to write to; a new one by default
         :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
         """
-        params = self.params
-        tiles = params.observation == "tiles"
+        shape = (self.n_games, *self._view_shape)
         if out is None:
-            side, depth = (params.view_size, ()) if tiles else (params.view_pixels, (3,))
-            out = np.empty((self.n_games, params.n_agents, side, side, *depth), dtype=np.uint8)
-        codes = out if tiles else self._codes
-        self._run(observe_tiles, codes.reshape(-1))
-        if not tiles:
-            n, facing = params.n_agents, self._games.direction.reshape(-1)
-            self._share(lambda first, last: self._draw(codes, facing, out, first * n, last * n))
+            out = np.empty(shape, dtype=np.uint8)
+        elif out.shape != shape or out.dtype != np.uint8 or not out.flags.c_contiguous:
+            raise ValueError(f"out must be a contiguous uint8 array of shape {shape}, got {out.dtype} {out.shape}")
+        self._shares.play(self._observe_task, out.reshape(-1))
         return out
 
     def observe_game(self, game: int) -> U8:
@@ -114,36 +132,12 @@ class GameBatch:
 
         :return: as :meth:`observe` without its first axis
         """
-        observe_tiles(self._games, self._book, self._codes.reshape(-1), game, game + 1)
-        codes = self._codes[game]
-        if self.params.observation == "tiles":
-            return codes.copy()
-        side = self.params.view_pixels
-        out = np.empty((self.params.n_agents, side, side, 3), dtype=np.uint8)
-        self._draw(codes, self._games.direction[game], out, 0, self.params.n_agents)
+        self._shares.play_game(TILES, self._codes.reshape(-1), game)
+        if self._observe_task == TILES:
+            return self._codes[game].copy()
+        out = np.empty(self._view_shape, dtype=np.uint8)
+        self._shares.draw(self._codes[game].reshape(-1), self._games.direction[game], out.reshape(-1))
         return out
-
-    def _draw(self, codes: U8, facing: U8, out: U8, first: int, last: int) -> None:
-        size, tile = self.params.view_size, self.params.view_tile_size
-        draw_pictures(
-            codes.reshape(-1), facing, self._atlas, self._turn_bytes, size, tile, out.reshape(-1), first, last
-        )
-
-    def _run(self, kernel: Callable[..., None], array: U8) -> None:
-        self._share(lambda first, last: kernel(self._games, self._book, array, first, last))
-
-    def _share(self, work: Callable[[int, int], None]) -> None:
-        if self.n_threads == 1:
-            work(0, self.n_games)
-            return
-        edges = np.linspace(0, self.n_games, self.n_threads + 1).astype(int).tolist()
-        if self._threads is None:
-            self._threads = ThreadPoolExecutor(self.n_threads - 1, thread_name_prefix="hecogrid")
-        *others, own = pairwise(edges)
-        pending = [self._threads.submit(work, first, last) for first, last in others]
-        work(*own)  # the calling thread takes a share, too: handing work over costs as much as stepping a dozen games
-        for done in pending:
-            done.result()
 
     @property
     def rewards(self) -> npt.NDArray[np.float64]:
@@ -248,7 +242,7 @@ class GameBatch:
 
         :return: (N, W, H)
         """
-        observe_tiles(self._games, self._book, self._codes.reshape(-1), game, game + 1)
+        self._shares.play_game(TILES, self._codes.reshape(-1), game)
         state = self.get_state(game)
         return seen_cells(
             self._codes[game] != INVISIBLE,
@@ -299,8 +293,21 @@ def _rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
         blank_planes=np.zeros(0, dtype=np.uint8),
         blank_bits=np.zeros(0, dtype=np.uint8),
         spread=np.array(spread, dtype=np.uint64),
+        swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
     )
     return _with_blank_map(book)
+
+
+def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
+    """The table that :class:`~hecogrid_envs.core.types.RuleBook` calls ``swept``."""
+    cells, own = 1 << size, size // 2
+    clear, seen = np.divmod(np.arange(cells * cells), cells)
+    following = np.zeros_like(seen)
+    for column, towards in [(i, i + 1) for i in range(own, size)] + [(i, i - 1) for i in range(own + 1, 0, -1)]:
+        lights = (seen & clear) >> column & 1
+        seen |= lights << towards
+        following |= lights << column | lights << towards
+    return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
 
 
 def _with_blank_map(book: RuleBook) -> RuleBook:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
-import cloudpickle
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
+from hecogrid_envs import supersuit_calls
+from hecogrid_envs.supersuit_copies import LocalOriginal, Original, original_of
 from hecogrid_envs.supersuit_signals import AskMasks, Signals, find_signals
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
@@ -27,8 +27,7 @@ class Blueprint:
     """
     What it takes to build a game anywhere, and what is known of it before it is built.
 
-    :param parcel: the environment, or the function that makes it, pickled
-    :param is_factory: whether the parcel holds the function
+    :param original: the environment, or the function that makes it
     :param agents: N names, in the order of the rows
     :param observation_space: of every agent
     :param action_space: of every agent
@@ -37,8 +36,7 @@ class Blueprint:
     :param signals: what rows show beside observations
     """
 
-    parcel: bytes
-    is_factory: bool
+    original: Original | LocalOriginal
     agents: tuple[Any, ...]
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
@@ -53,7 +51,12 @@ class Blueprint:
 
     @classmethod
     def of(
-        cls, make_env: MakeEnv, active: bool = False, action_masks: AskMasks | None = None, state: bool = False
+        cls,
+        make_env: MakeEnv,
+        active: bool = False,
+        action_masks: AskMasks | None = None,
+        state: bool = False,
+        n_cpus: int = 1,
     ) -> Blueprint:
         """
         Draw the blueprint of an environment.
@@ -62,6 +65,7 @@ class Blueprint:
         :param active: whether rows tell who is active
         :param action_masks: whether rows show action masks; None for observations as they are, masks and all
         :param state: whether rows show the game's state
+        :param n_cpus: number of processes in which games will be built
         :raises ValueError: if it is no ParallelEnv, cannot be copied, or its agents differ in their spaces
         """
         is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
@@ -69,18 +73,17 @@ class Blueprint:
         _check_is_parallel(example, is_factory)
         try:
             agents = tuple(example.possible_agents)
-            parcel = _pickled(make_env, is_factory)
+            original = original_of(make_env, is_factory, n_cpus)
             observation_space = _checked_space("observation", agents, example.observation_space)
             action_space = _checked_space("action", agents, example.action_space)
             signals = Signals(observation_space, observation_space)
             if active or action_masks is not None or state:
-                first_infos = partial(_first_infos, parcel, is_factory)
+                first_infos = partial(_first_infos, original)
                 signals = find_signals(
                     example, observation_space, action_space, active, action_masks, state, first_infos
                 )
             return cls(
-                parcel,
-                is_factory,
+                original,
                 agents,
                 observation_space,
                 action_space,
@@ -96,21 +99,15 @@ class Blueprint:
 
     def build(self) -> AnyParallelEnv:
         """Build a game."""
-        return _build(self.parcel, self.is_factory)
+        env: AnyParallelEnv = self.original.build()
+        return env
 
 
-def _build(parcel: bytes, is_factory: bool) -> AnyParallelEnv:
-    content = pickle.loads(parcel)
-    env: AnyParallelEnv = content() if is_factory else content
-    return env
-
-
-def _first_infos(parcel: bytes, is_factory: bool) -> Mapping[Any, dict[str, Any]]:
+def _first_infos(original: Original | LocalOriginal) -> Mapping[Any, dict[str, Any]]:
     """Infos of a reset, of a copy that is closed again."""
-    env = _build(parcel, is_factory)
+    env = original.build()
     try:
-        infos: Mapping[Any, dict[str, Any]] = env.reset(seed=0)[1]
-        return infos
+        return supersuit_calls.reset(env, seed=0, options=None)[1]
     finally:
         env.close()
 
@@ -121,7 +118,7 @@ def _check_is_parallel(env: Any, is_factory: bool) -> None:
         raise ValueError(
             f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
             "convert it with pettingzoo.utils.conversions.aec_to_parallel, or, where agents take turns, with "
-            "turn_based_aec_to_parallel"
+            "hecogrid_envs.turns.TurnsInParallel (which is sb3_saf.TurnsInParallel)"
         )
     if not isinstance(env, ParallelEnv):
         hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""
@@ -135,6 +132,11 @@ def _check_is_parallel(env: Any, is_factory: bool) -> None:
 
 def _checked_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], spaces.Space[Any]]) -> spaces.Space[Any]:
     """The one space of all agents."""
+    if not callable(space_of):
+        raise ValueError(
+            f"expected {kind}_space(agent) to be a method that gives an agent's space, got {type(space_of).__name__}; "
+            f"write it as: def {kind}_space(self, agent): return self.{kind}_spaces[agent]"
+        )
     space_by_agent = {agent: space_of(agent) for agent in agents}
     first = space_by_agent[agents[0]]
     others = [f"{agent} has {space}" for agent, space in space_by_agent.items() if space != first]
@@ -160,32 +162,6 @@ def _leaves(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
     if isinstance(space, spaces.Tuple):
         return [leaf for part in space.spaces for leaf in _leaves(part)]
     return [space]
-
-
-def dumps(content: Any) -> bytes:
-    """
-    Pickle, also what only cloudpickle can.
-
-    :param content: anything; what is defined in an importable module stays what it is on the other side
-    """
-    try:
-        return pickle.dumps(content)
-    except Exception:  # pickle, and the objects it asks, have many ways to decline
-        return bytes(cloudpickle.dumps(content))
-
-
-def _pickled(make_env: MakeEnv, is_factory: bool) -> bytes:
-    try:
-        return dumps(make_env)
-    except Exception as error:
-        advice = (
-            "it holds something that cannot be pickled, let it create that itself"
-            if is_factory
-            else "pass a function that makes the environment instead"
-        )
-        raise ValueError(
-            f"each game needs its own copy of {make_env}, but pickling it failed ({error}); {advice}"
-        ) from error
 
 
 def blank(space: spaces.Space[Any]) -> Any:

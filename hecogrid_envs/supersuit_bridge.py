@@ -49,8 +49,8 @@ class SuperSuitVecEnv(VecEnv):
 
     An exception in a game comes out of the bridge as it is, also from a worker process; afterwards call ``reset``.
 
-    :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it,
-        made with cloudpickle
+    :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it.
+        For worker processes it must be possible to pickle it with cloudpickle
     :param n_games: E, number of games
     :param seed: of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
@@ -75,7 +75,7 @@ class SuperSuitVecEnv(VecEnv):
     ):
         _check_count("n_games", n_games)
         _check_count("n_cpus", n_cpus)
-        blueprint = Blueprint.of(make_env, active, action_masks, state)
+        blueprint = Blueprint.of(make_env, active, action_masks, state, int(n_cpus))
         self.possible_agents = list(blueprint.agents)
         self.n_agents = len(self.possible_agents)
         self.n_games = int(n_games)

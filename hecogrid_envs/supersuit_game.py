@@ -13,7 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from hecogrid_envs.supersuit_blueprint import AnyParallelEnv, Blueprint, blank, dumps, fitted
+from hecogrid_envs import supersuit_calls
+from hecogrid_envs.supersuit_blueprint import AnyParallelEnv, Blueprint, blank, fitted
+from hecogrid_envs.supersuit_copies import dumps
 
 #: Key of the letters, in the options of a reset on its way down.
 LETTERS = "supersuit_bridge/letters"
@@ -159,7 +161,9 @@ class Game(ParallelEnv[Any, Any, Any]):
 
     def _step(self, actions: dict[Any, Any]) -> Any:
         acted = self._playing
-        observations, rewards, terminations, truncations, infos = self.env.step({a: actions[a] for a in acted})
+        observations, rewards, terminations, truncations, infos = supersuit_calls.step(
+            self.env, {a: actions[a] for a in acted}
+        )
         ended = {a for a in acted if terminations.get(a, False) or truncations.get(a, False)}
         self._ended |= ended
         self._playing = self._alive()
@@ -236,7 +240,7 @@ class Game(ParallelEnv[Any, Any, Any]):
         :param options: for the game's reset
         :return: reset infos of the N agents
         """
-        observations, infos = self.env.reset(seed=seed, options=options)
+        observations, infos = supersuit_calls.reset(self.env, seed, options)
         self._ended.clear()
         self._playing = self._alive()
         self._show(observations, infos, self._playing, active=self._playing)

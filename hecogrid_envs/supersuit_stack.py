@@ -18,7 +18,8 @@ import supersuit
 from supersuit.vector import ProcConcatVec
 from supersuit.vector.multiproc_vec import decompress_info, numpy_deepcopy
 
-from hecogrid_envs.supersuit_blueprint import Blueprint, dumps
+from hecogrid_envs.supersuit_blueprint import Blueprint
+from hecogrid_envs.supersuit_copies import dumps
 from hecogrid_envs.supersuit_game import LETTERS, Failure, Game, Info, Letter
 
 #: Seconds that worker processes get to close their games before they are killed.

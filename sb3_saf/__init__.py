@@ -22,13 +22,14 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
+    from hecogrid_envs.turns import TurnsInParallel
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
     from sb3_saf.common.buffers import TeamRolloutBuffer
     from sb3_saf.common.callbacks import TeamEvalCallback
     from sb3_saf.common.centralized import CentralizedValueWrapper
-    from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
+    from sb3_saf.common.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.common.env import make_team_env
     from sb3_saf.common.evaluation import (
         EvaluationResult,
@@ -83,6 +84,7 @@ __all__ = [
     "MAPPOMaskablePolicy",
     "MAPPOPolicy",
     "MLPEncoder",
+    "NatureEncoder",
     "ObservationEncoder",
     "PaperCNN",
     "QPLEXLstmPolicy",
@@ -97,6 +99,7 @@ __all__ = [
     "TeamMonitor",
     "TeamReplayBuffer",
     "TeamRolloutBuffer",
+    "TurnsInParallel",
     "confidence_interval",
     "evaluate_policy",
     "evaluate_team",

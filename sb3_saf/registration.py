@@ -11,6 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.common.game_steps import log_game_steps
+from sb3_saf.common.stock_policies import warn_of_stock_policies
 from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
 from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
 from sb3_saf.ippo.policies import IPPOPolicy
@@ -54,8 +55,12 @@ def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]
 
 
 def register_all() -> None:
-    """Register every policy, and log game steps beside SB3's rows; done when ``sb3_saf`` is imported."""
+    """
+    Register every policy, log game steps beside SB3's rows, and warn of SB3's own policies on teams; done when
+    ``sb3_saf`` is imported.
+    """
     for algorithm, policies in POLICIES.items():
         log_game_steps(algorithm)
+        warn_of_stock_policies(algorithm)
         for name, policy in policies.items():
             register(algorithm, name, policy)

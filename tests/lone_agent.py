@@ -1,8 +1,8 @@
 """
 One agent in a process of its own: ``python lone_agent.py FOLDER RUNTIME AGENT``.
 
-Reads own observations from standard input, answers with actions and probabilities. What training needs cannot be
-imported here, as if it were not installed.
+Reads own observations from standard input, with masks of actions and starts of episodes where there are any, answers
+with actions and probabilities. What training needs cannot be imported here, as if it were not installed.
 """
 
 from __future__ import annotations
@@ -41,10 +41,15 @@ def main(folder: str, runtime: str, agent: str) -> None:
 
     assert runtime in ("torch", "onnx")
     actor = sb3_saf.Actor.load(folder, agent=int(agent), runtime="onnx" if runtime == "onnx" else "torch")
+    memory = None
     for line in sys.stdin:
         question = json.loads(line)
         observation = np.array(question["observation"], dtype=question["dtype"])
-        action, probabilities = actor.act(observation), actor.probabilities(observation)
+        mask = question.get("action_mask")
+        if actor.has_memory and question.get("start"):
+            memory = actor.new_memory()
+        probabilities = actor.probabilities(observation, action_mask=mask, memory=memory)
+        action = actor.act(observation, action_mask=mask, memory=memory)
         loaded = sorted(absent & set(sys.modules))
         print(
             json.dumps({"action": int(action), "probabilities": probabilities.tolist(), "loaded": loaded}), flush=True

@@ -9,10 +9,10 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
-from sb3_saf import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
+from sb3_saf import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.common.encoders import PixelInput
 from tests.toy_teams import PICTURE, CodeSpace, samples
 
@@ -47,6 +47,54 @@ def test_paper_cnn_has_the_papers_size() -> None:
 def test_paper_cnn_infers_sizes(shape: tuple[int, ...]) -> None:
     space = spaces.Box(0, 255, shape, np.uint8)
     assert PaperCNN(space, features_dim=7)(th.tensor(samples(space, 3))).shape == (3, 7)
+
+
+def n_weights(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected", "count"),
+    [
+        ((3, 64, 64), PaperCNN, 7_426_208),
+        ((3, 65, 64), NatureEncoder, 141_536),
+        ((84, 84, 3), NatureEncoder, 276_704),
+        ((3, 30, 200), PaperCNN, 9_687_200),
+    ],
+)
+def test_larger_pictures_get_the_smaller_encoder(shape: tuple[int, ...], expected: type, count: int) -> None:
+    space = spaces.Box(0, 255, shape, np.uint8)
+    encoder = ObservationEncoder(space)
+    assert type(encoder.encoder) is expected
+    assert n_weights(encoder) == count
+    assert encoder(th.tensor(samples(space, 2))).shape == (2, 64)
+
+
+def test_nature_encoder_is_sb3s_on_either_layout() -> None:
+    first, last = (spaces.Box(0, 255, shape, np.uint8) for shape in ((3, 40, 50), (40, 50, 3)))
+    of_first, of_last, stock = NatureEncoder(first), NatureEncoder(last), NatureCNN(first, 64)
+    of_last.load_state_dict(of_first.state_dict())
+    stock.load_state_dict(of_first.nature.state_dict())
+    pictures = th.tensor(samples(first, 3))
+    th.testing.assert_close(of_first(pictures), stock(pictures.float() / 255.0), rtol=0, atol=1e-6)
+    th.testing.assert_close(of_last(pictures.permute(0, 2, 3, 1)), of_first(pictures), rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match=r"NatureEncoder needs pictures of at least 36 x 36 pixels, got 35 x 50; use"):
+        NatureEncoder(spaces.Box(0, 255, (3, 35, 50), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        (
+            (280, 480, 3),
+            r"Box\(0, 255, .* have 280 x 480 pixels, for which NatureEncoder has 7,186,656 weights",
+        ),
+        ((3, 30, 400), r"have 30 x 400 pixels, for which PaperCNN has 19,\d+,\d+ weights"),
+    ],
+)
+def test_huge_pictures_are_warned_of_with_what_to_do(shape: tuple[int, ...], words: str) -> None:
+    with pytest.warns(UserWarning, match=rf"{words} .*supersuit.resize_v1.*features_extractor_class.*LightEncoder"):
+        ObservationEncoder(spaces.Box(0, 255, shape, np.uint8))
 
 
 @pytest.mark.parametrize("shape", [(3, 7, 7), (3, 28, 7), (5, 5, 3)])

@@ -118,6 +118,6 @@ def test_a_worker_has_control_c_blocked(driver: tuple[subprocess.Popen[str], int
 def test_control_c_is_the_drivers_alone(driver: tuple[subprocess.Popen[str], int]) -> None:
     process, worker = driver
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to every process of the group
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=240)
     assert (out, err, process.returncode) == ("interrupted\n", "", 0)
     assert not is_running(worker)

@@ -12,14 +12,20 @@ import pytest
 from scipy import stats
 
 from sb3_saf.experiments import cli
+from sb3_saf.experiments.cells import Protocol
 from sb3_saf.experiments.comparisons import compare
 from sb3_saf.experiments.definitions import EXPERIMENTS
 from sb3_saf.experiments.frames import read_results
+from sb3_saf.experiments.options import protocol_of
+from sb3_saf.experiments.page import _protocol_words
+from sb3_saf.experiments.page_tables import losses
 from sb3_saf.experiments.selection import complete
-from sb3_saf.zoo.statistics import Estimate
+from sb3_saf.zoo.statistics import Estimate, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
 
 pytest.importorskip("rliable")
+#: Seconds, of a busy machine too: the first test waits for 72 cells.
+pytestmark = pytest.mark.timeout(900)
 LEVELS = [f"{task}-c{c}-h1" for task in ("TeamTogether", "TeamSupport", "KeyForTreasure") for c in (1, 2, 3)]
 
 
@@ -59,6 +65,37 @@ def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> 
     every = np.sort(table[table.method == "mappo"].score)
     # Of 18 scores, the middle half: four and a half from each end are left out, rounded as scipy does.
     assert f"{stats.trim_mean(every, 0.25):.3f} [" in page.split("## Aggregates")[1].split("## ")[0]
+
+
+def test_losses_are_shares_of_the_first_level(page: str) -> None:
+    rows = [
+        (method, seed, c, 4.0 - c if method == "saf" else 0.0)
+        for method in ("saf", "ippo")
+        for seed in (0, 1)
+        for c in (1, 2, 3)
+    ]
+    table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "return_mean"])
+    table["return_mean"] += table["seed"] * (table["coordination"] == 1) * (table["method"] == "saf")
+    table = table.assign(task="TeamSupport", heterogeneity=1, train_heterogeneity=1)
+    table["train_coordination"] = table["coordination"]
+    text = losses(table, EXPERIMENTS["coordination"].views[0])
+    # Seed 0 has 3, 2, 1 treasures, seed 1 has 4, 2, 1.
+    second, third = (mean_over_seeds([100 * (1 - each / 3), 100 * (1 - each / 4)]) for each in (2, 1))
+    cells = " | ".join(f"{e.value:.0f} [{e.low:.0f}, {e.high:.0f}]" for e in (second, third))
+    assert text.splitlines()[-2:] == [f"| TeamSupport | saf | {cells} |", "| TeamSupport | ippo | – | – |"]
+    assert "## Loss by coordination" in page
+    assert losses(table, EXPERIMENTS["ood-coordination"].views[0]) == ""
+
+
+def test_options_of_the_page_are_read_as_they_were() -> None:
+    overrides = {
+        "env_kwargs": {"observation": "rgb"},
+        "clip_range_vf": None,
+        "policy_kwargs": {"n_slots": 3},
+        "n_epochs": 1,
+    }
+    options = cli._parser().parse_args(["run", "joint", *_protocol_words(Protocol("smoke", overrides, 8, True))])
+    assert protocol_of(options) == Protocol("smoke", overrides, 8, True)
 
 
 def test_two_seeds_name_no_winner(page: str) -> None:

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_saf.experiments import cli
 from sb3_saf.experiments import run as run_module
 from sb3_saf.experiments.cells import Cell, Choice, Protocol, Shard
 from sb3_saf.experiments.definitions import Level, find_experiment
-from sb3_saf.experiments.files import differences
+from sb3_saf.experiments.files import differences, unpack
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine, Summary, run
 from sb3_saf.experiments.table import Row
@@ -158,6 +159,31 @@ def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> No
     assert both == alone
     assert [row["coordination"] for row in both if row["method"] == "ippo"] == ["1", "2", "3"]
     assert {row["train_coordination"] for row in both if row["method"] == "ippo"} == {"2"}
+
+
+def test_a_loaded_model_of_qplex_does_not_explore(tmp_path: Path) -> None:
+    """A fresh QPLEX would take random actions only."""
+    choice, short = Choice((0,), ("qplex",), ("TeamSupport",)), replace(SMOKE, overrides={"game_steps": 40})
+    run_inline(tmp_path / "both", choice, "coordination", short)
+    _, works = run_inline(tmp_path / "both", choice, "ood-coordination", short)
+    assert [work.model is not None for work in works] == [True]
+    run_inline(tmp_path / "alone", choice, "ood-coordination", short)
+    both, alone = (read_table(tmp_path / name / "ood-coordination" / "table.csv") for name in ("both", "alone"))
+    assert both == alone
+
+
+def test_tensorboard_of_a_cell_has_the_inside_of_its_policy(tmp_path: Path) -> None:
+    cell = Cell("ippo", "TeamSupport", Level(1, 1), 0, (Level(1, 1),))
+    archives = [
+        do(Work(cell, replace(SMOKE, overrides={"game_steps": 40}), cell.tests, tensorboard=on, scratch=str(tmp_path)))
+        for on in (True, False)
+    ]
+    for name, archive in zip(("with", "without"), archives, strict=True):
+        unpack(archive, tmp_path / name)
+    (file,) = (tmp_path / "with").rglob("events.*")
+    assert "critic/explained_variance" in EventAccumulator(str(file)).Reload().Tags()["scalars"]
+    theirs, ours = (PPO.load(tmp_path / name / "model.zip").policy.state_dict() for name in ("with", "without"))
+    assert all(th.equal(theirs[name], ours[name]) for name in ours)
 
 
 def _train_badly(work: Work) -> bytes:

@@ -178,8 +178,9 @@ class TestPage:
 
     def test_layout_and_hyperparameters(self, page: EventAccumulator) -> None:
         layout = page.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0].decode(errors="replace")
-        for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1"):
+        for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1", "share of"):
             assert name in layout
+        assert "Mixer" not in layout
         told = page.PluginTagToContent("hparams")
         for word in (b"TeamSupport", b"n_policies", b"learning_rate"):
             assert word in told["_hparams_/session_start_info"]
@@ -499,7 +500,7 @@ def test_environments_that_do_not_fit() -> None:
 
 def test_policies_of_others_are_refused() -> None:
     model = PPO("MultiInputPolicy", ToyTeams(), n_steps=5, batch_size=60, device="cpu")
-    with pytest.raises(ValueError, match=r"expected a policy of sb3_saf such as .*, got MultiInputActorCriticPolicy"):
+    with pytest.raises(ValueError, match=r"expected a policy of sb3_saf such as .*, got MultiInputActorCritic"):
         model.learn(60, callback=InspectionCallback(ToyTeams()))
 
 

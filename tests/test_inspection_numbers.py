@@ -30,6 +30,7 @@ def played(**changes: Any) -> Played:
     """Two agents of one game, one episode of three steps."""
     usual = Played(
         n_agents=2,
+        of_team=False,
         counted=np.ones((3, 2), dtype=bool),
         rewards=np.array([[1, 0], [2, 0], [4, 8]], dtype=np.float32),
         ends=np.array([[False] * 2, [False] * 2, [True] * 2]),

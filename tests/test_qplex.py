@@ -372,10 +372,26 @@ def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], onnx:
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="hidden state"):
+    with pytest.raises(ExportError, match=r"its memory reads the agent's last action, too; act with model\.predict"):
         export_actors(make_model(policy="QPLEXLstmPolicy"), tmp_path / "actor", onnx=False)
-    with pytest.raises(ExportError, match="masks"):
-        export_actors(make_model(telling_env()), tmp_path / "actor", onnx=False)
+
+
+def test_exported_actors_keep_to_masks(tmp_path: Path) -> None:
+    model = make_model(telling_env())
+    with th.no_grad():
+        for parameter in model.policy.actor.parameters():
+            parameter.add_(th.randn_like(parameter))
+    actor = Actor.load(export_actors(model, tmp_path / "actor", onnx=False))
+    rng = np.random.default_rng(0)
+    own = model.get_env().reset()["obs"]  # type: ignore[union-attr, call-overload]
+    chosen = set()
+    for _ in range(20):
+        masks = (rng.random((len(own), model.action_space.n)) < 0.5).astype(np.int8)
+        masks[np.arange(len(own)), rng.integers(masks.shape[1], size=len(own))] = 1
+        expected = model.predict({"obs": own, "action_mask": masks}, deterministic=True)[0]
+        np.testing.assert_array_equal(actor.act(own, action_mask=masks), expected)
+        chosen |= set(expected.tolist())
+    assert len(chosen) > 2
 
 
 def test_acting_reads_nothing_but_own_observations() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import multiprocessing
 import os
@@ -749,13 +750,32 @@ def test_toy_games_are_proper(env: CounterEnv) -> None:
         (dict, "got a function that returned an object of type dict"),
         ("counter", "got an object of type str"),
         (UnpicklableEnv(), "pass a function that makes the environment instead"),
-        (LockedFactory(), "it holds something that cannot be pickled, let it create that"),
         (toy_envs.same_env_again, "got one that returned the same object for 3 games"),
     ],
 )  # fmt: skip
 def test_wrong_environment(bridge: Bridge, make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         bridge(make, n_games=3)
+
+
+def test_what_cannot_be_pickled_stays_in_this_process(bridge: Bridge) -> None:
+    """Caches on methods cannot be pickled, and neither can a class in a function that has one."""
+
+    class CachedEnv(CounterEnv):
+        @functools.lru_cache  # noqa: B019 - as PettingZoo's own tutorial writes it
+        def observation_space(self, agent: str) -> spaces.Space[Any]:
+            return super().observation_space(agent)
+
+    for make in (LockedFactory(), CachedEnv, lambda: CachedEnv(), CachedEnv()):
+        venv = bridge(make, n_games=3, seed=0)
+        draws = np.asarray(venv.reset())[::2, 2]
+        assert len(set(draws.tolist())) == 3, "each game has its own generator"
+        assert venv.step(zeros(venv))[1].tolist() == [10, 11] * 3
+        venv.close()
+        with pytest.raises(
+            ValueError, match=r"n_cpus=2 sends .* to worker processes, but pickling it failed .* or use n_cpus=1"
+        ):
+            bridge(make, n_games=2, n_cpus=2)
 
 
 def test_module_instead_of_environment(bridge: Bridge) -> None:

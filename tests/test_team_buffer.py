@@ -280,7 +280,16 @@ def test_a_wrong_view_of_any_one_row_is_found_within_n_steps(agent: int) -> None
 
 
 @pytest.mark.parametrize(
-    ("batch_size", "choices"), [(64, "63 or 66"), (1, "3"), (2, "3"), (5, "3 or 6"), (0, "3"), (-3, "3")]
+    ("batch_size", "choices"),
+    [
+        (59, "57 or 60"),
+        (64, r"60, the whole rollout \(n_steps=5 x 4 games x 3\)"),
+        (1, "3"),
+        (2, "3"),
+        (5, "3 or 6"),
+        (0, "3"),
+        (-3, "3"),
+    ],
 )
 def test_batch_size_must_be_whole_teams(batch_size: int, choices: str) -> None:
     team, _ = make_both("vector")
@@ -350,6 +359,12 @@ def test_observations_normalised_above_the_wrapper_are_refused() -> None:
     with pytest.raises(ValueError, match="change or normalise observations below CentralizedValueWrapper"):
         model.learn(60)
     make_model(env=CentralizedValueWrapper(VecNormalize(make_env().venv))).learn(60)
+
+
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of 5000")
+def test_a_batch_larger_than_the_rollout_is_the_rollout() -> None:
+    with pytest.raises(ValueError, match=r"use batch_size=60, the whole rollout \(n_steps=5 x 4 games x 3\)"):
+        make_model(batch_size=5000).learn(60)
 
 
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of 64")

@@ -9,8 +9,11 @@ from matplotlib.colors import to_hex
 
 pytest.importorskip("rliable")
 
+from rliable import metrics
+
 from sb3_saf import confidence_interval
-from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels, method_colours
+from sb3_saf.zoo.algorithms import ALGOS
+from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels, method_styles
 from sb3_saf.zoo.statistics import (
     interquartile_means,
     learning_curve,
@@ -62,7 +65,7 @@ def test_curves_are_drawn_where_they_are() -> None:
     assert list(lines) == ["saf (2 seeds)", "mappo (1 seed)"]
     assert np.array_equal(lines["saf (2 seeds)"].get_xdata(), [100, 200, 300])
     assert np.array_equal(lines["saf (2 seeds)"].get_ydata(), [2, 3, 5.5])
-    assert to_hex(str(lines["mappo (1 seed)"].get_color())) == method_colours(["mappo"])["mappo"].lower()
+    assert to_hex(str(lines["mappo (1 seed)"].get_color())) == method_styles(["mappo"])["mappo"].colour.lower()
     assert (axes.get_xlabel(), axes.get_title()) == ("game steps", "t")
     assert figure.get_suptitle() == "T"
 
@@ -89,8 +92,11 @@ def test_scores_become_matrices_of_seeds_and_tasks() -> None:
     with pytest.raises(ValueError, match="saf has no seed 0 on b"):
         score_matrices(table.drop(index=1))
     other = pd.DataFrame([("ippo", 0, "a", 1.0)], columns=table.columns)
-    with pytest.raises(ValueError, match="on the same tasks"):
+    with pytest.raises(ValueError, match="on the same tasks: ippo has no result on b"):
         score_matrices(pd.concat([table, other]))
+    elsewhere = pd.DataFrame([("ippo", seed, task, 1.0) for seed in (0, 1) for task in "cd"], columns=table.columns)
+    with pytest.raises(ValueError, match="on the same tasks: saf has no result on c, d"):
+        score_matrices(pd.concat([table, elsewhere]))
 
 
 def test_interquartile_mean_and_its_interval() -> None:
@@ -102,6 +108,12 @@ def test_interquartile_mean_and_its_interval() -> None:
     assert estimate.low >= 0.5 and estimate.high <= 6.5
     alone = interquartile_means({"saf": scores[:1]})["saf"]
     assert np.isnan([alone.low, alone.high]).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 9), (5, 7)])
+def test_the_interquartile_mean_is_rliables(shape: tuple[int, int]) -> None:
+    scores = np.random.default_rng(0).normal(size=shape)
+    assert interquartile_means({"saf": scores})["saf"].value == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
 
 
 def test_seeds_without_spread_have_an_interval_without_width() -> None:
@@ -133,10 +145,48 @@ def test_aggregates_are_drawn_at_their_values() -> None:
     assert [line.get_label() for line in right.get_lines()] == ["saf", "mappo"]
 
 
-def test_methods_keep_their_colours() -> None:
-    assert method_colours(["ippo", "saf"])["saf"] == method_colours(["saf", "other"])["saf"]
-    colours = method_colours(["saf", "mappo", "a", "b"])
-    assert len(set(colours.values())) == 4
+def test_methods_keep_their_styles_and_none_looks_like_another() -> None:
+    assert method_styles(["ippo", "saf"])["saf"] == method_styles(["saf", "other"])["saf"]
+    methods = [*ALGOS, "random", "saf gamma=0.9", "saf, variant 1"]
+    assert len(set(method_styles(methods).values())) == len(methods)
+    assert method_styles(methods)["saf-lstm"].colour == method_styles(methods)["saf"].colour
+
+
+def long_names(count: int) -> dict[str, list[list[float]]]:
+    return {f"saf with_a_setting_of_a_long_name={index}": [[0.0, 1.0]] for index in range(count)}
+
+
+@pytest.mark.parametrize("n_panels", [1, 2, 9])
+def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
+    """Constrained layout only warns where it does not fit, and warnings are errors here."""
+    table = pd.concat([runs(**long_names(12)).assign(task=f"task {index}") for index in range(n_panels)])
+    for figure in (
+        draw_curves(table, panel="task"),
+        draw_levels(table.assign(coordination=1), "coordination", panel="task"),
+    ):
+        figure.draw_without_rendering()
+        (legend,) = figure.legends
+        box = legend.get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0
+        boxes = [axes.get_tightbbox() for axes in figure.axes if axes.axison]
+        assert all(each is not None and box.y1 <= each.y0 + 1 for each in boxes)
+
+
+def test_panels_have_their_own_levels() -> None:
+    rows = [("saf", 0, 1, 2.0, "a"), ("saf", 0, 2, 3.0, "a"), ("saf", 0, 5, 1.0, "b")]
+    table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "score", "task"])
+    ticks = [
+        [label.get_text() for label in axes.get_xticklabels()]
+        for axes in draw_levels(table, "coordination", None, "task").axes
+    ]
+    assert ticks == [["1", "2"], ["5"]]
+
+
+def test_returns_that_are_never_negative_are_drawn_from_zero() -> None:
+    wide = runs(saf=[[1, 2], [3, 9]])  # the interval of two seeds goes far below 0
+    assert draw_curves(wide).axes[0].get_ylim()[0] == 0
+    assert draw_levels(wide.assign(coordination=1), "coordination").axes[0].get_ylim()[0] == 0
+    assert draw_curves(runs(saf=[[-1, 2]])).axes[0].get_ylim()[0] < -1
 
 
 def test_tables_are_checked() -> None:

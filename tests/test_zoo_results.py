@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 pytest.importorskip("rl_zoo3.train")
 
@@ -21,7 +25,7 @@ from sb3_saf.zoo import enjoy as zoo_enjoy
 from sb3_saf.zoo import plot as zoo_plot
 from sb3_saf.zoo import train as zoo_train
 from sb3_saf.zoo.runs import Run, describe, find_runs, setting_names, training_curve
-from sb3_saf.zoo.settings import saved_settings
+from sb3_saf.zoo.settings import load_settings, saved_settings
 from sb3_saf.zoo.watching import play
 
 ENV = "TeamTogether-v0"
@@ -137,6 +141,7 @@ def test_a_window_needs_a_display(
         (["--gif", "film.mp4"], "a file that ends with .gif"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--gif", "a.gif", "--text"], "not allowed with"),
+        (["--gif", "/dev/null/a.gif"], "Not a directory"),
     ],
 )
 def test_mistakes_in_enjoy_are_one_line(
@@ -144,6 +149,15 @@ def test_mistakes_in_enjoy_are_one_line(
 ) -> None:
     quiet = [] if "--gif" in options else ["--no-render"]
     assert words in failed(zoo_enjoy.main, ["-f", str(logs), *quiet, *options], capsys)
+
+
+def test_a_reader_may_leave(logs: Path) -> None:
+    """As ``| head -1`` does."""
+    words = ["-m", "sb3_saf.enjoy", "-f", str(logs), "--env", ENV, "--episodes", "2", "--text"]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        assert command.stdout is not None and command.stderr is not None
+        command.stdout.close()
+        assert command.stderr.read() == b""
 
 
 def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -199,10 +213,41 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
     table = describe(find_runs(tmp_path))
-    assert list(table["method"]) == ["saf gamma=default", "saf gamma=0.9"]
+    assert list(table["method"]) == ["saf", "saf gamma=0.9"]
     assert [run.number for run in table["run"]] == [1, 3]
     with pytest.raises(ValueError, match="has no evaluations"):
         table["run"][0].curve("evaluation")
+
+
+def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None:
+    """A run's settings, as training writes them."""
+    settings = load_settings("saf", ENV, "smoke", overrides=overrides)
+    config = folder / "saf" / f"{ENV}_{number}" / ENV / "config.yml"
+    config.parent.mkdir(parents=True)
+    config.write_text(yaml.safe_dump({**settings.as_dict(), "seed": seed}))
+
+
+def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
+    fake_run(tmp_path, 1)
+    fake_run(tmp_path, 2, game_steps=80, batch_size=80)
+    many: dict[str, Any] = {"gamma": 0.9123456, "ent_coef": 0.02, "policy_kwargs": {"n_slots": 3, "n_policies": 2}}
+    fake_run(tmp_path, 3, **many)
+    fake_run(tmp_path, 4, seed=1, **many)
+    fake_run(tmp_path, 5, **{**many, "gamma": 0.8})
+    table = describe(find_runs(tmp_path))
+    assert list(table["method"]) == [
+        "saf",
+        "saf batch_size=80 game_steps=80",
+        *["saf, variant 1"] * 2,
+        "saf, variant 2",
+    ]
+    assert table["changes"][2] == "ent_coef=0.02 gamma=0.912 n_policies=2 n_slots=3"
+
+
+def test_what_all_runs_share_is_not_named(tmp_path: Path) -> None:
+    for number in (1, 2):
+        fake_run(tmp_path, number, seed=number, game_steps=80)
+    assert list(describe(find_runs(tmp_path))["method"]) == ["saf", "saf"]
 
 
 @pytest.mark.parametrize("kind", ["curves", "levels", "aggregate"])
@@ -227,6 +272,7 @@ def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Pat
         (["aggregate", "-o", "a.png"], "aggregates"),
         (["bars", "-o", "a.png"], "invalid choice"),
         (["curves"], "--output"),
+        (["curves", "--algos", "saf", "-o", "/dev/null/a.png"], "Not a directory"),
     ],
 )
 def test_mistakes_in_plot_are_one_line(

@@ -16,10 +16,13 @@ import torch as th
 import yaml
 from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_saf import SAFPolicy
+from sb3_saf import QPLEX, SAFPolicy, evaluate_team
+from sb3_saf.common.randomness import own_randomness
 from sb3_saf.zoo import train as zoo_train
-from sb3_saf.zoo.callbacks import GameStepsProgressBar, own_generators
+from sb3_saf.zoo.algorithms import ALGOS
+from sb3_saf.zoo.callbacks import GameStepsProgressBar
 from sb3_saf.zoo.settings import ENV_IDS, load_settings
 
 rl_zoo_train = pytest.importorskip("rl_zoo3.train")
@@ -65,6 +68,35 @@ def test_another_seed_trains_something_else(by_hand: dict[str, th.Tensor], tmp_p
     assert not equal(by_hand, weights(PPO.load(run / f"{ENV}.zip")))
 
 
+@pytest.mark.parametrize("algo", ["saf", "qplex"])
+def test_tensorboard_has_the_inside_of_the_policy_and_training_does_not_notice(algo: str, tmp_path: Path) -> None:
+    quick = ("--eval-freq", "-1", "-n", "80")
+    plain = train(tmp_path, *quick, algo=algo)
+    watched = train(tmp_path, *quick, "-tb", str(tmp_path / "tb"), "--inspect-freq", "40", algo=algo)
+    load = ALGOS[algo].algorithm.load
+    assert equal(weights(load(plain / f"{ENV}.zip")), weights(load(watched / f"{ENV}.zip")))
+    (file,) = (tmp_path / "tb").rglob("events.*")
+    found = EventAccumulator(str(file)).Reload()
+    assert [event.step for event in found.Scalars("team/return")] == [0, 160, 320]
+    assert {"episode/strip", "critic/calibration"} <= set(found.Tags()["images"])
+    assert b"TeamTogether" in found.PluginTagToContent("hparams")["_hparams_/session_start_info"]
+
+
+def test_no_look_into_the_policy(tmp_path: Path) -> None:
+    train(tmp_path, "--eval-freq", "-1", "-n", "40", "-tb", str(tmp_path / "tb"), "--inspect-freq", "-1")
+    (file,) = (tmp_path / "tb").rglob("events.*")
+    assert "team/return" not in EventAccumulator(str(file)).Reload().Tags()["scalars"]
+
+
+def test_value_based_algorithms_are_evaluated_without_exploring(tmp_path: Path) -> None:
+    """QPLEX explores with every second action at this point; SAF's drawn actions are what it learns."""
+    run = train(tmp_path, "--eval-freq", "40", "-n", "40", "-params", "exploration_final_eps:0.5", algo="qplex")
+    games = load_settings("qplex", ENV, "smoke").make_env(3, evaluation=True, n_envs=4)
+    expected = evaluate_team(QPLEX.load(run / "best_model.zip"), games, 4, deterministic=True)
+    with np.load(run / "evaluations.npz") as arrays:
+        assert arrays["results"].tolist() == [expected.returns]
+
+
 def test_generators_are_put_back() -> None:
     def draws() -> tuple[float, float, float]:
         return random.random(), float(np.random.random()), float(th.rand(()))  # noqa: NPY002
@@ -74,10 +106,10 @@ def test_generators_are_put_back() -> None:
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
     th.set_rng_state(states[2])
-    with own_generators(5):
+    with own_randomness(5, th.device("cpu")):
         inside = draws()
     assert draws() == expected
-    with own_generators(5):
+    with own_randomness(5, th.device("cpu")):
         assert draws() == inside
 
 
@@ -106,9 +138,8 @@ def test_evaluation_may_have_a_level_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
-    run = train(
-        tmp_path, "-tb", str(tmp_path / "tb"), "-params", "gamma:0.9", "policy_kwargs:{n_slots: 3}", algo="saf-no-pool"
-    )
+    logs = ("-tb", str(tmp_path / "tb"), "--inspect-freq", "-1")
+    run = train(tmp_path, *logs, "-params", "gamma:0.9", "policy_kwargs:{n_slots: 3}", algo="saf-no-pool")
     assert run == tmp_path / "saf-no-pool" / f"{ENV}_1"
     config, given, versions = (
         yaml.safe_load((run / ENV / f"{name}.yml").read_text()) for name in ("config", "args", "versions")
@@ -225,6 +256,8 @@ def failed(options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         (["--trial-id", "1", "--storage", "s.log", "--study-name", "s"], ("there is no study file s.log",)),
         (["-optimize", "--storage", "study"], ("--storage must be",)),
         (["--sampler", "grid"], ("invalid choice", "--help")),
+        (["-f", "/dev/null/logs"], ("Not a directory", "/dev/null/logs")),
+        (["-tb", "/dev/null/tb"], ("Not a directory", "/dev/null/tb")),
         (["--game-step", "5"], ("unrecognized arguments", "--help")),
     ],
 )
@@ -238,6 +271,13 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     line = failed(["--size", "smoke", *options], capsys)
     assert all(word in line for word in words), line
+    assert not list(Path("logs").rglob("*.yml"))  # it would pass for the latest run
+
+
+def test_help_tells_defaults_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
+    text = zoo_train.make_parser().format_help()
+    assert "(default: saf)" in text
+    assert not any(f"(default: {empty})" in text for empty in ("None", "{}", "", "False"))
 
 
 def test_strings_are_not_evaluated(

@@ -14,7 +14,7 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int)
     """
     Play one step of games ``first`` to ``last - 1``.
 
-    :param actions: (E, N) action integers, 0 to 6
+    :param actions: (E * N,) action integers, 0 to 6
     """
     for e in range(first, last):
         if book.random_order:
@@ -22,7 +22,7 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int)
         games.paid[e] = 0
         for turn in range(book.n_agents):
             agent = games.order[e, turn]
-            act(games, book, e, agent, actions[e, agent])
+            act(games, book, e, agent, actions[e * book.n_agents + agent])
         games.collected[e] += games.paid[e]
         games.steps[e] += 1
 

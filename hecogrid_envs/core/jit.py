@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from numba import njit
+from numba import njit, typeof
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -30,4 +30,17 @@ def hot(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile a part of a hot loop into it: a call would pass every array of a batch on the stack."""
     compiled: Function = njit(cache=True, nogil=True, _nrt=False, forceinline=True)(function)  # type: ignore[call-overload]
+    return compiled
+
+
+def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """
+    Find the machine code for some arguments, to be called without numba's dispatcher.
+
+    At each call that looks at the type of every array of a batch, which costs as much as stepping six games.
+
+    :param function: a kernel
+    :param arguments: of the types that it will be called with; others must not follow
+    """
+    compiled: Callable[..., Any] = function.compile(tuple(map(typeof, arguments)))  # type: ignore[attr-defined]
     return compiled

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 U8 = npt.NDArray[np.uint8]
+U16 = npt.NDArray[np.uint16]
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]
 U64 = npt.NDArray[np.uint64]
@@ -32,6 +33,8 @@ class RuleBook(NamedTuple):
     :param blank_planes: (4 * plane_bytes,) the planes of a map with its outer wall and nothing else
     :param blank_bits: (4 * bits_bytes,) its wall bits
     :param spread: (256,) word whose byte i is 0xFF where bit i of the index is set
+    :param swept: (4 ** V,) what light does in one row of a view of at most eight columns: the index is the row's clear
+        cells times 2 ** V plus its lit cells before, the entry its lit cells after and, 8 bits higher, the next row's
     """
 
     task: int
@@ -59,6 +62,7 @@ class RuleBook(NamedTuple):
     blank_planes: U8
     blank_bits: U8
     spread: U64
+    swept: U16
 
 
 class Games(NamedTuple):

@@ -76,13 +76,15 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
             walls = load_word(games.wall_bits, bits + (bit >> 3)) >> np.uint64(bit & 7)
             clear = ~walls & every
             seen = games.sight[np.uint64(words + row)]
-            lit = np.uint64(0)
-            right = _spread_right(seen & rightwards, clear & rightwards, size)
-            seen |= (right | (right << _ONE)) & every
-            lit |= right | (right << _ONE)
-            left = _spread_left(seen & leftwards, clear & leftwards, size)
-            seen |= left | (left >> _ONE)
-            lit |= left | (left >> _ONE)
+            if size <= _WORD_BYTES:
+                swept = np.uint64(book.swept[(clear << np.uint64(size)) | seen])
+                seen, lit = swept & _BYTE, swept >> np.uint64(_WORD_BYTES)
+            else:
+                right = _spread_right(seen & rightwards, clear & rightwards, size)
+                seen |= (right | (right << _ONE)) & every
+                left = _spread_left(seen & leftwards, clear & leftwards, size)
+                seen |= left | (left >> _ONE)
+                lit = right | (right << _ONE) | left | (left >> _ONE)
             games.sight[np.uint64(words + row)] = seen
             if 0 <= following < size:
                 games.sight[np.uint64(words + following)] |= lit & every
@@ -100,13 +102,13 @@ def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) 
     size = book.view_size
     n_words = (size + _WORD_BYTES - 1) // _WORD_BYTES
     own = (size - 1 - book.view_offset) * size + size // 2
+    end = last * book.n_agents * size * size
     for e in range(first, last):
         for agent in range(book.n_agents):
             if not games.sight_known[e, agent]:
                 look(games, book, e, agent)
             words = (e * book.n_agents + agent) * size
             start = words * size
-            end = start + size * size
             source = (e * 4 + games.direction[e, agent]) * book.plane_bytes + view_corner(games, book, e, agent)
             for row in range(size):
                 seen = games.sight[np.uint64(words + row)]
@@ -115,7 +117,7 @@ def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) 
                     codes = load_word(games.planes, source + row * book.stride + _WORD_BYTES * k) & mask
                     to = start + row * size + _WORD_BYTES * k
                     if to + _WORD_BYTES <= end:
-                        # Writes past the row's end; the next row, written later, repairs it.
+                        # Writes past the row's end; the next row or view, written later, repairs it.
                         store_word(out, to, codes)
                     else:
                         for i in range(min(end - to, size - _WORD_BYTES * k)):
@@ -142,10 +144,10 @@ def draw_pictures(
     :param last: one beyond the last view to draw
     """
     line, tile_bytes = 3 * tile, 3 * tile * tile
+    end = last * size * size * tile_bytes
     for view in range(first, last):
         turned = facing[view] * turn_bytes
         to = view * size * size * tile_bytes
-        end = to + size * size * tile_bytes
         for row in range(size):
             cell = (view * size + row) * size
             for pixel_row in range(tile):

@@ -246,13 +246,19 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         if batch_size is None:
             return self.buffer_size * self.n_games
         if batch_size < 1 or batch_size % self.n_agents:
-            below = max(batch_size // self.n_agents, 0) * self.n_agents
-            choices = [size for size in (below, below + self.n_agents) if size > 0]
             raise ValueError(
                 f"batch_size counts rows and must be a multiple of n_agents={self.n_agents}, because TeamRolloutBuffer "
-                f"gives whole teams, got {batch_size}; use batch_size={' or '.join(map(str, choices))}"
+                f"gives whole teams, got {batch_size}; use batch_size={self._nearest_batch_sizes(batch_size)}"
             )
         return batch_size // self.n_agents
+
+    def _nearest_batch_sizes(self, batch_size: int) -> str:
+        """What somebody may have meant."""
+        rollout = self.buffer_size * self.n_games * self.n_agents
+        if batch_size > rollout:
+            return f"{rollout}, the whole rollout (n_steps={self.buffer_size} x {self.n_games} games x {self.n_agents})"
+        below = max(batch_size // self.n_agents, 0) * self.n_agents
+        return " or ".join(str(size) for size in (below, below + self.n_agents) if size > 0)
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from pettingzoo import ParallelEnv
 from scipy.special import stdtrit
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
 from stable_baselines3.common.monitor import Monitor
@@ -98,12 +99,17 @@ class RandomPolicy:
     The baseline that every learner has to beat: actions uniform over the action space, or over the legal ones where
     observations have an ``action_mask``.
 
-    :param action_space: one agent's action space; a Box must be bounded
+    :param action_space: one agent's action space, a Box must be bounded; or the environment that has it, for instance
+        from ``make_team_env``
     :param seed: of its own generator; None for a fresh one
     :raises ValueError: for an unbounded Box or another kind of space
     """
 
-    def __init__(self, action_space: spaces.Space[Any], seed: int | None = None) -> None:
+    def __init__(
+        self, action_space: spaces.Space[Any] | VecEnv | ParallelEnv[Any, Any, Any], seed: int | None = None
+    ) -> None:
+        if not isinstance(action_space, spaces.Space):
+            action_space = _action_space_of(action_space)
         if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
             raise ValueError(f"a uniform policy needs a bounded action space, got {action_space}; rescale the actions")
         if not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)):
@@ -153,6 +159,19 @@ class RandomPolicy:
         if space.dtype is not None and space.dtype.kind in "iu":
             return rng.integers(space.low, space.high, size=shape, endpoint=True, dtype=space.dtype)
         return rng.uniform(space.low, space.high, size=shape).astype(space.dtype)
+
+
+def _action_space_of(env: Any) -> spaces.Space[Any]:
+    """The action space of a vector environment, or of what else has one and the same for all agents."""
+    space = getattr(env, "action_space", None)
+    if callable(space) and (agents := getattr(env, "possible_agents", None)):  # PettingZoo's
+        space = space(agents[0])
+    if isinstance(space, spaces.Space):
+        return space
+    raise ValueError(
+        f"expected one agent's action space, or an environment that has it, got {type(env).__name__}; pass "
+        "env.action_space of the environment from sb3_saf.make_team_env"
+    )
 
 
 class _GameRows(VecEnvWrapper):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch as th
@@ -23,6 +23,16 @@ from sb3_saf.common.teams import (
     TeamSpaces,
 )
 from sb3_saf.common.views import ViewEncoder
+
+#: For those who pass what a PettingZoo environment gives.
+_HOW_TO_STACK: Final = (
+    ". Of observations by agent, as a ParallelEnv gives them, pass one agent's, model.predict(observations[{0!r}]), or "
+    "stack them, model.predict(np.stack(list(observations.values()))): row i of the actions is then that of the i-th "
+    "agent. sb3_saf.export_actors gives each agent an actor of its own"
+)
+
+#: How PettingZoo's environments give masks.
+_CLASSIC: Final = {"observation", ACTION_MASK_KEY}
 
 
 class TeamRowsPolicy(BasePolicy):
@@ -83,14 +93,20 @@ class TeamRowsPolicy(BasePolicy):
         """
         Make tensors of NumPy observations.
 
-        :param observation: rows, some of their entries, or own observations alone; a batch or a single one
+        :param observation: rows, some of their entries, or own observations alone; a batch or a single one. Where
+            there are masks, also in PettingZoo's form {"observation", "action_mask"}
         :return: dict of tensors with a batch axis, and whether the observation was a batch
         """
         entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
+        if set(entries) == _CLASSIC and self.team_spaces.action_mask is not None:
+            entries = {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
         keys = self.team_spaces.keys
         unknown = [key for key in entries if key not in keys]
         if unknown:
-            raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
+            hint = _HOW_TO_STACK.format(unknown[0]) if len(unknown) == len(entries) else ""
+            raise ValueError(
+                f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}{hint}"
+            )
         arrays = {key: np.asarray(value) for key, value in entries.items()}
         if AGENT_KEY in arrays:
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])

@@ -211,6 +211,16 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         """
         return self._recall_values(obs, None, lstm_states, episode_starts)[0]
 
+    def remember(self, features: th.Tensor, lstm_states: LstmStates) -> tuple[th.Tensor, LstmStates]:
+        """
+        One step of the actor's LSTM, in the midst of an episode.
+
+        :param features: (B, d) of own observations
+        :param lstm_states: of the actor, (layers, B, H) each
+        :return: (B, H), which the actor reads, and the next states
+        """
+        return self._process(features, lstm_states, th.zeros(len(features), device=features.device), self.lstm_actor)
+
     # --- memory -----------------------------------------------------------------------------------------------------
 
     def _recall_distribution(

@@ -20,8 +20,9 @@ class Frames(NamedTuple):
 
     :param tests: one row for each cell and level that it was tested at, columns of
         :class:`~sb3_saf.experiments.table.Row`; ``return_mean`` is a mean over episodes, ``seed`` the training run
-    :param curves: one row for each point of a learning curve, columns ``method``, ``task``, ``level``, ``seed``,
-        ``game_steps`` and ``score``, the mean team return of training episodes
+    :param curves: one row for each point of a learning curve, columns ``method``, ``task``, ``coordination``,
+        ``heterogeneity``, ``level`` (both in one word), ``seed``, ``game_steps`` and ``score``, the mean team return of
+        training episodes
     """
 
     tests: pd.DataFrame
@@ -67,6 +68,7 @@ def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
     for cell in cells:
         path = results.cell_folder(cell) / "curve.csv"
         if results.is_finished(cell) and path.exists():
-            names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, "seed": cell.seed}
+            level = {**cell.level._asdict(), "level": cell.level.slug}
+            names = {"method": cell.method, "task": cell.task, **level, "seed": cell.seed}
             found.append(pd.read_csv(path).rename(columns={"mean_return": "score"}).assign(**names))
     return pd.concat(found, ignore_index=True) if found else pd.DataFrame()

@@ -109,12 +109,13 @@ def _draw_curves(experiment: Experiment, curves: pd.DataFrame, table: pd.DataFra
     paths: list[Path] = []
     if curves.empty:
         return paths
-    for (task, level), runs in curves.groupby(["task", "level"], sort=False):
-        random = table[(table["method"] == RANDOM) & (table["task"] == task)]
-        random = random[[Level(row.coordination, row.heterogeneity).slug == level for row in random.itertuples()]]
+    for (task, *dials), runs in curves.groupby(["task", *Level._fields], sort=False):
+        level = Level(*dials)
+        at_level = (table["coordination"] == level.coordination) & (table["heterogeneity"] == level.heterogeneity)
+        random = table[(table["method"] == RANDOM) & (table["task"] == task) & at_level]
         steps = pd.DataFrame({"game_steps": [runs["game_steps"].min(), runs["game_steps"].max()]})
         line = random[["method", "seed", "return_mean"]].rename(columns={"return_mean": "score"})
         together = pd.concat([runs, line.merge(steps, how="cross")], ignore_index=True)
-        figure = draw_curves(together, title=f"{experiment.name}: {task}, {level.replace('-', ', ')}")
-        paths.append(_save(figure, folder / f"curve-{task}-{level}.png"))
+        figure = draw_curves(together, title=f"{experiment.name}: {task}, {level}")
+        paths.append(_save(figure, folder / f"curve-{task}-{level.slug}.png"))
     return paths

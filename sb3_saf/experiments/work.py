@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shlex
 import socket
 import subprocess
@@ -23,6 +22,8 @@ from sb3_saf.experiments.cells import Cell, Protocol
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import pack, to_json
 from sb3_saf.experiments.results import FINISHED, config_of
+from sb3_saf.zoo.commands import option_words
+from sb3_saf.zoo.inspection import inspection
 from sb3_saf.zoo.seeds import evaluation_seed
 from sb3_saf.zoo.versions import software_versions
 
@@ -102,7 +103,10 @@ def _train(work: Work, folder: Path) -> BaseAlgorithm:
     env = settings.make_env(work.cell.seed, monitor_dir=folder)
     logs = str(folder / "tb") if work.tensorboard else None
     model = settings.make_model(env, work.cell.seed, device=work.device, tensorboard_log=logs)
-    model.learn(settings.total_timesteps, tb_log_name=work.cell.method)
+    look = inspection(settings, work.cell.seed) if work.tensorboard else None
+    model.learn(settings.total_timesteps, callback=look, tb_log_name=work.cell.method)
+    if look is not None:
+        look.eval_env.close()
     model.save(folder / "model.zip")
     env.close()
     monitor = folder / "monitor.csv"
@@ -159,7 +163,8 @@ def play(cell: Cell, protocol: Protocol, level: Level, model: BaseAlgorithm | No
     # Sampled actions must depend neither on the training nor on other tests.
     set_random_seed(cell.seed)
     player: Any = RandomPolicy(env.action_space, seed=cell.seed) if model is None else model
-    result = evaluate_team(player, env, protocol.episodes, protocol.deterministic)
+    deterministic = protocol.deterministic or not settings.spec.draws_actions
+    result = evaluate_team(player, env, protocol.episodes, deterministic)
     env.close()
     low, high = result.interval()
     return {
@@ -182,10 +187,8 @@ def command(cell: Cell, protocol: Protocol) -> str:
     words = ["python", "-m", "sb3_saf.train", "--algo", cell.method, "--env", settings.env_id]
     words += ["--size", protocol.size, "--seed", str(cell.seed)]
     env_kwargs = {**protocol.overrides.get("env_kwargs", {}), **cell.env_kwargs(cell.level)}
-    words += ["--env-kwargs", *(f"{key}:{json.dumps(value)}" for key, value in env_kwargs.items())]
     own = {key: value for key, value in protocol.overrides.items() if key not in ("env_kwargs", "game_steps")}
-    if own:
-        words += ["--hyperparams", *(f"{key}:{json.dumps(value)}" for key, value in own.items())]
+    words += [*option_words("--env-kwargs", env_kwargs), *option_words("--hyperparams", own)]
     if "game_steps" in protocol.overrides:
         words += ["--game-steps", str(protocol.overrides["game_steps"])]
     return shlex.join(words)

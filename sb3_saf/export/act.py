@@ -1,15 +1,19 @@
 """
 Act with an exported actor. Needs Python, NumPy and onnxruntime, nothing else.
 
-    python act.py observation.npy [--agent 3] [--sample] [--seed 0]
+    python act.py observation.npy [--agent 3] [--action-mask mask.npy] [--sample] [--seed 0]
 
 or, from a program beside this file:
 
-    from act import OnnxActor
+    from act import Memory, OnnxActor
     actor = OnnxActor("folder of actor.json and actor.onnx")
     action = actor.act(observation)
 
-Letters: K rows (a batch of observations), U policies, P parameters of one policy, D action dimensions, A actions.
+An actor with a memory takes ``memory=Memory()``, made anew at the start of each episode; to the command line, the
+observations of such an actor are the steps of one episode.
+
+Letters: K rows (a batch of observations), U policies, P parameters of one policy, D action dimensions, A actions, M
+choices of all dimensions, H size of a memory.
 """
 
 from __future__ import annotations
@@ -24,9 +28,13 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
+#: What an LSTM remembers: hidden and cell state, (layers, K, H) each; empty without memory.
+States = tuple[Array, ...]
 
 #: Up to this many joint actions, the most likely action of a mixture is found by enumeration.
 MAX_ENUMERATED_ACTIONS = 4096
+#: Logit of what a mask forbids: its probability is zero to the last bit.
+FORBIDDEN = np.float32(-1e8)
 
 
 class Outputs(NamedTuple):
@@ -42,6 +50,59 @@ class Outputs(NamedTuple):
     log_weights: Array
     parameters: Array
     log_probs: Array | None = None
+
+
+class Memory:
+    """
+    What an actor remembers of an episode: the state of its LSTM, zeros at first. Make a new one for each episode.
+
+    :param hidden: (layers, K, H); None for zeros
+    :param cell: (layers, K, H); None for zeros
+    """
+
+    def __init__(self, hidden: Array | None = None, cell: Array | None = None):
+        self.hidden, self.cell = hidden, cell
+
+    def arrays(self, net: dict[str, Any], n_rows: int) -> tuple[Array, Array]:
+        """
+        Hidden and cell state, (layers, K, H) each.
+
+        :param net: ``"memory"`` of ``actor.json``
+        :param n_rows: K, as many as at the last step
+        """
+        shape = (net["n_layers"], n_rows, net["hidden_size"])
+        zeros = np.zeros(shape, np.float32)
+        hidden, cell = (zeros if part is None else part for part in (self.hidden, self.cell))
+        if hidden.shape != shape or cell.shape != shape:
+            raise ValueError(
+                f"this memory is of {hidden.shape[1]} observations at once, got {n_rows}; give each agent and each "
+                "game a memory of its own, and make a new one for each episode"
+            )
+        return hidden, cell
+
+
+def masked(action: dict[str, Any], outputs: Outputs, mask: Array) -> Outputs:
+    """
+    Take forbidden choices out of every policy, as the trained model does before it mixes them.
+
+    :param action: the action space, as in ``actor.json``
+    :param outputs: of the network
+    :param mask: (K, M) bool, True for what is allowed: the choices of each dimension in turn (of multi-binary actions:
+        off, on). A dimension of which nothing is allowed leaves its choices equally likely
+    """
+    if action["kind"] == "multi_binary":
+        off, on = mask[:, 0::2], mask[:, 1::2]
+        kept, otherwise = off & on, FORBIDDEN * (off.astype(np.float32) - on.astype(np.float32))
+    else:
+        parts = np.split(mask, np.cumsum(action["choices"])[:-1], axis=1)
+        some = [np.broadcast_to(part.any(axis=1, keepdims=True), part.shape) for part in parts]
+        kept, otherwise = mask, FORBIDDEN * np.concatenate(some, axis=1).astype(np.float32)
+    parameters = np.where(kept[:, np.newaxis], outputs.parameters, otherwise[:, np.newaxis]).astype(np.float32)
+    if outputs.log_probs is None:
+        return outputs._replace(parameters=parameters)
+    (log_probs,) = factors(action, parameters)
+    mixed = np.logaddexp.reduce(outputs.log_weights[:, :, np.newaxis] + log_probs, axis=1)
+    return outputs._replace(parameters=parameters, log_probs=mixed)
 
 
 class Draws(Protocol):
@@ -197,6 +258,39 @@ def as_batch(observation: Any, space: dict[str, Any]) -> tuple[Array, bool]:
     return np.ascontiguousarray(array if is_batch else array[np.newaxis], dtype=space["dtype"]), is_batch
 
 
+def as_masks(action_mask: Any, manifest: dict[str, Any], n_rows: int) -> Array | None:
+    """
+    Check masks of actions.
+
+    :param action_mask: (M,) for one observation, (K, M) for a batch; or None
+    :param manifest: ``"action"`` and ``"action_mask"`` as in ``actor.json``
+    :param n_rows: K
+    :return: (K, M) bool, or None for none
+    :raises ValueError: if masks are missing, not wanted, of another shape, or allow nothing where something must be
+    """
+    wanted = manifest["action_mask"]
+    n_choices = sum(manifest["action"]["choices"])
+    if action_mask is None:
+        if wanted == "required":
+            raise ValueError(
+                f"this actor was trained to keep to masks: pass action_mask, {n_choices} zeros and ones per observation"
+            )
+        return None
+    if wanted == "none":
+        raise ValueError("this actor was trained without masks of actions, and does not know what to do with one")
+    mask = np.asarray(action_mask)
+    mask = mask[np.newaxis] if mask.ndim == 1 else mask
+    if mask.shape != (n_rows, n_choices) or not ((mask == 0) | (mask == 1)).all():
+        raise ValueError(
+            f"expected {n_choices} zeros and ones for each of {n_rows} observations as action_mask, got shape "
+            f"{np.shape(action_mask)}"
+        )
+    mask = mask.astype(bool)
+    if wanted == "required" and not mask.any(axis=1).all():
+        raise ValueError(f"expected at least one legal action in each action_mask, got {mask.astype(int).tolist()}")
+    return mask
+
+
 class OnnxActor:
     """
     Run ``actor.onnx``. Trusts its folder; ``sb3_saf.Actor`` checks it first.
@@ -214,35 +308,73 @@ class OnnxActor:
         self.agent = agent
         self.session = onnxruntime.InferenceSession(Path(folder) / "actor.onnx", providers=["CPUExecutionProvider"])
 
-    def act(self, observation: Any, rng: np.random.Generator | None = None) -> Array:
+    def act(
+        self,
+        observation: Any,
+        rng: np.random.Generator | None = None,
+        action_mask: Any = None,
+        memory: Memory | None = None,
+    ) -> Array:
         """
         Act.
 
         :param observation: one own observation, or a batch
         :param rng: to sample with; None takes the most likely action
+        :param action_mask: which actions are legal, where the actor was trained with masks
+        :param memory: of the episode, where the actor has one; it is brought up to date
         """
         batch, is_batch = as_batch(observation, self.manifest["observation"])
+        outputs = self._outputs(batch, memory)
+        mask = as_masks(action_mask, self.manifest, len(batch))
+        action = self.manifest["action"]
+        outputs = outputs if mask is None else masked(action, outputs, mask)
+        draws = None if rng is None else NumpyDraws(rng)
+        actions = decide(action, self.manifest["selection"], outputs, draws)
+        return actions if is_batch else actions.squeeze(axis=0)
+
+    def _outputs(self, batch: Array, memory: Memory | None) -> Outputs:
         inputs = {"observation": batch}
         if self.manifest["reads_agent"]:
             inputs["agent"] = np.full(len(batch), self.agent)
-        outputs = Outputs(*self.session.run(None, inputs))
-        draws = None if rng is None else NumpyDraws(rng)
-        actions = decide(self.manifest["action"], self.manifest["selection"], outputs, draws)
-        return actions if is_batch else actions.squeeze(axis=0)
+        net = self.manifest["memory"]
+        if net is None:
+            return Outputs(*self.session.run(None, inputs))
+        if memory is None:
+            raise ValueError("this actor has a memory: pass memory=Memory(), made anew at the start of each episode")
+        inputs["hidden"], inputs["cell"] = memory.arrays(net, len(batch))
+        *outputs, memory.hidden, memory.cell = self.session.run(None, inputs)
+        return Outputs(*outputs)
 
 
 def main() -> None:
     """Print the action for an observation in a ``.npy`` file."""
     parser = argparse.ArgumentParser(description="act with an exported actor")
-    parser.add_argument("observation", help="a .npy file of one own observation, or of a batch")
+    parser.add_argument(
+        "observation", help="a .npy file of one own observation, or of a batch (with a memory: of an episode's steps)"
+    )
     parser.add_argument("--folder", default=Path(__file__).parent, help="the exported folder; this file's own")
     parser.add_argument("--agent", type=int, help="which agent acts, where every agent has a policy of its own")
+    parser.add_argument("--action-mask", help="a .npy file with the legal actions of each observation")
     parser.add_argument("--sample", action="store_true", help="draw the action instead of taking the most likely one")
     parser.add_argument("--seed", type=int, help="seed of --sample")
     options = parser.parse_args()
     actor = OnnxActor(options.folder, options.agent)
     rng = np.random.default_rng(options.seed) if options.sample else None
-    print(json.dumps(actor.act(np.load(options.observation, allow_pickle=False), rng).tolist()))
+    observations = np.load(options.observation, allow_pickle=False)
+    masks = None if options.action_mask is None else np.load(options.action_mask, allow_pickle=False)
+    if actor.manifest["memory"] is None:
+        actions = actor.act(observations, rng, masks)
+    else:
+        actions = _act_on_steps(actor, observations, rng, masks)
+    print(json.dumps(actions.tolist()))
+
+
+def _act_on_steps(actor: OnnxActor, observations: Array, rng: np.random.Generator | None, masks: Array | None) -> Array:
+    """(T, ...) actions of the steps of one episode."""
+    steps, memory = as_batch(observations, actor.manifest["observation"])[0], Memory()
+    return np.stack(
+        [actor.act(own, rng, None if masks is None else masks[step], memory) for step, own in enumerate(steps)]
+    )
 
 
 if __name__ == "__main__":

@@ -15,7 +15,17 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 import numpy.typing as npt
 
-from sb3_saf.export.act import Draws, NumpyDraws, Outputs, as_batch, decide
+from sb3_saf.export.act import (
+    Draws,
+    Memory,
+    NumpyDraws,
+    Outputs,
+    States,
+    as_batch,
+    as_masks,
+    decide,
+    masked,
+)
 from sb3_saf.export.files import read_limited
 from sb3_saf.export.likelihood import log_prob
 from sb3_saf.export.manifest import MANIFEST_FILE, MAX_MANIFEST_BYTES, Manifest, SpaceRecord, bound_array
@@ -27,8 +37,8 @@ RuntimeName = Literal["torch", "onnx"]
 class Runtime(Protocol):
     """What computes the network."""
 
-    def __call__(self, observations: Array) -> Outputs:
-        """(K, *shape) own observations to the network's outputs."""
+    def __call__(self, observations: Array, states: States = ()) -> tuple[Outputs, States]:
+        """(K, *shape) own observations and what is remembered, to the network's outputs and what is remembered then."""
 
     def draws(self, seed: int | None) -> Draws:
         """Random numbers from a seed, or those that go on from the last call."""
@@ -41,7 +51,12 @@ class Actor:
     It sees the agent's own observation and nothing else, and acts as the trained model's ``predict`` does. Nothing is
     unpickled, no code is imported by a name from the files, and the training environment is not needed.
 
-    Make one with :meth:`load`.
+    Make one with :meth:`load`. An actor that was trained with masks of actions is told each time which are legal, and
+    one that remembers gets a memory for each episode::
+
+        actor = sb3_saf.Actor.load("actor", agent=3)
+        memory = actor.new_memory()  # at the start of each episode, where has_memory
+        action = actor.act(own_observation, action_mask=legal, memory=memory)
 
     :param manifest: what the export says of itself
     :param runtime: computes the network
@@ -54,6 +69,7 @@ class Actor:
         self._runtime = runtime
         self._observation = _plain(manifest.observation)
         self._action = _plain(manifest.action)
+        self._masks = {"action": self._action, "action_mask": manifest.action_mask}
 
     @classmethod
     def load(cls, folder: str | PathLike[str], agent: int | None = None, runtime: RuntimeName = "torch") -> Actor:
@@ -77,9 +93,32 @@ class Actor:
         """N, the size of the team that was trained."""
         return self.manifest.n_agents
 
-    def act(self, observation: Any, deterministic: bool = True, rng: int | np.random.Generator | None = None) -> Array:
+    @property
+    def has_memory(self) -> bool:
+        """Whether it remembers what it has seen in an episode."""
+        return self.manifest.memory is not None
+
+    def new_memory(self) -> Memory:
         """
-        Choose an action.
+        Make what an agent remembers at the start of an episode: nothing. :meth:`act` keeps it up to date.
+
+        :raises ValueError: if the actor does not remember
+        """
+        if not self.has_memory:
+            raise ValueError(f"{self.manifest.policy} acts on single observations and has no memory; leave memory out")
+        return Memory()
+
+    def act(
+        self,
+        observation: Any,
+        deterministic: bool = True,
+        rng: int | np.random.Generator | None = None,
+        action_mask: Any = None,
+        memory: Memory | None = None,
+    ) -> Array:
+        """
+        Choose an action: by default what ``model.predict(observation, deterministic=True)`` chooses. ``predict`` itself
+        draws unless told otherwise.
 
         :param observation: one own observation as the environment gives it (pictures with channels first or last), or
             a batch of them with one more axis
@@ -87,37 +126,48 @@ class Actor:
         :param rng: where draws come from: a seed, or a NumPy generator. None goes on where the last call ended; with
             torch that is torch's global generator, and the draws are those of the trained model's ``predict`` (for a
             seed, those of ``predict`` after ``torch.manual_seed``)
+        :param action_mask: (M,) zeros and ones, or one more axis for a batch: which choices are legal, in the form in
+            which the model was trained with them. Needed where the training environment's observations had masks
+        :param memory: of the episode, from :meth:`new_memory`, where the actor has one; it is brought up to date. For a
+            batch of K observations it holds what K agents remember
         :return: the action, or a batch of actions, as ``predict`` gives them
-        :raises ValueError: for observations that are not of the observation space's shape and kind, or not finite
+        :raises ValueError: for observations that are not of the observation space's shape and kind, or not finite, and
+            for masks or memories that do not fit
         """
-        batch, is_batch = self._batch(observation)
+        outputs, states, is_batch = self._outputs(observation, action_mask, memory)
         draws = None if deterministic else self._draws(rng)
-        actions = decide(self._action, self.manifest.selection, self._runtime(batch), draws)
+        actions = decide(self._action, self.manifest.selection, outputs, draws)
+        if memory is not None:
+            memory.hidden, memory.cell = states
         return actions if is_batch else actions.squeeze(axis=0)
 
-    def probabilities(self, observation: Any) -> Array:
+    def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
         Probability of every action, for discrete actions.
 
         :param observation: see :meth:`act`
+        :param action_mask: see :meth:`act`
+        :param memory: see :meth:`act`; it stays as it is
         :return: (A,), or (K, A) for a batch
         """
-        outputs, is_batch = self._outputs(observation)
+        outputs, _, is_batch = self._outputs(observation, action_mask, memory)
         self._refuse_greedy()
         if outputs.log_probs is None:
             raise ValueError(f"{self.manifest.action.kind} actions have no list of probabilities; use log_prob")
         probabilities = np.exp(outputs.log_probs)
         return probabilities if is_batch else probabilities[0]
 
-    def log_prob(self, observation: Any, action: Any) -> Array:
+    def log_prob(self, observation: Any, action: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
         Log-likelihood of actions: that of drawing a policy of the pool by its weight, and the action from it.
 
         :param observation: see :meth:`act`
         :param action: one action, or as many as there are observations
+        :param action_mask: see :meth:`act`
+        :param memory: see :meth:`act`; it stays as it is
         :return: (), or (K,) for a batch
         """
-        outputs, is_batch = self._outputs(observation)
+        outputs, _, is_batch = self._outputs(observation, action_mask, memory)
         self._refuse_greedy()
         actions = np.asarray(action).reshape(len(outputs.log_weights), -1)
         result = log_prob(self._action, outputs, actions)
@@ -127,9 +177,27 @@ class Actor:
         if self.manifest.selection == "greedy":
             raise ValueError(f"{self.manifest.policy} has values of actions and takes the best: no action is drawn")
 
-    def _outputs(self, observation: Any) -> tuple[Outputs, bool]:
+    def _outputs(
+        self, observation: Any, action_mask: Any = None, memory: Memory | None = None
+    ) -> tuple[Outputs, States, bool]:
+        """What the network says, with forbidden actions taken out; what is remembered then; whether a batch came."""
         batch, is_batch = self._batch(observation)
-        return self._runtime(batch), is_batch
+        mask = as_masks(action_mask, self._masks, len(batch))
+        outputs, states = self._runtime(batch, self._states(memory, len(batch)))
+        return (outputs if mask is None else masked(self._action, outputs, mask)), states, is_batch
+
+    def _states(self, memory: Memory | None, n_rows: int) -> States:
+        net = self.manifest.memory
+        if net is None:
+            if memory is not None:
+                self.new_memory()  # says that there is none
+            return ()
+        if not isinstance(memory, Memory):
+            raise ValueError(
+                "this actor remembers what it has seen: memory = actor.new_memory() at the start of each episode, then "
+                f"actor.act(observation, memory=memory); got memory={memory!r}"
+            )
+        return memory.arrays(asdict(net), n_rows)
 
     def _batch(self, observation: Any) -> tuple[Array, bool]:
         space = self.manifest.observation

@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import prod
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.export.entries import MAX_ENTRIES, MAX_SIZE, Entries, refuse, short, strict_json
 
 FORMAT: Final = "sb3_saf.actor"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 
 MANIFEST_FILE: Final = "actor.json"
 WEIGHTS_FILE: Final = "actor.safetensors"
@@ -29,7 +29,9 @@ SCRIPT_FILE: Final = "act.py"
 #: Files whose checksums a manifest states.
 DATA_FILES: Final = (WEIGHTS_FILE, ONNX_FILE)
 
-ENCODER_NAMES: Final = ("LightEncoder", "MLPEncoder", "PaperCNN")
+ENCODER_NAMES: Final = ("LightEncoder", "MLPEncoder", "NatureEncoder", "PaperCNN")
+#: Least side of a picture, in pixels, that the convolutions of an encoder need.
+_LEAST_SIDE: Final = {"PaperCNN": 8, "NatureEncoder": 36}
 ACTOR_NAMES: Final = ("AgentPolicies", "PolicyPool", "SinglePolicy")
 ACTIVATION_NAMES: Final = (
     "ELU",
@@ -44,6 +46,8 @@ ACTIVATION_NAMES: Final = (
     "Softplus",
     "Tanh",
 )
+#: Whether an actor can, or must, be told which actions are legal.
+ACTION_MASKS: Final = ("none", "optional", "required")
 SELECTIONS: Final = ("mixture", "gumbel", "greedy")
 KINDS: Final = ("box", "discrete", "multi_discrete", "multi_binary")
 DTYPES: Final = tuple(
@@ -53,11 +57,8 @@ DTYPES: Final = tuple(
 #: Far above what anybody trains, far below what hurts.
 MAX_MANIFEST_BYTES: Final = 1 << 24
 MAX_DATA_BYTES: Final = 1 << 31
-_MAX_SIZE: Final = 1 << 20
-_MAX_ENTRIES: Final = 1 << 22
 _MAX_LENGTH: Final = 1 << 12
 _MAX_AXES: Final = 8
-_MAX_TEXT: Final = 200
 
 #: One number for all entries of a Box, or nested lists; infinities are the words "inf" and "-inf".
 Bound = float | int | str | list[Any]
@@ -100,12 +101,12 @@ class SpaceRecord:
     @classmethod
     def parse(cls, value: object, where: str) -> SpaceRecord:
         """Read and check; ``where`` is for messages."""
-        entries = _Entries(value, where)
+        entries = Entries(value, where)
         space = cls(
             kind=entries.word("kind", KINDS),
             shape=entries.sizes("shape", _MAX_AXES),
             dtype=entries.word("dtype", DTYPES),
-            choices=entries.sizes("choices", _MAX_ENTRIES),
+            choices=entries.sizes("choices", MAX_ENTRIES),
             low=entries.raw("low"),
             high=entries.raw("high"),
             picture=entries.flag("picture"),
@@ -124,23 +125,23 @@ def _check_space(space: SpaceRecord, where: str) -> None:
     is_box = space.kind == "box"
     looks = (space.picture or space.atlas is not None) and not is_box
     if len(space.choices) != n_choices or len(space.shape) != axes or not is_binary or looks:
-        _refuse(f"{where} has a shape, choices, picture or atlas that a {space.kind!r} space does not have")
-    if size > _MAX_ENTRIES or sum(space.choices) > _MAX_ENTRIES:
-        _refuse(f"{where} has {max(size, sum(space.choices))} entries or choices, more than {_MAX_ENTRIES}")
+        refuse(f"{where} has a shape, choices, picture or atlas that a {space.kind!r} space does not have")
+    if size > MAX_ENTRIES or sum(space.choices) > MAX_ENTRIES:
+        refuse(f"{where} has {max(size, sum(space.choices))} entries or choices, more than {MAX_ENTRIES}")
     if space.picture and (len(space.shape) != 3 or space.dtype != "uint8"):
-        _refuse(f"{where} must be uint8 of three axes to be a picture, got {space.dtype} of shape {space.shape}")
+        refuse(f"{where} must be uint8 of three axes to be a picture, got {space.dtype} of shape {space.shape}")
     if space.atlas is not None and (len(space.shape) != 2 or np.dtype(space.dtype).kind not in "iu"):
-        _refuse(f"{where} must be whole numbers of two axes to have an atlas, got {space.dtype} of {space.shape}")
+        refuse(f"{where} must be whole numbers of two axes to have an atlas, got {space.dtype} of {space.shape}")
     for side, bound in (("low", space.low), ("high", space.high)):
         if (bound is not None) != is_box:
-            _refuse(f"{where} must have {side!r} exactly if it is a box")
+            refuse(f"{where} must have {side!r} exactly if it is a box")
         if bound is not None:
             bound_array(bound, space, f"{where}.{side}")
     if space.atlas is not None:
         assert space.low is not None and space.high is not None
         low, high = bound_array(space.low, space), bound_array(space.high, space)
         if low.min() < 0 or high.max() >= space.atlas[0]:
-            _refuse(f"{where} has codes without an entry in its atlas")
+            refuse(f"{where} has codes without an entry in its atlas")
 
 
 def bound_array(bound: Bound, space: SpaceRecord, where: str = "a bound") -> npt.NDArray[Any]:
@@ -153,9 +154,9 @@ def bound_array(bound: Bound, space: SpaceRecord, where: str = "a bound") -> npt
         with np.errstate(all="raise"):
             array = np.asarray(bound, dtype=space.dtype)
     except (ValueError, TypeError, OverflowError, ArithmeticError, RecursionError):
-        _refuse(f"{where} must be one number of {space.dtype} or nested lists of them")
+        refuse(f"{where} must be one number of {space.dtype} or nested lists of them")
     if array.shape not in ((), space.shape) or np.isnan(array).any():
-        _refuse(f"{where} must be one number or have the shape {space.shape}, without NaN; got {array.shape}")
+        refuse(f"{where} must be one number or have the shape {space.shape}, without NaN; got {array.shape}")
     return array
 
 
@@ -182,7 +183,7 @@ class EncoderNet:
     @classmethod
     def parse(cls, value: object, where: str) -> EncoderNet:
         """Read and check."""
-        entries = _Entries(value, where)
+        entries = Entries(value, where)
         net = cls(
             name=entries.word("name", ENCODER_NAMES),
             features_dim=entries.size("features_dim"),
@@ -218,7 +219,7 @@ class ActorNet:
     @classmethod
     def parse(cls, value: object, where: str) -> ActorNet:
         """Read and check."""
-        entries = _Entries(value, where)
+        entries = Entries(value, where)
         net = cls(
             name=entries.word("name", ACTOR_NAMES),
             hidden=entries.sizes("hidden", _MAX_LENGTH),
@@ -229,7 +230,32 @@ class ActorNet:
         )
         entries.finish()
         if (net.name == "PolicyPool") != (net.n_policies > 1):
-            _refuse(f"{where}: a PolicyPool has at least 2 policies and others have 1, got {net.n_policies}")
+            refuse(f"{where}: a PolicyPool has at least 2 policies and others have 1, got {net.n_policies}")
+        return net
+
+
+@dataclass(frozen=True)
+class MemoryNet:
+    """
+    The LSTM between encoder and policies.
+
+    :param hidden_size: H
+    :param n_layers: layers, one on top of the other
+    :param bias: whether it has biases
+    """
+
+    hidden_size: int
+    n_layers: int
+    bias: bool
+
+    @classmethod
+    def parse(cls, value: object, where: str) -> MemoryNet:
+        """Read and check."""
+        entries = Entries(value, where)
+        net = cls(entries.size("hidden_size"), entries.size("n_layers", _MAX_LENGTH), entries.flag("bias"))
+        entries.finish()
+        if net.hidden_size * net.n_layers > MAX_SIZE:
+            refuse(f"{where} has {net.n_layers} layers of {net.hidden_size}, more than {MAX_SIZE} numbers")
         return net
 
 
@@ -253,7 +279,7 @@ class DataFile:
     @classmethod
     def parse(cls, value: object, where: str) -> DataFile:
         """Read and check."""
-        entries = _Entries(value, where)
+        entries = Entries(value, where)
         result = cls(entries.size("size", MAX_DATA_BYTES), entries.text("sha256"))
         entries.finish()
         return result
@@ -268,12 +294,14 @@ class Manifest:
     :param policy: name of the policy class it was trained with, for people
     :param n_agents: N
     :param reads_agent: whether every agent has a policy of its own
+    :param action_mask: whether actions may be masked: ``"none"``, ``"optional"`` or ``"required"``
     :param selection: ``"mixture"`` or ``"gumbel"``; ``"greedy"`` if parameters are values of actions, of which the best
         is taken
     :param observation: space of one own observation
     :param action: action space
     :param encoder: the encoder; None if only the ONNX file knows
     :param actor: the policies; None if only the ONNX file knows
+    :param memory: the LSTM; None without memory
     :param files: what lies beside the manifest
     """
 
@@ -281,11 +309,13 @@ class Manifest:
     policy: str
     n_agents: int
     reads_agent: bool
+    action_mask: str
     selection: str
     observation: SpaceRecord
     action: SpaceRecord
     encoder: EncoderNet | None
     actor: ActorNet | None
+    memory: MemoryNet | None
     files: Mapping[str, DataFile]
 
     @property
@@ -305,21 +335,23 @@ class Manifest:
 
         :raises ExportError: for anything that :meth:`to_json` would not have written
         """
-        entries = _Entries(_strict_json(text), MANIFEST_FILE)
+        entries = Entries(strict_json(text, MANIFEST_FILE), MANIFEST_FILE)
         _check_format(entries)
         stated = entries.text("checksum")
         if stated != _checksum({name: value for name, value in entries.value.items() if name != "checksum"}):
-            _refuse(f"{MANIFEST_FILE} does not have the checksum that it states: it was changed or damaged")
+            refuse(f"{MANIFEST_FILE} does not have the checksum that it states: it was changed or damaged")
         manifest = cls(
             sb3_saf_version=entries.text("sb3_saf_version"),
             policy=entries.text("policy"),
             n_agents=entries.size("n_agents"),
             reads_agent=entries.flag("reads_agent"),
+            action_mask=entries.word("action_mask", ACTION_MASKS),
             selection=entries.word("selection", SELECTIONS),
             observation=SpaceRecord.parse(entries.raw("observation"), "observation"),
             action=SpaceRecord.parse(entries.raw("action"), "action"),
             encoder=entries.optional("encoder", EncoderNet.parse),
             actor=entries.optional("actor", ActorNet.parse),
+            memory=entries.optional("memory", MemoryNet.parse),
             files=_parse_files(entries.raw("files")),
         )
         entries.finish()
@@ -334,13 +366,15 @@ class Manifest:
         """
         has_nets = self.encoder is not None and self.actor is not None
         if has_nets != (WEIGHTS_FILE in self.files) or has_nets != (self.encoder is not None or self.actor is not None):
-            _refuse(f"{MANIFEST_FILE} must describe encoder and actor exactly if there is a {WEIGHTS_FILE}")
+            refuse(f"{MANIFEST_FILE} must describe encoder and actor exactly if there is a {WEIGHTS_FILE}")
         if not self.files:
-            _refuse(f"{MANIFEST_FILE} names neither {WEIGHTS_FILE} nor {ONNX_FILE}")
+            refuse(f"{MANIFEST_FILE} names neither {WEIGHTS_FILE} nor {ONNX_FILE}")
         if self.actor is not None and self.reads_agent != (self.actor.name == "AgentPolicies"):
-            _refuse(f"reads_agent must say whether the actor is AgentPolicies, got {self.reads_agent}")
+            refuse(f"reads_agent must say whether the actor is AgentPolicies, got {self.reads_agent}")
         if self.selection == "greedy" and self.action.kind != "discrete":
-            _refuse(f"selection 'greedy' needs discrete actions, got {self.action.kind}")
+            refuse(f"selection 'greedy' needs discrete actions, got {self.action.kind}")
+        if self.action_mask != "none" and self.action.kind == "box":
+            refuse("actions of a box cannot be masked")
         if self.encoder is not None:
             _check_encoder(self.encoder, self.observation)
 
@@ -349,16 +383,17 @@ def _check_encoder(net: EncoderNet, space: SpaceRecord) -> None:
     """Check that an encoder can read a space."""
     if net.name == "MLPEncoder":
         if not space.shape and space.kind == "box":
-            _refuse("MLPEncoder needs at least one axis")
+            refuse("MLPEncoder needs at least one axis")
         return
     if space.kind != "box" or (space.atlas is None and len(space.shape) != 3):
-        _refuse(f"{net.name} reads pictures or tile codes, got a {space.kind} of shape {space.shape}")
+        refuse(f"{net.name} reads pictures or tile codes, got a {space.kind} of shape {space.shape}")
     _, height, width = picture_shape(space)
-    if net.name == "PaperCNN" and min(height, width) < 8:
-        _refuse(f"PaperCNN needs at least 8 x 8 pixels, got {height} x {width}")
+    least = _LEAST_SIDE.get(net.name, 1)
+    if min(height, width) < least:
+        refuse(f"{net.name} needs at least {least} x {least} pixels, got {height} x {width}")
     tile = net.tile_size if space.atlas is None else space.atlas[1]
     if net.name == "LightEncoder" and (height % tile or width % tile or tile != net.tile_size):
-        _refuse(f"LightEncoder needs whole tiles of {net.tile_size} pixels, got {height} x {width} in tiles of {tile}")
+        refuse(f"LightEncoder needs whole tiles of {net.tile_size} pixels, got {height} x {width} in tiles of {tile}")
 
 
 def picture_shape(space: SpaceRecord) -> tuple[int, int, int]:
@@ -374,121 +409,24 @@ def picture_shape(space: SpaceRecord) -> tuple[int, int, int]:
     return (first, second, third) if first == min(space.shape) else (third, first, second)
 
 
-class _Entries:
-    """
-    The entries of a JSON object, taken out one by one.
-
-    :param value: what should be an object
-    :param where: its name, for messages
-    """
-
-    def __init__(self, value: object, where: str):
-        if not isinstance(value, dict):
-            _refuse(f"{where} must be an object with named entries, got {_short(value)}")
-        self.value, self.where = value, where
-        self.taken: set[str] = set()
-
-    def raw(self, name: str) -> Any:
-        """Any value."""
-        if name not in self.value:
-            _refuse(f"{self.where} lacks {name!r}")
-        self.taken.add(name)
-        return self.value[name]
-
-    def text(self, name: str) -> str:
-        """A short text."""
-        value = self.raw(name)
-        if not isinstance(value, str) or len(value) > _MAX_TEXT:
-            _refuse(f"{self.where}.{name} must be a text of at most {_MAX_TEXT} letters, got {_short(value)}")
-        return value
-
-    def word(self, name: str, choices: tuple[str, ...]) -> str:
-        """One of a few words."""
-        value = self.raw(name)
-        if not isinstance(value, str) or value not in choices:
-            _refuse(f"{self.where}.{name} must be one of {', '.join(choices)}, got {_short(value)}")
-        return value
-
-    def flag(self, name: str) -> bool:
-        """True or false."""
-        value = self.raw(name)
-        if not isinstance(value, bool):
-            _refuse(f"{self.where}.{name} must be true or false, got {_short(value)}")
-        return value
-
-    def size(self, name: str, most: int = _MAX_SIZE) -> int:
-        """A whole number of at least 1."""
-        return self._size(self.raw(name), name, most)
-
-    def _size(self, value: object, name: str, most: int = _MAX_SIZE) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-            _refuse(f"{self.where}.{name} must be a whole number in 1..{most}, got {_short(value)}")
-        return value
-
-    def sizes(self, name: str, most: int) -> tuple[int, ...]:
-        """A list of whole numbers of at least 1."""
-        value = self.raw(name)
-        if not isinstance(value, list) or len(value) > most:
-            _refuse(f"{self.where}.{name} must be a list of at most {most} whole numbers, got {_short(value)}")
-        return tuple(self._size(number, name) for number in value)
-
-    def atlas(self, name: str) -> tuple[int, int, int, int] | None:
-        """Shape of an atlas, or None."""
-        if self.raw(name) is None:
-            return None
-        shape = self.sizes(name, 4)
-        if len(shape) != 4 or shape[1] != shape[2] or prod(shape) > _MAX_ENTRIES:
-            _refuse(f"{self.where}.{name} must be (codes, tile, tile, channels), got {shape}")
-        return shape[0], shape[1], shape[2], shape[3]
-
-    def optional(self, name: str, parse: Callable[[object, str], Any]) -> Any:
-        """What ``parse`` makes of it, or None."""
-        value = self.raw(name)
-        return None if value is None else parse(value, name)
-
-    def finish(self) -> None:
-        """Refuse entries that nobody asked for."""
-        unknown = sorted(set(self.value) - self.taken)
-        if unknown:
-            _refuse(f"{self.where} has an unknown entry {_short(unknown[0])}")
-
-
 def _parse_files(value: object) -> dict[str, DataFile]:
-    entries = _Entries(value, "files")
+    entries = Entries(value, "files")
     # A closed list: no name in a file decides what is opened.
     files = {name: DataFile.parse(entries.raw(name), f"files.{name}") for name in DATA_FILES if name in entries.value}
     entries.finish()
     return files
 
 
-def _check_format(entries: _Entries) -> None:
+def _check_format(entries: Entries) -> None:
     if entries.raw("format") != FORMAT:
-        _refuse(f"{MANIFEST_FILE} is not of an exported actor: its format is {_short(entries.raw('format'))}")
+        refuse(f"{MANIFEST_FILE} is not of an exported actor: its format is {short(entries.raw('format'))}")
     version = entries.raw("format_version")
     if isinstance(version, bool) or version != FORMAT_VERSION:
-        _refuse(
-            f"{MANIFEST_FILE} has format version {_short(version)}, written by sb3_saf "
-            f"{_short(entries.value.get('sb3_saf_version'))}; this version reads {FORMAT_VERSION}: load it with the "
+        refuse(
+            f"{MANIFEST_FILE} has format version {short(version)}, written by sb3_saf "
+            f"{short(entries.value.get('sb3_saf_version'))}; this version reads {FORMAT_VERSION}: load it with the "
             "version that wrote it, or export again"
         )
-
-
-def _strict_json(text: bytes) -> Any:
-    """JSON without what Python's parser lets through: NaN, infinities, names that occur twice."""
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = [name for name, _ in pairs]
-        if len(set(names)) != len(names):
-            raise ValueError("a name occurs twice")
-        return dict(pairs)
-
-    def constant(name: str) -> NoReturn:
-        raise ValueError(f"{name} is no number")
-
-    try:
-        return json.loads(text.decode("utf-8"), object_pairs_hook=unique, parse_constant=constant)
-    except (ValueError, RecursionError) as error:
-        _refuse(f"{MANIFEST_FILE} is not valid JSON: {error}", error)
 
 
 def _checksum(entries: Mapping[str, Any]) -> str:
@@ -496,17 +434,4 @@ def _checksum(entries: Mapping[str, Any]) -> str:
     try:
         return hashlib.sha256(json.dumps(entries, sort_keys=True).encode("utf-8")).hexdigest()
     except (ValueError, TypeError, RecursionError) as error:
-        _refuse(f"{MANIFEST_FILE} cannot be summed up: {error}", error)
-
-
-def _refuse(message: str, cause: Exception | None = None) -> NoReturn:
-    raise ExportError(message) from cause
-
-
-def _short(value: object) -> str:
-    """A value for a message, cut if a stranger made it long."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # numbers of thousands of digits
-        return f"a {type(value).__name__}"
-    return text if len(text) <= 60 else f"{text[:57]}..."
+        refuse(f"{MANIFEST_FILE} cannot be summed up: {error}", error)

@@ -15,7 +15,15 @@ import torch as th
 from torch import nn
 
 from sb3_saf.common.networks import mlp
-from sb3_saf.export.manifest import ACTIVATION_NAMES, ActorNet, EncoderNet, Manifest, SpaceRecord, picture_shape
+from sb3_saf.export.manifest import (
+    ACTIVATION_NAMES,
+    ActorNet,
+    EncoderNet,
+    Manifest,
+    MemoryNet,
+    SpaceRecord,
+    picture_shape,
+)
 
 #: Activations that a file may name.
 ACTIVATIONS: Final[dict[str, type[nn.Module]]] = {name: getattr(nn, name) for name in ACTIVATION_NAMES}
@@ -83,6 +91,44 @@ class PaperCNN(nn.Module):
         return features
 
 
+class NatureEncoder(nn.Module):
+    """See ``sb3_saf.NatureEncoder``."""
+
+    def __init__(self, space: SpaceRecord, net: EncoderNet):
+        super().__init__()
+        self.pixels = Pictures(space, net.divide_by_255)
+        self.nature = _NatureCNN(self.pixels.shape, net.features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) raw observations to (K, d)."""
+        features: th.Tensor = self.nature(self.pixels(observations))
+        return features
+
+
+class _NatureCNN(nn.Module):
+    """Stable-Baselines3's, without Stable-Baselines3."""
+
+    def __init__(self, shape: tuple[int, int, int], features_dim: int):
+        super().__init__()
+        channels, height, width = shape
+        out = [(((size - 8) // 4 + 1 - 4) // 2 + 1 - 3) + 1 for size in (height, width)]
+        self.cnn = nn.Sequential(
+            nn.Conv2d(channels, 32, kernel_size=8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, kernel_size=3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        self.linear = nn.Sequential(nn.Linear(64 * prod(out), features_dim), nn.ReLU())
+
+    def forward(self, pictures: th.Tensor) -> th.Tensor:
+        """(K, C, H, W) to (K, d)."""
+        features: th.Tensor = self.linear(self.cnn(pictures))
+        return features
+
+
 class LightEncoder(nn.Module):
     """See ``sb3_saf.LightEncoder``."""
 
@@ -142,6 +188,7 @@ class MLPEncoder(nn.Module):
 ENCODERS: Final[dict[str, Callable[[SpaceRecord, EncoderNet], nn.Module]]] = {
     "LightEncoder": LightEncoder,
     "MLPEncoder": MLPEncoder,
+    "NatureEncoder": NatureEncoder,
     "PaperCNN": PaperCNN,
 }
 
@@ -257,41 +304,73 @@ def make_actor(
     return PolicyPool(query_net, net.latent_dim, heads(net.n_policies))
 
 
+def make_memory(net: MemoryNet | None, features_dim: int) -> nn.LSTM | None:
+    """
+    The LSTM, with weights yet to be loaded.
+
+    :param net: its sizes; None without memory
+    :param features_dim: d
+    """
+    return None if net is None else nn.LSTM(features_dim, net.hidden_size, net.n_layers, bias=net.bias)
+
+
 class ActorNetwork(nn.Module):
     """
     All that an agent needs to act.
 
     :param encoder: (K, *shape) raw own observations to (K, d)
-    :param actor: (K, d) and agents to log weights and parameters
+    :param memory: LSTM over the features of one step after the other, (K, d) to (K, H); None without memory
+    :param actor: (K, d), or (K, H), and agents to log weights and parameters
     :param gives_log_probs: whether actions are discrete, so that each has a probability
     """
 
     def __init__(
-        self, encoder: nn.Module, actor: SinglePolicy | AgentPolicies | PolicyPool, gives_log_probs: bool
+        self,
+        encoder: nn.Module,
+        memory: nn.LSTM | None,
+        actor: SinglePolicy | AgentPolicies | PolicyPool,
+        gives_log_probs: bool,
     ) -> None:
         super().__init__()
-        self.encoder, self.actor, self.gives_log_probs = encoder, actor, gives_log_probs
+        self.encoder, self.memory, self.actor, self.gives_log_probs = encoder, memory, actor, gives_log_probs
 
     @classmethod
     def of(cls, manifest: Manifest) -> ActorNetwork:
         """The networks that a manifest describes, with weights yet to be loaded."""
-        encoder, actor = manifest.encoder, manifest.actor
+        encoder, actor, memory = manifest.encoder, manifest.actor, manifest.memory
         assert encoder is not None and actor is not None
+        latent_dim = encoder.features_dim if memory is None else memory.hidden_size
         return cls(
             ENCODERS[encoder.name](manifest.observation, encoder),
-            make_actor(actor, encoder.features_dim, manifest.action, manifest.n_agents, ACTIVATIONS[actor.activation]),
+            make_memory(memory, encoder.features_dim),
+            make_actor(actor, latent_dim, manifest.action, manifest.n_agents, ACTIVATIONS[actor.activation]),
             manifest.gives_log_probs,
         )
 
-    def forward(self, observation: th.Tensor, agent: th.Tensor | None = None) -> tuple[th.Tensor, ...]:
+    def forward(
+        self,
+        observation: th.Tensor,
+        agent: th.Tensor | None = None,
+        hidden: th.Tensor | None = None,
+        cell: th.Tensor | None = None,
+    ) -> tuple[th.Tensor, ...]:
         """
         Everything that the action depends on.
 
         :param observation: (K, *shape) raw own observations
         :param agent: (K,) indices of agents, where each has a policy of its own
-        :return: log weights (K, U), parameters (K, U, P), and for discrete actions log-probabilities (K, A)
+        :param hidden: (layers, K, H) what is remembered, where there is a memory
+        :param cell: the same of the LSTM's cells
+        :return: log weights (K, U), parameters (K, U, P), for discrete actions log-probabilities (K, A), and with a
+            memory the next hidden and cell states
         """
-        log_weights, parameters = self.actor(self.encoder(observation), agent)
+        latent, states = self.encoder(observation), ()
+        if self.memory is not None:
+            assert hidden is not None and cell is not None
+            outputs, states = self.memory(latent.unsqueeze(0), (hidden, cell))
+            latent = outputs.squeeze(0)
+        log_weights, parameters = self.actor(latent, agent)
         if not self.gives_log_probs:
-            return log_weights, parameters
-        return log_weights, parameters, (log_weights.unsqueeze(2) + parameters.log_softmax(dim=2)).logsumexp(dim=1)
+            return log_weights, parameters, *states
+        log_probs = (log_weights.unsqueeze(2) + parameters.log_softmax(dim=2)).logsumexp(dim=1)
+        return log_weights, parameters, log_probs, *states

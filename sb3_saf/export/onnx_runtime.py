@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_saf.export.act import NumpyDraws, Outputs
+from sb3_saf.export.act import NumpyDraws, Outputs, States
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import read_checked
 from sb3_saf.export.manifest import ONNX_FILE, Manifest
@@ -46,33 +46,35 @@ class OnnxRuntime:
         self.agent = agent
         self.rng = np.random.default_rng()
 
-    def __call__(self, observations: Array) -> Outputs:
-        """(K, *shape) own observations to the network's outputs."""
-        inputs = {"observation": observations}
+    def __call__(self, observations: Array, states: States = ()) -> tuple[Outputs, States]:
+        """(K, *shape) own observations and what is remembered, to the network's outputs and what is remembered then."""
+        inputs = {"observation": observations, **dict(zip(("hidden", "cell"), states, strict=False))}
         if self.manifest.reads_agent:
             inputs["agent"] = np.full(len(observations), self.agent, dtype=np.int64)
         try:
             outputs = self.session.run(None, inputs)
         except Exception as error:
             raise ExportError(f"{ONNX_FILE} does not run on such observations: {str(error)[:200]}") from error
-        return self._checked(outputs, len(observations))
+        return self._checked(outputs, len(observations), states)
 
     def draws(self, seed: int | None) -> NumpyDraws:
         """The actor's own generator, or a new one with a seed."""
         return NumpyDraws(self.rng if seed is None else np.random.default_rng(seed))
 
-    def _checked(self, outputs: list[Any], n_rows: int) -> Outputs:
+    def _checked(self, outputs: list[Any], n_rows: int, states: States) -> tuple[Outputs, States]:
         """Nothing ties a stranger's graph to its manifest but this."""
         action = self.manifest.action
         n_parameters = action.n_outputs * (2 if action.kind == "box" else 1)
         arrays = [np.asarray(output) for output in outputs]
         n_policies = arrays[0].shape[-1] if arrays and arrays[0].ndim else 0
-        shapes = [(n_rows, n_policies), (n_rows, n_policies, n_parameters)]
+        shapes: list[tuple[int, ...]] = [(n_rows, n_policies), (n_rows, n_policies, n_parameters)]
         if self.manifest.gives_log_probs:
             shapes.append((n_rows, n_parameters))
+        n_outputs = len(shapes)
+        shapes += [state.shape for state in states]
         found = [array.shape for array in arrays]
         if found != shapes or n_policies < 1 or any(array.dtype != np.float32 for array in arrays):
             raise ExportError(f"{ONNX_FILE} gives outputs of the shapes {found}, expected float32 of {shapes}")
         if any(np.isnan(array).any() for array in arrays):
             raise ExportError(f"{ONNX_FILE} gives NaN")
-        return Outputs(*arrays)
+        return Outputs(*arrays[:n_outputs]), tuple(arrays[n_outputs:])

@@ -9,26 +9,24 @@ from contextlib import contextmanager
 
 import torch as th
 
+from sb3_saf.export.comparison import check_close
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.network import ActorNetwork
-from sb3_saf.export.writer import agents_of, check_close
 
 _OPSET = 18
 
 
-def onnx_bytes(
-    network: ActorNetwork, observations: th.Tensor, reads_agent: bool, expected: tuple[th.Tensor, ...]
-) -> bytes:
+def onnx_bytes(network: ActorNetwork, inputs: dict[str, th.Tensor], expected: tuple[th.Tensor, ...]) -> bytes:
     """
     Write the graph, run it, and compare.
 
-    Inputs: ``observation`` (rows, *shape) of the observation space's own dtype, and ``agent`` (rows,) int64 where each
-    agent has a policy of its own. Outputs: ``log_weights`` (rows, U), ``parameters`` (rows, U, P), and for discrete
-    actions ``log_probs`` (rows, A).
+    Inputs: ``observation`` (rows, *shape) of the observation space's own dtype, ``agent`` (rows,) int64 where each
+    agent has a policy of its own, and where there is a memory ``hidden`` and ``cell`` (layers, rows, H). Outputs:
+    ``log_weights`` (rows, U), ``parameters`` (rows, U, P), for discrete actions ``log_probs`` (rows, A), and with a
+    memory ``next_hidden`` and ``next_cell``.
 
     :param network: what to write
-    :param observations: (K, *shape), to trace and to compare with
-    :param reads_agent: whether there is an input ``agent``
+    :param inputs: by name, to trace and to compare with
     :param expected: the network's outputs
     :raises ImportError: if onnx, onnxscript or onnxruntime are missing
     :raises ExportError: if the network cannot be written as a graph, or the graph gives other numbers
@@ -40,9 +38,6 @@ def onnx_bytes(
         raise ImportError(
             'writing ONNX needs onnx, onnxscript and onnxruntime: pip install "sb3-saf[export]", or pass onnx=False'
         ) from error
-    inputs = {"observation": observations}
-    if reads_agent:
-        inputs["agent"] = agents_of(observations, len(network.actor.heads))  # type: ignore[arg-type]
     data = _written(network, inputs)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -56,16 +51,18 @@ def onnx_bytes(
 def _written(network: ActorNetwork, inputs: dict[str, th.Tensor]) -> bytes:
     rows = th.export.Dim("rows")
     names = ["log_weights", "parameters", "log_probs"][: 3 if network.gives_log_probs else 2]
+    names += [] if network.memory is None else ["next_hidden", "next_cell"]
+    axes = {name: {1 if name in ("hidden", "cell") else 0: rows} for name in inputs}
     try:
         with _quiet():
             program = th.onnx.export(
                 network,
-                tuple(inputs.values()),
+                kwargs=inputs,
                 input_names=list(inputs),
                 output_names=names,
                 opset_version=_OPSET,
                 dynamo=True,
-                dynamic_shapes=tuple({0: rows} for _ in inputs),
+                dynamic_shapes=axes,
                 external_data=False,
                 verbose=False,
             )

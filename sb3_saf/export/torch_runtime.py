@@ -10,7 +10,7 @@ import torch as th
 from safetensors import SafetensorError
 from safetensors.torch import load
 
-from sb3_saf.export.act import Outputs
+from sb3_saf.export.act import Outputs, States
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import read_checked
 from sb3_saf.export.manifest import MANIFEST_FILE, WEIGHTS_FILE, ActorNet, Manifest
@@ -40,10 +40,13 @@ class TorchRuntime:
             assert agent is not None
             self.network.actor = policies.of_agent(agent)
 
-    def __call__(self, observations: Array) -> Outputs:
-        """(K, *shape) own observations to the network's outputs."""
+    def __call__(self, observations: Array, states: States = ()) -> tuple[Outputs, States]:
+        """(K, *shape) own observations and what is remembered, to the network's outputs and what is remembered then."""
         with th.inference_mode():
-            return Outputs(*(output.numpy() for output in self.network(th.tensor(observations))))
+            outputs = self.network(th.tensor(observations), None, *(th.tensor(state) for state in states))
+        arrays = [output.numpy() for output in outputs]
+        n_outputs = len(arrays) - len(states)
+        return Outputs(*arrays[:n_outputs]), tuple(arrays[n_outputs:])
 
     def draws(self, seed: int | None) -> TorchDraws:
         """Torch's global generator, or a new one with a seed."""
@@ -78,6 +81,8 @@ def _check_layers(manifest: Manifest, n_tensors: int) -> None:
     assert isinstance(actor, ActorNet)
     n_heads = manifest.n_agents if actor.name == "AgentPolicies" else actor.n_policies
     needed = 2 * (n_heads * (len(actor.hidden) + 1) + len(actor.projection_hidden))
+    if manifest.memory is not None:
+        needed += 2 * manifest.memory.n_layers
     if needed > n_tensors:
         raise ExportError(f"{MANIFEST_FILE} describes at least {needed} tensors, {WEIGHTS_FILE} has {n_tensors}")
 

@@ -6,7 +6,7 @@ import copy
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +18,19 @@ from stable_baselines3.common.preprocessing import is_image_space, preprocess_ob
 from torch import nn
 
 from sb3_saf.common.actor import ActionHead, SinglePolicy
-from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN, is_tile_space
+from sb3_saf.common.encoders import (
+    LightEncoder,
+    MLPEncoder,
+    NatureEncoder,
+    ObservationEncoder,
+    PaperCNN,
+    is_tile_space,
+)
 from sb3_saf.common.networks import AgentHeads
-from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.common.policies import TeamPolicy
+from sb3_saf.contrib.maskable import TeamMaskablePolicy
+from sb3_saf.contrib.recurrent import TeamRecurrentPolicy
+from sb3_saf.export.comparison import ExportablePolicy, compare, some_inputs
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import write_folder
 from sb3_saf.export.manifest import (
@@ -33,18 +43,12 @@ from sb3_saf.export.manifest import (
     DataFile,
     EncoderNet,
     Manifest,
+    MemoryNet,
     SpaceRecord,
 )
-from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor
+from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor, make_memory
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.saf.policy_pool import PolicyPool
-
-#: Policies whose actors read one agent's own observation and nothing else.
-ExportablePolicy: TypeAlias = TeamActorCriticPolicy | QPLEXPolicy
-
-#: Largest difference between the model's and the exported network's outputs, beside the outputs' own size.
-_TOLERANCE = 1e-4
-_N_CHECKED = 16
 
 
 def export_actors(
@@ -65,11 +69,13 @@ def export_actors(
     ``act.py``            an example that needs NumPy and onnxruntime alone
     ===================== ============================================================================
 
-    Nothing of the critic is written. ``sb3_saf.Actor.load`` reads the folder. With an encoder or activation of your
-    own, which no file can name, there is no ``actor.safetensors``: the ONNX graph is all. The folder appears whole or
-    not at all; an earlier export in it is replaced.
+    Nothing of the critic is written. ``sb3_saf.Actor.load`` reads the folder. Actors of models with masks of actions
+    are told the mask with each observation, those of models with memory carry one (see :class:`~sb3_saf.Actor`). With
+    an encoder or activation of your own, which no file can name, there is no ``actor.safetensors``: the ONNX graph is
+    all. The folder appears whole or not at all; an earlier export in it is replaced.
 
-    :param model: PPO or A2C with SAFPolicy, MAPPOPolicy or IPPOPolicy, QPLEX without memory, or the policy itself
+    :param model: an algorithm with a SAF, MAPPO or IPPO policy, also recurrent or maskable; QPLEX without memory; or
+        the policy itself
     :param folder: where to
     :param onnx: whether to write ``actor.onnx`` and ``act.py``, which needs ``pip install "sb3-saf[export]"``
     :param overwrite: whether to replace a folder that is not an export, with everything in it
@@ -80,8 +86,8 @@ def export_actors(
     policy = _checked_policy(model)
     described = _Described.of(policy)
     network = described.network(policy)
-    observations = _some_observations(policy.team_spaces.own)
-    expected = _compare(policy, network, observations)
+    inputs = some_inputs(policy, described.memory)
+    expected = compare(policy, network, inputs)
     data: dict[str, bytes] = {}
     if described.encoder is not None and described.actor_name_is_known:
         data[WEIGHTS_FILE] = save({name: tensor.contiguous() for name, tensor in network.state_dict().items()})
@@ -93,7 +99,7 @@ def export_actors(
     if onnx:
         from sb3_saf.export.onnx_writer import onnx_bytes
 
-        data[ONNX_FILE] = onnx_bytes(network, observations, described.reads_agent, expected)
+        data[ONNX_FILE] = onnx_bytes(network, inputs, expected)
     manifest = described.manifest(policy, {name: DataFile.of(content) for name, content in data.items()})
     data[MANIFEST_FILE] = manifest.to_json().encode("utf-8")
     if onnx:
@@ -106,20 +112,17 @@ def export_actors(
 
 def _checked_policy(model: object) -> ExportablePolicy:
     policy = getattr(model, "policy", model)
-    if not isinstance(policy, (TeamActorCriticPolicy, QPLEXPolicy)):
+    if not isinstance(policy, (TeamPolicy, QPLEXPolicy)):
         raise ExportError(
             f"expected a model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got "
             f"{type(policy).__name__}; policies of "
             "Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
-    if policy.team_spaces.action_mask is not None:
+    if getattr(policy, "memory", None) is not None:
         raise ExportError(
-            "an exported actor reads its own observation and nothing else, so it would not keep to the action masks of "
-            "this model's environment; act with model.predict, or train without masks: "
-            "make_team_env(..., action_masks=False)"
+            f"{type(policy).__name__} cannot be exported: its memory reads the agent's last action, too; act with "
+            "model.predict, which carries the state, or train RecurrentPPO's policies, whose memory can be exported"
         )
-    if hasattr(policy, "lstm_actor") or getattr(policy, "memory", None) is not None:
-        raise ExportError("recurrent policies cannot be exported yet: their actors carry a hidden state")
     if type(policy.actor) not in (SinglePolicy, PolicyPool):
         raise ExportError(f"expected the actor SinglePolicy or PolicyPool, got {type(policy.actor).__name__}")
     wrong = [name for name, tensor in policy.state_dict().items() if not bool(tensor.isfinite().all())]
@@ -132,6 +135,7 @@ class _Described(NamedTuple):
     """What the parts of a policy are in the words of a manifest."""
 
     encoder: EncoderNet | None
+    memory: MemoryNet | None
     actor: ActorNet
     features_dim: int
     selection: str
@@ -151,6 +155,7 @@ class _Described(NamedTuple):
         own = policy.team_spaces.own
         return cls(
             encoder=_describe_encoder(policy),
+            memory=_describe_memory(policy),
             actor=_describe_actor(policy),
             features_dim=policy.features_dim,
             selection=_selection(policy),
@@ -167,13 +172,18 @@ class _Described(NamedTuple):
             encoder = ENCODERS[self.encoder.name](self.observation, self.encoder)
             encoder.load_state_dict(_encoder_tensors(policy), strict=True)
         n_agents = policy.team_spaces.n_agents
-        actor = make_actor(self.actor, self.features_dim, self.action, n_agents, policy.activation_fn)
+        memory = make_memory(self.memory, self.features_dim)
+        if memory is not None:
+            assert isinstance(policy, TeamRecurrentPolicy)
+            memory.load_state_dict(policy.lstm_actor.state_dict(), strict=True)
+        latent_dim = self.features_dim if self.memory is None else self.memory.hidden_size
+        actor = make_actor(self.actor, latent_dim, self.action, n_agents, policy.activation_fn)
         prefix = "head." if self.reads_agent else ""
         actor.load_state_dict(
             {name.removeprefix(prefix): tensor for name, tensor in policy.actor.state_dict().items()}, strict=True
         )
         gives_log_probs = self.action.kind == "discrete" and self.selection != "greedy"
-        return ActorNetwork(encoder, actor, gives_log_probs).requires_grad_(False).eval()
+        return ActorNetwork(encoder, memory, actor, gives_log_probs).requires_grad_(False).eval()
 
     def manifest(self, policy: ExportablePolicy, data: dict[str, DataFile]) -> Manifest:
         """The manifest beside some files."""
@@ -185,11 +195,13 @@ class _Described(NamedTuple):
             policy=type(policy).__name__,
             n_agents=policy.team_spaces.n_agents,
             reads_agent=self.reads_agent,
+            action_mask=_action_mask(policy),
             selection=self.selection,
             observation=self.observation,
             action=self.action,
             encoder=self.encoder if complete else None,
             actor=self.actor if complete else None,
+            memory=self.memory,
             files=data,
         )
 
@@ -218,6 +230,24 @@ def _selection(policy: ExportablePolicy) -> str:
     return policy.actor.selection if isinstance(policy.actor, PolicyPool) else "mixture"
 
 
+def _action_mask(policy: ExportablePolicy) -> str:
+    """Whether the policy asks for masks: with each observation, or only if somebody has one."""
+    if policy.team_spaces.action_mask is not None:
+        return "required"
+    return "optional" if isinstance(policy, TeamMaskablePolicy) else "none"
+
+
+def _describe_memory(policy: ExportablePolicy) -> MemoryNet | None:
+    if not isinstance(policy, TeamRecurrentPolicy):
+        return None
+    lstm = policy.lstm_actor
+    if lstm.bidirectional or lstm.proj_size or lstm.batch_first:
+        raise ExportError(
+            f"expected an LSTM that goes forward, lstm_kwargs of bias and dropout at most, got {policy.lstm_kwargs}"
+        )
+    return MemoryNet(lstm.hidden_size, lstm.num_layers, lstm.bias)
+
+
 def _inner_encoder(policy: ExportablePolicy) -> nn.Module:
     extractor = policy.features_extractor
     return extractor.encoder if type(extractor) is ObservationEncoder else extractor
@@ -228,8 +258,8 @@ def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
     own, encoder = policy.team_spaces.own, _inner_encoder(policy)
     divide = bool(policy.normalize_images and isinstance(own, spaces.Box) and is_image_space(own))
     features_dim = policy.features_dim
-    if type(encoder) is PaperCNN:
-        return EncoderNet("PaperCNN", features_dim, divide)
+    if type(encoder) in (PaperCNN, NatureEncoder):
+        return EncoderNet(type(encoder).__name__, features_dim, divide)
     if type(encoder) is MLPEncoder:
         return EncoderNet("MLPEncoder", features_dim, divide, hidden=_hidden(encoder.net)[0])
     if type(encoder) is LightEncoder:
@@ -317,47 +347,3 @@ def _merged(number: Any, word: Any) -> Bound:
         return [_merged(*pair) for pair in zip(number, word, strict=True)]
     result: Bound = word or number
     return result
-
-
-# --- checking ---------------------------------------------------------------------------------------------------------
-
-
-def _some_observations(own: spaces.Space[Any]) -> th.Tensor:
-    """(K, *shape) random observations; the space's own generator is left alone."""
-    space = copy.deepcopy(own)
-    space.seed(0)
-    return th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))
-
-
-def _compare(policy: ExportablePolicy, network: ActorNetwork, observations: th.Tensor) -> tuple[th.Tensor, ...]:
-    """The exported network's outputs, once they are known to be the model's."""
-    was_training = policy.training
-    policy.set_training_mode(False)
-    with th.no_grad():
-        agent = agents_of(observations, policy.team_spaces.n_agents) if policy.actor.reads_agent else None
-        features = policy.extract_features(observations.to(policy.device))
-        expected = policy.actor(features, None if agent is None else agent.to(policy.device)).cpu()
-        outputs = network(observations) if agent is None else network(observations, agent)
-    policy.set_training_mode(was_training)
-    found = outputs[-1].flatten(1)
-    if not isinstance(policy.actor, PolicyPool):
-        found = outputs[1].flatten(1)
-    elif found.shape != expected.shape:
-        found = th.cat([outputs[0], outputs[1].flatten(1)], dim=1)
-    check_close(found, expected, f"{type(policy).__name__} does more than its encoder and actor show")
-    return tuple(outputs)
-
-
-def agents_of(observations: th.Tensor, n_agents: int) -> th.Tensor:
-    """(K,) indices of agents in turn."""
-    return th.arange(len(observations)) % n_agents
-
-
-def check_close(found: th.Tensor, expected: th.Tensor, otherwise: str) -> None:
-    """
-    Compare outputs.
-
-    :raises ExportError: if they differ by more than rounding does
-    """
-    if found.shape != expected.shape or not th.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
-        raise ExportError(f"the exported network does not give the model's numbers: {otherwise}")

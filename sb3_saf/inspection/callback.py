@@ -17,14 +17,15 @@ from sb3_saf.common.game_steps import game_steps
 from sb3_saf.common.teams import check_count, require_n_agents
 from sb3_saf.inspection.doors import Zones, check_zones, zone_function
 from sb3_saf.inspection.episodes import Player
-from sb3_saf.inspection.insides import require_team_policy
 from sb3_saf.inspection.inspection import Inspection, inspect_with
+from sb3_saf.inspection.kinds import require_our_policy
 from sb3_saf.inspection.page import Page, hparams, hyperparameters
+from sb3_saf.qplex.policies import QPLEXPolicy
 
 
 class InspectionCallback(BaseCallback):
     """
-    Look into SAF, MAPPO and IPPO while they train.
+    Look into SAF, MAPPO, IPPO and QPLEX while they train.
 
     Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes, and what
     it does and thinks is written to the run's own TensorBoard file: team returns; which policy of the pool acts, by
@@ -39,7 +40,8 @@ class InspectionCallback(BaseCallback):
     :param every_game_steps: game steps (of training, summed over all parallel games) between inspections
     :param n_eval_episodes: team episodes per inspection
     :param seed: of the episodes; the same ones are played at every inspection
-    :param deterministic: whether the policy takes its most likely actions; as it trains, it does not
+    :param deterministic: whether the policy takes its most likely actions; as it trains, it does not. QPLEX always
+        takes its best ones
     :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) whole numbers from 0; None asks the
         games for ``agent_zones``, as HECOGrid's have them; False for no zones
     :param pictures: whether to draw figures and episodes, which needs matplotlib and Pillow; False writes numbers only
@@ -82,7 +84,7 @@ class InspectionCallback(BaseCallback):
     # --- when -------------------------------------------------------------------------------------------------------
 
     def _init_callback(self) -> None:
-        require_team_policy(self.model.policy)
+        require_our_policy(self.model.policy)
         _check_fits(self.training_env, self.eval_env)
 
     def _on_training_start(self) -> None:
@@ -97,8 +99,8 @@ class InspectionCallback(BaseCallback):
                 stacklevel=2,
             )
         scalars = self._inspect()
-        self._page.arrange(scalars)
-        policy = require_team_policy(self.model.policy)
+        policy = require_our_policy(self.model.policy)
+        self._page.arrange(scalars, value_based=isinstance(policy, QPLEXPolicy))
         self._page.show("hparams", hparams(hyperparameters(self.model, policy, self.hparams), scalars))
         self._page.write(self.num_timesteps)
 
@@ -108,7 +110,8 @@ class InspectionCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        if self._last != self._game_steps():
+        # RL-Zoo3 ends callbacks even if training never began, which would hide why.
+        if self._last is not None and self._last != self._game_steps():
             self._inspect()
 
     def _game_steps(self) -> int:

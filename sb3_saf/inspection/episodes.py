@@ -15,10 +15,11 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.common.centralized import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.common.policies import TeamPolicy
 from sb3_saf.common.teams import ACTIVE_KEY, require_n_agents, team_dones
 from sb3_saf.inspection.doors import Picture, ZoneFunction, draws_pictures, picture, zones_now
-from sb3_saf.inspection.insides import Insides, Replacement, StepView, insides_of, takes_masks
+from sb3_saf.inspection.insides import Insides, Replacement, StepView, takes_masks
+from sb3_saf.inspection.kinds import OurPolicy, insides_of
+from sb3_saf.inspection.q_insides import QInsides
 
 Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
@@ -30,9 +31,10 @@ class Played(NamedTuple):
     What was seen of all games, step by step. Rows count while their agent takes part in an episode of the set.
 
     :param n_agents: N
+    :param of_team: whether values and rewards are the team's, the same in all its rows, not the agent's own
     :param counted: (T, B) whether the row counts
     :param rewards: (T, B) as the critic learns them
-    :param ends: (T, B) whether the agent's own part of the episode ended with this step
+    :param ends: (T, B) whether the episode ended with this step, or (unless values are the team's) the agent's own part
     :param last_values: (T, B) value of what follows a time limit that is no true end, else 0
     :param values: (T, B)
     :param zones: (T, B), -1 for none; None where there are no zones
@@ -47,6 +49,7 @@ class Played(NamedTuple):
     """
 
     n_agents: int
+    of_team: bool
     counted: Bools
     rewards: Floats
     ends: Bools
@@ -86,7 +89,7 @@ class Player:
         self.zones = zones
 
     @th.no_grad()
-    def play(self, policy: TeamPolicy, training: VecNormalize | None = None, draw: bool = False) -> Played:
+    def play(self, policy: OurPolicy, training: VecNormalize | None = None, draw: bool = False) -> Played:
         """
         Play all episodes.
 
@@ -97,8 +100,8 @@ class Player:
         share = (self.n_episodes + np.arange(self.n_games)) // self.n_games
         self.env.seed(self.seed)
         obs = self.env.reset()
-        steps, pictures = _Steps(self.n_games, self.n_agents), []
         insides = insides_of(policy, self.env.num_envs, self.deterministic)
+        steps, pictures = _Steps(self.n_games, self.n_agents, insides.of_team), []
         draw = draw and draws_pictures(self.env)
         starts = np.ones(self.env.num_envs, dtype=bool)
         while (steps.episodes < share).any():
@@ -116,7 +119,7 @@ class Player:
             starts = np.asarray(dones, dtype=bool)
         return steps.played([frame for frame in pictures if frame is not None])
 
-    def _action_masks(self, policy: TeamPolicy) -> Bools | None:
+    def _action_masks(self, policy: OurPolicy) -> Bools | None:
         return get_action_masks(self.env) if takes_masks(policy) and is_masking_supported(self.env) else None
 
     def _rewards(self, rewards: Floats, training: VecNormalize | None) -> tuple[Floats, Floats]:
@@ -131,10 +134,12 @@ class _Steps:
 
     :param n_games: E
     :param n_agents: N
+    :param of_team: whether values are the team's
     """
 
-    def __init__(self, n_games: int, n_agents: int) -> None:
+    def __init__(self, n_games: int, n_agents: int, of_team: bool) -> None:
         self.n_agents = n_agents
+        self.of_team = of_team
         self.episodes = np.zeros(n_games, dtype=np.int64)
         self._returns_now = np.zeros(n_games)
         self._lengths_now = np.zeros(n_games, dtype=np.int64)
@@ -157,8 +162,12 @@ class _Steps:
         """Store a step; the arrays are those of :class:`Played`, ``raw`` rewards are for team returns."""
         dones = np.asarray(dones, dtype=bool)
         self._views.append(view)
-        # Nothing that comes after an agent's own end counts for it, as in TeamRolloutBuffer.
-        columns = {"counted": counted, "rewards": learned, "ends": dones | ~active_next, "last_values": last}
+        if self.of_team:
+            learned, ends = self._sums(learned), dones
+        else:
+            # Nothing that comes after an agent's own end counts for it, as in TeamRolloutBuffer.
+            ends = dones | ~active_next
+        columns = {"counted": counted, "rewards": learned, "ends": ends, "last_values": last}
         if zones is not None:
             columns["zones"] = zones
         for name, column in columns.items():
@@ -173,6 +182,11 @@ class _Steps:
         self._lengths_now[ended] = 0
         self.episodes += ended
 
+    def _sums(self, rewards: Floats) -> Floats:
+        """(B,) the team's reward in each of its rows."""
+        teams: Floats = rewards.reshape(-1, self.n_agents).sum(axis=1, keepdims=True)
+        return np.repeat(teams, self.n_agents, axis=1).reshape(-1)
+
     def played(self, pictures: list[Picture]) -> Played:
         """Everything so far."""
         columns = {name: np.stack(column) for name, column in self._columns.items()}
@@ -181,6 +195,7 @@ class _Steps:
         names = [] if first.source is None else list(first.source.values)
         return Played(
             n_agents=self.n_agents,
+            of_team=self.of_team,
             counted=columns["counted"],
             rewards=columns["rewards"],
             ends=columns["ends"],
@@ -203,7 +218,7 @@ def _stack(tensors: list[th.Tensor]) -> Floats:
     return stacked
 
 
-def _tensors(policy: TeamPolicy, obs: Any) -> dict[str, th.Tensor]:
+def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:
     tensors, _ = policy.obs_to_tensor(obs)
     assert isinstance(tensors, dict)
     return tensors
@@ -216,7 +231,7 @@ def _takes_part(obs: Any, n_agents: int) -> Bools:
     return np.asarray(obs[ACTIVE_KEY][::n_agents]).reshape(-1) != 0
 
 
-def _last_values(insides: Insides, dones: Bools, infos: list[dict[str, Any]]) -> Floats:
+def _last_values(insides: Insides | QInsides, dones: Bools, infos: list[dict[str, Any]]) -> Floats:
     """(B,) values of last observations where a time limit is no true end, as SB3 bootstraps them."""
     values = np.zeros(len(infos), dtype=np.float32)
     rows = np.array([row for row in np.flatnonzero(dones) if infos[row].get(TRUNCATED)], dtype=np.int64)

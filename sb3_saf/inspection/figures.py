@@ -207,7 +207,7 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Cali
         capsize=3,
         label="tenths: mean ± standard deviation",
     )
-    of_unit = f" ({unit} per agent)" if unit else ""
+    of_unit = f" ({unit})" if unit else ""
     axes.set(xlabel=f"value{of_unit}", ylabel=f"discounted return{of_unit}")
     axes.set_title(_summary(found), fontsize=11, color=_ORANGE)
     axes.legend(loc="upper left", fontsize=10, frameon=False)

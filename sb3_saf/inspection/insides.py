@@ -1,6 +1,6 @@
 """
-What a policy does and thinks in one step of all games: actions and values, the weights of its pool, the attention of
-its knowledge source, and what its critic would say without the message that it read.
+What an actor-critic policy does and thinks in one step of all games: actions and values, the weights of its pool, the
+attention of its knowledge source, and what its critic would say without the message that it read.
 
 This module reads rows with the policies' own (private) readers, so that it sees exactly what they see. Letters: B rows
 of E games with N agents each, U policies, L slots, P parameters of an action distribution, d features.
@@ -8,7 +8,7 @@ of E games with N agents each, U policies, L slots, P parameters of an action di
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -73,19 +73,6 @@ class StepView(NamedTuple):
     source: SourceView | None
 
 
-def require_team_policy(policy: BasePolicy) -> TeamPolicy:
-    """
-    Refuse what cannot be looked into.
-
-    :raises ValueError: if it is none of this package's policies
-    """
-    if isinstance(policy, TeamPolicy):
-        return policy
-    raise ValueError(
-        f"expected a policy of sb3_saf such as 'SAFPolicy', 'MAPPOPolicy' or 'IPPOPolicy', got {type(policy).__name__}"
-    )
-
-
 class Insides:
     """
     Plays a policy and looks into it.
@@ -93,6 +80,9 @@ class Insides:
     :param policy: SAF's, MAPPO's, IPPO's, with or without memory and action masks
     :param deterministic: whether it takes its most likely actions
     """
+
+    #: Whether values are of the team's reward, not of the agent's.
+    of_team: ClassVar[bool] = False
 
     def __init__(self, policy: TeamPolicy, deterministic: bool = False):
         self.policy = policy
@@ -249,20 +239,7 @@ class RecurrentInsides(Insides):
         return self.policy._raw_values(obs, critic.head(latent, agent)).flatten()
 
 
-def insides_of(policy: TeamPolicy, n_rows: int, deterministic: bool = False) -> Insides:
-    """
-    Insides of a policy of any kind.
-
-    :param policy: to look into
-    :param n_rows: B
-    :param deterministic: whether it takes its most likely actions
-    """
-    if isinstance(policy, TeamRecurrentPolicy):
-        return RecurrentInsides(policy, n_rows, deterministic)
-    return Insides(policy, deterministic)
-
-
-def takes_masks(policy: TeamPolicy) -> bool:
+def takes_masks(policy: BasePolicy) -> bool:
     """Whether the policy asks the environment for action masks, as MaskablePPO does."""
     return isinstance(policy, TeamMaskablePolicy)
 

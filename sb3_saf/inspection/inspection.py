@@ -10,14 +10,14 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_saf.common.randomness import own_randomness
 from sb3_saf.common.teams import check_count
 from sb3_saf.inspection import figures, film, report
 from sb3_saf.inspection.calibration import calibrate, lambda_returns
 from sb3_saf.inspection.doors import Picture, ReturnScale, Zones, check_zones, return_scale, zone_colours, zone_function
 from sb3_saf.inspection.episodes import Played, Player
-from sb3_saf.inspection.insides import require_team_policy
+from sb3_saf.inspection.kinds import require_our_policy
 from sb3_saf.inspection.pool import chosen_by, differences
-from sb3_saf.inspection.randomness import own_randomness
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,7 +71,8 @@ class Inspection(NamedTuple):
     def _calibration(self) -> Figure:
         counted = self.played.counted
         values, returns = self.played.values[counted], lambda_returns(self.played, self.gamma)[counted]
-        return figures.calibration(values, returns, calibrate(values, returns), self.scale.unit)
+        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if self.played.of_team else 'per agent'}"
+        return figures.calibration(values, returns, calibrate(values, returns), unit)
 
     def _of_the_pool(self) -> dict[str, Figure]:
         played, counted = self.played, self.played.counted
@@ -123,7 +124,7 @@ def inspect_team(
     :param zones: as in :class:`~sb3_saf.InspectionCallback`
     :raises ValueError: if the policy is none of this package's or ``eval_env`` is not made of teams
     """
-    require_team_policy(model.policy)
+    require_our_policy(model.policy)
     check_zones(zones)
     check_count("n_eval_episodes", n_eval_episodes)
     player = Player(eval_env, n_eval_episodes, seed, deterministic, zone_function(eval_env, zones))
@@ -141,7 +142,7 @@ def inspect_with(
     :param normalising: what normalises the rewards that the critic learns from, if anything does
     :param draw: whether to draw the first game
     """
-    policy = require_team_policy(model.policy)
+    policy = require_our_policy(model.policy)
     training = policy.training
     policy.set_training_mode(False)
     with own_randomness(player.seed, model.device):

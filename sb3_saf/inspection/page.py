@@ -6,24 +6,32 @@ A logger of our own in front of the model's formats, so that what training has r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
-from sb3_saf.common.policies import TeamPolicy
 from sb3_saf.common.teams import require_n_agents
+from sb3_saf.inspection.kinds import OurPolicy
 
 #: Formats that hold numbers only.
 _NOT_FOR: Final = ("stdout", "log", "json", "csv")
 
+#: Hyperparameters that are shown, of algorithms that have them.
+_NUMBERS: Final = (
+    *("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
+    *("buffer_size", "learning_starts", "update_interval", "target_update_interval", "exploration_fraction"),
+)
+
 #: Charts of the custom scalars page: group, chart, regular expressions of tags.
 _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
     "Team": {
+        "evaluation: share of the largest return": [r"team/share_of_.+"],
         "training: mean return of the last 100 episodes": [r"rollout/ep_rew_mean"],
-        "evaluation: episode length (game steps)": [r"team/episode_length"],
         "training: game steps per second": [r"time/game_steps_per_second"],
+        "evaluation: episode length (game steps)": [r"team/episode_length"],
     },
     "Policy pool": {
         "how often each policy is chosen": [r"pool/chosen/policy_\d+"],
@@ -39,6 +47,16 @@ _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
         "explained variance and slope (1 is right)": [r"critic/explained_variance.*", r"critic/slope"],
         "mean value and mean return": [r"critic/mean_value", r"critic/mean_return"],
         "error (root mean square)": [r"critic/error", r"critic/td_error"],
+    },
+}
+#: Groups that algorithms log themselves, later than the layout is made.
+_OF_ALGORITHMS: Final = ("rollout/", "time/", "train/", "lambda/")
+#: Charts of algorithms that learn Q_tot.
+_VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
+    "Mixer": {
+        "weight of each agent's advantage (lambda)": [r"lambda/agent_\d+"],
+        "training: Q_tot and its error": [r"train/q_tot", r"train/td_error"],
+        "training: share of random actions": [r"rollout/exploration_rate"],
     },
 }
 
@@ -78,19 +96,19 @@ class Page:
             writer = board.writer._get_file_writer()
             writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
-    def arrange(self, tags: Mapping[str, float]) -> None:
+    def arrange(self, tags: Mapping[str, float], value_based: bool) -> None:
         """
-        Lay out the custom scalars page, leaving out groups that this run has nothing for.
+        Lay out the custom scalars page, leaving out charts that this run has nothing for.
 
         :param tags: of the run's first inspection
+        :param value_based: whether the run learns Q_tot
         """
-        groups = {tag.split("/")[0] for tag in tags} | {"rollout", "time"}
         layout: dict[str, dict[str, list[Any]]] = {}
-        for category, charts in _CHARTS.items():
+        for category, charts in {**_CHARTS, **(_VALUE_CHARTS if value_based else {})}.items():
             kept = {
                 name: ["Multiline", [f"^{pattern}$" for pattern in patterns]]
                 for name, patterns in charts.items()
-                if any(pattern.split("/")[0] in groups for pattern in patterns)
+                if any(_is_coming(pattern, tags) for pattern in patterns)
             }
             if kept:
                 layout[category] = kept
@@ -119,7 +137,12 @@ class Page:
         self._logger.dump(step)
 
 
-def hyperparameters(model: BaseAlgorithm, policy: TeamPolicy, more: Mapping[str, object]) -> dict[str, Any]:
+def _is_coming(pattern: str, tags: Iterable[str]) -> bool:
+    """Whether a run has scalars for a pattern: among what is inspected, or from the algorithm's own logs."""
+    return pattern.startswith(_OF_ALGORITHMS) or any(re.fullmatch(pattern, tag) for tag in tags)
+
+
+def hyperparameters(model: BaseAlgorithm, policy: OurPolicy, more: Mapping[str, object]) -> dict[str, Any]:
     """
     What describes a run: the algorithm's numbers, the fields of the policy's parts, the sizes.
 
@@ -141,7 +164,7 @@ def hyperparameters(model: BaseAlgorithm, policy: TeamPolicy, more: Mapping[str,
         "learning_rate": model.lr_schedule(1.0),
         "seed": model.seed,
     }
-    for name in ("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"):
+    for name in _NUMBERS:
         found[name] = getattr(model, name, None)
     found |= asdict(policy.parts) | dict(more)
     return {name: _plain(value) for name, value in found.items() if value is not None}

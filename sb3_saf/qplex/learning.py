@@ -183,6 +183,19 @@ def _mix(
     return mixed
 
 
+def greedy_q_tot(policy: QPLEXPolicy, values: th.Tensor, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
+    """
+    Q_tot of the joint action that agents take by themselves: each its own best one.
+
+    :param policy: whose online networks judge
+    :param values: (G, N, A) Q_i, -inf for illegal actions
+    :param steps: what teams see
+    :param features: (G, N, d) of the online encoder
+    :return: (G,)
+    """
+    return _mix(policy, policy.online, values, steps, features, values.argmax(dim=2)).q_tot
+
+
 def _state(policy: QPLEXPolicy, state_encoder: nn.Module | None, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
     """(G, S) what the mixer reads: the encoded state of the game, or the features of all agents."""
     if state_encoder is not None:

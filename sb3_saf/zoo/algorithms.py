@@ -9,6 +9,7 @@ from typing import Any, Final
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.qplex.qplex import QPLEX
@@ -30,6 +31,11 @@ class AlgorithmSpec:
     policy: str
     config: str
     policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def draws_actions(self) -> bool:
+        """Whether drawn actions are the policy's own; those of off-policy algorithms are exploration."""
+        return not issubclass(self.algorithm, OffPolicyAlgorithm)
 
     @property
     def policy_class(self) -> type[BasePolicy]:

@@ -2,45 +2,21 @@
 
 from __future__ import annotations
 
-import random
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import optuna
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.utils import set_random_seed
 from tqdm import TqdmExperimentalWarning
 from tqdm.rich import tqdm
 
 from sb3_saf.common.callbacks import TeamEvalCallback
 from sb3_saf.common.evaluation import EvaluationResult
 from sb3_saf.common.game_steps import game_steps
+from sb3_saf.common.randomness import own_randomness
 from sb3_saf.common.teams import require_n_agents
-from sb3_saf.zoo.seeds import MAX_SEED, evaluation_seed
-
-
-@contextmanager
-def own_generators(seed: int) -> Iterator[None]:
-    """
-    Seed the global generators of Python, NumPy and torch for a while, then put them back where they were.
-
-    SB3 samples actions from them: without this, a run with evaluations would differ from the same run without.
-
-    :param seed: of what happens inside
-    """
-    python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
-    with th.random.fork_rng():
-        set_random_seed(seed % MAX_SEED, using_cuda=th.cuda.is_available())
-        try:
-            yield
-        finally:
-            random.setstate(python_state)
-            np.random.set_state(numpy_state)  # noqa: NPY002
+from sb3_saf.zoo.seeds import evaluation_seed
 
 
 class ZooEvalCallback(TeamEvalCallback):
@@ -66,7 +42,7 @@ class ZooEvalCallback(TeamEvalCallback):
     def _evaluate(self) -> bool:
         self._n_evaluations += 1
         self._evaluated_at = self._game_steps()
-        with own_generators(self._seed + self._n_evaluations):
+        with own_randomness(self._seed + self._n_evaluations, self.model.device):
             return super()._evaluate()
 
     def _on_training_end(self) -> None:
@@ -108,7 +84,7 @@ class GameStepsProgressBar(ProgressBarCallback):
         total = self.locals["total_timesteps"] - self.model.num_timesteps
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TqdmExperimentalWarning)
-            self.pbar = tqdm(total=total // n_agents, unit=" game steps")
+            self.pbar = tqdm(total=total // n_agents, unit="game steps")
 
     def _on_step(self) -> bool:
         self.pbar.update(self.training_env.num_envs // require_n_agents(self.training_env))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, NoReturn
@@ -40,6 +42,15 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(USAGE_ERROR, f"{self.prog}: error: {' '.join(message.split())} (--help lists the options)\n")
 
 
+class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Help that tells defaults where there are any to tell."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default in (None, "", False) or action.default == {}:
+            return action.help
+        return super()._get_help_string(action)
+
+
 class KeyValues(argparse.Action):
     """``--option a:1 b:rgb`` as a dict. Values are YAML, never Python."""
 
@@ -63,16 +74,32 @@ class KeyValues(argparse.Action):
         setattr(namespace, self.dest, pairs)
 
 
+def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
+    """
+    The words that give pairs to an option of :class:`KeyValues`.
+
+    :param option: such as ``"--env-kwargs"``
+    :param pairs: plain data
+    :return: empty if there are none
+    """
+    return [option, *(f"{key}:{json.dumps(value)}" for key, value in pairs.items())] if pairs else []
+
+
 def run_command(program: str, command: Callable[[], None]) -> None:
     """
-    Run a command; errors for the user go to stderr as one line, with exit code 2.
+    Run a command; errors for the user, and files that cannot be read or written, go to stderr as one line, with exit
+    code 2.
 
     :param program: what the user typed, for the line
     :param command: the command
     """
     try:
         command()
-    except CommandError as error:
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read along has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    except (CommandError, OSError) as error:
         print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
 

@@ -14,7 +14,15 @@ from sb3_saf.common.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.weights import load_weights
 from sb3_saf.zoo.algorithms import ALGOS, find_algorithm
-from sb3_saf.zoo.commands import CommandError, KeyValues, OneLineParser, require_zoo, run_command, user_errors
+from sb3_saf.zoo.commands import (
+    CommandError,
+    DefaultsFormatter,
+    KeyValues,
+    OneLineParser,
+    require_zoo,
+    run_command,
+    user_errors,
+)
 from sb3_saf.zoo.names import unknown_name
 from sb3_saf.zoo.seeds import check_seed
 from sb3_saf.zoo.settings import ENV_IDS, Settings, saved_settings
@@ -41,7 +49,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OneLineParser(
         prog=PROGRAM,
         description="Measure and watch a trained team.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
     )
     parser.add_argument("--algo", default="saf", help=", ".join(ALGOS))
     parser.add_argument("--env", default="TeamTogether-v0", help=", ".join(ENV_IDS))

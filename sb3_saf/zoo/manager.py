@@ -27,9 +27,16 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.callbacks import CheckpointInGameSteps, GameStepsProgressBar, TrialCallback, ZooEvalCallback
+from sb3_saf.zoo.callbacks import (
+    CheckpointInGameSteps,
+    GameStepsProgressBar,
+    TrialCallback,
+    ZooEvalCallback,
+)
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
+from sb3_saf.zoo.inspection import inspection
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
 from sb3_saf.zoo.settings import Settings
@@ -64,7 +71,7 @@ class TeamExperimentManager(ExperimentManager):
     ):
         super().__init__(args, algo, env_id, log_folder, *rest, **kwargs)
         self.request = request
-        self.deterministic_eval = request.deterministic_eval
+        self.deterministic_eval = request.deterministic_eval or not ALGOS[algo].draws_actions
         # RL-Zoo3 would divide these by the number of games.
         self.eval_freq = self.save_freq = -1
         self._envs: list[VecEnv] = []
@@ -126,17 +133,18 @@ class TeamExperimentManager(ExperimentManager):
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Make folder, environments, callbacks and model; if that fails, nothing is left."""
         try:
-            with user_errors(AssertionError, TypeError):  # SB3's checks of what it is given
+            # SB3's checks of what it is given, and folders that cannot be written
+            with user_errors(AssertionError, TypeError, OSError):
                 prepared = super().setup_experiment()
+                if prepared is not None:
+                    model, _ = prepared
+                    # SB3 would call every run PPO.
+                    model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
         except CommandError:
             self._close_envs()
             if self._has_folder:
                 shutil.rmtree(self.save_path)  # it would pass for the latest run
             raise
-        if prepared is not None:
-            model, _ = prepared
-            # SB3 would call every run PPO.
-            model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
         return prepared
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -188,7 +196,7 @@ class TeamExperimentManager(ExperimentManager):
         return env
 
     def create_callbacks(self) -> None:
-        """Add the progress bar, checkpoints and evaluation."""
+        """Add the progress bar, checkpoints, evaluation, and a look into the policy."""
         if self.optimize_hyperparameters:
             return  # trials have callbacks of their own
         if self.show_progress:
@@ -199,17 +207,27 @@ class TeamExperimentManager(ExperimentManager):
         if eval_freq is None:
             eval_freq = max(1, self.settings.game_steps // 20)
         if eval_freq > 0:
-            evaluation = ZooEvalCallback(
-                self.create_envs(self.n_eval_envs, eval_env=True),
-                seed=self.seed,
-                best_model_save_path=self.save_path,
-                log_path=self.save_path,
-                n_eval_episodes=self.n_eval_episodes,
-                eval_freq=eval_freq,
-                deterministic=self.deterministic_eval,
-                verbose=self.verbose,
-            )
-            self.callbacks.append(evaluation)
+            self.callbacks.append(self._evaluation(eval_freq))
+        inspect_freq = self.request.inspect_freq
+        if self.tensorboard_log is not None and (inspect_freq is None or inspect_freq > 0):
+            self.callbacks.append(self._inspection(inspect_freq))
+
+    def _evaluation(self, eval_freq: int) -> ZooEvalCallback:
+        return ZooEvalCallback(
+            self.create_envs(self.n_eval_envs, eval_env=True),
+            seed=self.seed,
+            best_model_save_path=self.save_path,
+            log_path=self.save_path,
+            n_eval_episodes=self.n_eval_episodes,
+            eval_freq=eval_freq,
+            deterministic=self.deterministic_eval,
+            verbose=self.verbose,
+        )
+
+    def _inspection(self, inspect_freq: int | None) -> InspectionCallback:
+        callback = inspection(self.settings, self.seed, inspect_freq)
+        self._envs.append(callback.eval_env)
+        return callback
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Keep what was used and asked for; RL-Zoo3's ``args.yml`` and command would be those it was called with."""

@@ -78,6 +78,9 @@ def _draw(options: argparse.Namespace) -> Figure:
     table = describe(find_runs(options.log_folder, options.algos, options.env))
     without = [options.level] if options.kind == "levels" else []
     table["setting"] = setting_names(table, without)
+    for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
+        if changes not in method:
+            print(f"{method}: {changes}")
     if options.kind == "curves":
         names = ("method", "seed", "setting")
         curves = [

@@ -25,6 +25,7 @@ class Request:
     :param config: a file in place of the algorithm's
     :param eval_freq: game steps between evaluations; 0 or less for none, None for 20 in a run
     :param save_freq: game steps between checkpoints; 0 or less for none
+    :param inspect_freq: game steps between looks into the policy for TensorBoard; 0 or less for none, None for 10
     :param deterministic_eval: whether evaluation takes the most likely actions
     :param trial: number of the trial to train again, or ``"best"``
     :param options: all options as given, to be kept
@@ -40,6 +41,7 @@ class Request:
     config: Path | None = None
     eval_freq: int | None = None
     save_freq: int = -1
+    inspect_freq: int | None = None
     deterministic_eval: bool = False
     trial: int | str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_saf.zoo.names import unknown_name
-from sb3_saf.zoo.settings import Settings, saved_settings
+from sb3_saf.zoo.settings import Settings, load_settings, saved_settings
 from sb3_saf.zoo.yaml_files import load_yaml
 
 #: Where scores come from: evaluation games, or the games that were trained on.
@@ -20,6 +20,8 @@ Source = Literal["evaluation", "training"]
 
 #: Points of a curve of training episodes.
 _N_POINTS: Final = 50
+#: Changed settings that a method's name spells out.
+_MOST_NAMED: Final = 2
 #: The part of training whose episodes count as its result.
 _FINAL_PART: Final = 0.1
 
@@ -143,39 +145,66 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
     What tells runs apart.
 
     :param runs: the runs
-    :return: columns ``run``, ``method``, ``seed``, ``env``, ``size``, ``n_treasures`` and the parameters of the level;
-        a method's name says which of its hyperparameters differ among the runs. Of runs that are alike but for their
-        number only the latest is there.
+    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size``, ``n_treasures`` and the parameters
+        of the level; a method's name says in what it differs from the zoo's settings and from other runs, or, where
+        that is much, has a number, and ``changes`` says it. Of runs that are alike but for their number only the latest
+        is there.
     """
     rows = []
     for run in runs:
         settings = run.settings
-        identity = {"method": settings.algo, "env": settings.env_id, "size": settings.size, "seed": run.config["seed"]}
+        identity = {"env": settings.env_id, "size": settings.size, "seed": run.config["seed"]}
         rows.append({**identity, **settings.env_kwargs, "run": run})
     table = pd.DataFrame(rows)
-    table["method"] = _method_names(runs)
+    table["changes"] = _changes(runs)
+    table["method"] = _method_names([run.settings.algo for run in runs], list(table["changes"]))
     repeated = [column for column in table.columns if column != "run"]
     return table.drop_duplicates(repeated, keep="last", ignore_index=True)
 
 
-def _method_names(runs: Sequence[Run]) -> list[str]:
-    """The algorithm, and what differs from others of the same algorithm at the same size."""
-    flat = [{**_flat(run.settings.plain), "n_envs": run.settings.n_envs} for run in runs]
+def _changes(runs: Sequence[Run]) -> list[str]:
+    """What differs from the zoo's settings, and not in all runs of the algorithm at that size alike."""
+    own = [_different_from_the_zoo(run.settings) for run in runs]
+    peers: dict[tuple[str, str], list[dict[str, str]]] = {}
+    for run, different in zip(runs, own, strict=True):
+        peers.setdefault((run.settings.algo, run.settings.size), []).append(different)
+    texts = []
+    for run, different in zip(runs, own, strict=True):
+        others = peers[run.settings.algo, run.settings.size]
+        named = [key for key, value in different.items() if any(other.get(key) != value for other in others)]
+        texts.append(" ".join(f"{key}={different[key]}" for key in sorted(named)))
+    return texts
+
+
+def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
+    """Settings other than what the zoo has for the same game today, as text."""
+    zoo = load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)
+    ours, theirs = _flat(settings), _flat(zoo)
+    keys = [key for key in {**theirs, **ours} if repr(ours.get(key)) != repr(theirs.get(key))]
+    return {key: _short(ours.get(key, "default")) for key in keys}
+
+
+def _flat(settings: Settings) -> dict[str, Any]:
+    own = {"n_envs": settings.n_envs, "game_steps": settings.game_steps, **settings.plain}
+    of_policy = own.pop("policy_kwargs", {})
+    return {**own, **of_policy}
+
+
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _method_names(algos: Sequence[str], changes: Sequence[str]) -> list[str]:
+    """The algorithm with its changes, or with a number where these are more than a legend has room for."""
+    numbers: dict[str, dict[str, int]] = {}
     names = []
-    for run, own in zip(runs, flat, strict=True):
-        same = (run.settings.algo, run.settings.size)
-        peers = [
-            other for other, peer in zip(flat, runs, strict=True) if (peer.settings.algo, peer.settings.size) == same
-        ]
-        keys = sorted({key for peer in peers for key in peer})
-        # The size of a minibatch follows from the number of agents.
-        varying = [key for key in keys if key != "batch_size" and len({repr(peer.get(key)) for peer in peers}) > 1]
-        names.append(" ".join([run.settings.algo, *(f"{key}={own.get(key, 'default')}" for key in varying)]))
+    for algo, text in zip(algos, changes, strict=True):
+        if text.count("=") <= _MOST_NAMED:
+            names.append(f"{algo} {text}".rstrip())
+        else:
+            known = numbers.setdefault(algo, {})
+            names.append(f"{algo}, variant {known.setdefault(text, len(known) + 1)}")
     return names
-
-
-def _flat(plain: Mapping[str, Any]) -> dict[str, Any]:
-    return {**plain, **plain.get("policy_kwargs", {}), "policy_kwargs": None}
 
 
 def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
@@ -185,7 +214,7 @@ def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[st
     :param table: from :func:`describe`
     :param without: parameters that shall not be named
     """
-    named = {"method", "seed", "env", "run", *without}
+    named = {"method", "changes", "seed", "env", "run", *without}
     varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
     return [
         ", ".join([row["env"].removesuffix("-v0"), *(f"{column} {row[column]}" for column in varying)])

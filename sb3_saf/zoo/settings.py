@@ -15,6 +15,7 @@ from typing import Any, Final, get_args
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from hecogrid_envs.constants import RenderMode
 from hecogrid_envs.params import TASK_NAMES, HECOGridParams, TaskName
 from sb3_saf.common.buffers import TeamRolloutBuffer
 from sb3_saf.common.centralized import CentralizedValueWrapper, TimeLimit
@@ -101,6 +102,7 @@ class Settings:
         evaluation: bool = False,
         monitor_dir: str | Path | None = None,
         n_envs: int | None = None,
+        render_mode: RenderMode | None = None,
     ) -> CentralizedValueWrapper:
         """
         Make the games.
@@ -109,6 +111,7 @@ class Settings:
         :param evaluation: games for evaluation, whose seeds no training game of any run has
         :param monitor_dir: folder for a ``monitor.csv``; None for none
         :param n_envs: E; None for the settings'
+        :param render_mode: how games can be drawn; None for not at all
         """
         return make_team_env(
             self.task,
@@ -116,6 +119,7 @@ class Settings:
             seed=evaluation_seed(seed) if evaluation else check_seed(seed),
             time_limit=self.time_limit,
             monitor_dir=None if monitor_dir is None else str(monitor_dir),
+            render_mode=render_mode,
             **self.env_kwargs,
         )
 

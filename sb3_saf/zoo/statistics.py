@@ -110,10 +110,11 @@ def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Float
         (episodes) are averaged
     :param task: the column whose values count as tasks
     :return: (S, K) for each method
-    :raises ValueError: if a method lacks a seed of some task
+    :raises ValueError: if a method lacks a task, or a seed of one
     """
     require_columns(results, ("method", "seed", task, "score"))
     matrices: dict[str, Floats] = {}
+    tasks: dict[str, set[Any]] = {}
     for method, rows in results.groupby("method", sort=False):
         table = rows.groupby(["seed", task])["score"].mean().unstack(task)
         if table.isna().to_numpy().any():
@@ -123,9 +124,14 @@ def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Float
                 "it, or leave that seed or task out"
             )
         matrices[str(method)] = table.to_numpy(dtype=np.float64)
-    widths = {method: matrix.shape[1] for method, matrix in matrices.items()}
-    if len(set(widths.values())) > 1:
-        raise ValueError(f"aggregates compare methods on the same tasks, got these numbers of tasks: {widths}")
+        tasks[str(method)] = set(table.columns)
+    everything = set().union(*tasks.values())
+    for method, its in tasks.items():
+        if its != everything:
+            raise ValueError(
+                f"aggregates compare methods on the same tasks: {method} has no result on "
+                f"{', '.join(sorted(map(str, everything - its)))}; run it, or leave that method or task out"
+            )
     return matrices
 
 
@@ -135,13 +141,18 @@ def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
 
     :param scores: (S, K) normalised scores of each method
     """
-    from rliable import metrics
-
-    values, intervals = _bootstrap(scores, lambda runs: np.array([metrics.aggregate_iqm(runs)]))
+    values, intervals = _bootstrap(scores, lambda runs: np.array([_interquartile_mean(runs)]))
     return {
         method: Estimate(float(values[method][0]), *(float(end) for end in intervals[method][:, 0]))
         for method in scores
     }
+
+
+def _interquartile_mean(runs: Floats) -> float:
+    """``aggregate_iqm`` of rliable, called some ten thousand times: scipy's checks of arguments are all its cost."""
+    scores = np.sort(runs, axis=None)
+    cut = len(scores) // 4
+    return float(scores[cut : len(scores) - cut].mean())
 
 
 def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> dict[str, Profile]:

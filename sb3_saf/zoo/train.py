@@ -12,7 +12,16 @@ from pathlib import Path
 from typing import Final
 
 from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.commands import CommandError, KeyValues, OneLineParser, replaced, require_zoo, run_command, user_errors
+from sb3_saf.zoo.commands import (
+    CommandError,
+    DefaultsFormatter,
+    KeyValues,
+    OneLineParser,
+    replaced,
+    require_zoo,
+    run_command,
+    user_errors,
+)
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.seeds import MAX_SEED, check_seed
 from sb3_saf.zoo.settings import ENV_IDS
@@ -49,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OneLineParser(
         prog=PROGRAM,
         description="Train or tune a team by name, on RL-Zoo3. Steps are steps of the game, summed over all games.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
         allow_abbrev=False,
     )
     _add_what(parser)
@@ -98,6 +107,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--n-eval-envs", type=int, default=32, help="games of an evaluation")
     group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
     group.add_argument("--save-freq", type=int, default=-1, help="game steps between checkpoints, -1 for none")
+    group.add_argument(
+        "--inspect-freq",
+        type=int,
+        help="game steps between looks into the policy for TensorBoard, -1 for none; by default 10 a run",
+    )
     group.add_argument("--log-interval", type=int, default=-1, help="rollouts between logs, -1 for SB3's")
     group.add_argument("--num-threads", type=int, default=-1, help="threads of torch, -1 for its own choice")
     group.add_argument("--device", default="auto", help="cpu, cuda, ...")
@@ -151,6 +165,7 @@ def train(arguments: Sequence[str] | None = None) -> None:
         config=options.conf_file,
         eval_freq=options.eval_freq,
         save_freq=options.save_freq,
+        inspect_freq=options.inspect_freq,
         deterministic_eval=options.deterministic_eval,
         trial=options.trial_id,
         options={key: str(value) if isinstance(value, Path) else value for key, value in vars(options).items()},

@@ -1,0 +1,118 @@
+"""
+What encoders and methods cost, side by side. ``python -m benchmarks.costs``
+
+Encoders: forward and backward passes over views of HECOGrid (7 x 7 tiles, 28 x 28 pixels) and over larger pictures.
+Methods: rollout and update of PPO on TeamSupport with 10 agents, all of it, with each encoder (``MLPEncoder`` reads the
+tile codes as numbers: what it costs is what observations that are vectors cost).
+
+Processor time of one core; programs take turns, and the table shows medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from sb3_saf import LightEncoder, MLPEncoder, NatureEncoder, PaperCNN, TeamRolloutBuffer, make_team_env
+
+N_VIEWS: Final = 128
+METHODS: Final = ("IPPO", "MAPPO", "SAF")
+OF_METHODS: Final = (PaperCNN, LightEncoder, MLPEncoder)
+#: Height and width of pictures, and who encodes them.
+PICTURES: Final[dict[tuple[int, int], tuple[type[BaseFeaturesExtractor], ...]]] = {
+    (28, 28): (PaperCNN, LightEncoder),
+    (64, 64): (PaperCNN, NatureEncoder, LightEncoder),
+    (84, 84): (PaperCNN, NatureEncoder, LightEncoder),
+    (280, 480): (NatureEncoder,),
+}
+
+
+def encoder_work(encoder_class: type[BaseFeaturesExtractor], height: int, width: int) -> tuple[Callable[[], int], int]:
+    """Forward and backward over some views, and the number of weights."""
+    encoder = encoder_class(spaces.Box(0, 255, (3, height, width), np.uint8))
+    pictures = th.rand(N_VIEWS if height < 100 else 16, 3, height, width)
+
+    def work() -> int:
+        encoder(pictures).square().sum().backward()
+        return len(pictures)
+
+    return work, sum(parameter.numel() for parameter in encoder.parameters())
+
+
+def method_work(method: str, encoder: type[BaseFeaturesExtractor], n_games: int) -> Callable[[], int]:
+    """One rollout of 25 steps and 4 epochs over it."""
+    env = make_team_env("TeamSupport", n_envs=n_games, seed=0)
+    n_rows = 25 * env.num_envs
+    settings: dict[str, Any] = {"n_steps": 25, "batch_size": n_rows, "n_epochs": 4, "seed": 0, "device": "cpu"}
+    kwargs = {"features_extractor_class": encoder}
+    model = PPO(f"{method}Policy", env, rollout_buffer_class=TeamRolloutBuffer, policy_kwargs=kwargs, **settings)
+
+    def work() -> int:
+        model.learn(n_rows, reset_num_timesteps=False)
+        return n_rows
+
+    return work
+
+
+def medians(programs: dict[Any, Callable[[], int]], rounds: int) -> dict[Any, float]:
+    """What each does per second of processor time; the first round warms up."""
+    rates: dict[Any, list[float]] = {name: [] for name in programs}
+    for _ in range(rounds + 1):
+        for name, work in programs.items():
+            start = time.process_time()
+            count = work()
+            rates[name].append(count / (time.process_time() - start))
+    return {name: float(np.median(found[1:])) for name, found in rates.items()}
+
+
+def encoder_table(rounds: int) -> None:
+    """Print what encoders cost."""
+    made = {
+        (size, encoder): encoder_work(encoder, *size) for size, encoders in PICTURES.items() for encoder in encoders
+    }
+    rates = medians({key: work for key, (work, _) in made.items()}, rounds)
+    print("| pixels | encoder | weights | views/s, forward and backward |\n| --- | --- | --- | --- |")
+    for (size, encoder), (_, n_weights) in made.items():
+        print(
+            f"| {size[0]} x {size[1]} x 3 | `{encoder.__name__}` | {n_weights:,} | {rates[(size, encoder)]:,.0f} |",
+            flush=True,
+        )
+
+
+def method_table(rounds: int, n_games: int) -> None:
+    """Print what methods cost."""
+    programs = {
+        (method, encoder): method_work(method, encoder, n_games) for method in METHODS for encoder in OF_METHODS
+    }
+    rates = medians(programs, rounds)
+    print("| agent-steps/s | " + " | ".join(f"`{encoder.__name__}`" for encoder in OF_METHODS) + " |")
+    print("| --- |" + " --- |" * len(OF_METHODS))
+    for method in METHODS:
+        cells = [f"{rates[(method, encoder)]:,.0f}" for encoder in OF_METHODS]
+        print(f"| {method} | " + " | ".join(cells) + " |")
+    ratios = [f"{rates[('MAPPO', encoder)] / rates[('SAF', encoder)]:.1f}" for encoder in OF_METHODS]
+    print("| SAF takes x times MAPPO's time | " + " | ".join(ratios) + " |")
+
+
+def main() -> None:
+    """Print both tables as Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--games", type=int, default=16)
+    options = parser.parse_args()
+    th.set_num_threads(1)
+    encoder_table(options.rounds)
+    print()
+    method_table(options.rounds, options.games)
+
+
+if __name__ == "__main__":
+    main()

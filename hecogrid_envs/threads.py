@@ -1,0 +1,163 @@
+"""The compiled loops over a batch's games, shared between threads."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import weakref
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hecogrid_envs.core.jit import entry_point
+from hecogrid_envs.core.sharing import (
+    DESK_PART,
+    STEP,
+    Pictures,
+    is_asleep,
+    play_share,
+    post,
+    post_leave,
+    serve,
+    wait_for_helpers,
+)
+from hecogrid_envs.core.types import U8, Games, RuleBook
+from hecogrid_envs.core.view import draw_pictures
+
+#: Looks at the desk before a helper goes to sleep, some tenths of a millisecond: tight loops find it awake, and while a
+#: network computes it does not take its processor.
+_POLLS_OF_HELPERS: Final = 100_000
+#: Looks at the desk before the calling thread offers its processor to others.
+_POLLS_OF_CALLER: Final = 10_000
+
+
+class Helpers:
+    """
+    Threads that do their shares of every task that is posted.
+
+    The handing over takes well under a microsecond while they are awake, where a thread pool takes twenty.
+
+    :param arguments: games, book and pictures of a batch
+    :param shares: the first game and one beyond the last, of each helper
+    """
+
+    def __init__(self, arguments: tuple[Games, RuleBook, Pictures], shares: list[tuple[int, int]]):
+        #: Threads do not survive a fork.
+        self.process = os.getpid()
+        self._desk = np.zeros(DESK_PART * (1 + len(shares)), dtype=np.int64)
+        self._bells = [threading.Semaphore(0) for _ in shares]
+        self._array: npt.NDArray[Any] = self._desk
+        self._post = entry_point(post, self._desk, 0, 0, 0)
+        self._asleep = entry_point(is_asleep, self._desk, 0)
+        self._wait = entry_point(wait_for_helpers, self._desk, 0)
+        compiled = entry_point(serve, *arguments, self._desk, 0, 0, 0, 0)
+        self.threads = [
+            threading.Thread(
+                target=_serve,
+                args=(compiled, (*arguments, self._desk, helper, first, last, _POLLS_OF_HELPERS), bell),
+                name=f"hecogrid-{helper}",
+                daemon=True,
+            )
+            for helper, ((first, last), bell) in enumerate(zip(shares, self._bells, strict=True), 1)
+        ]
+        for thread in self.threads:
+            thread.start()
+        weakref.finalize(self, _send_away, self._desk, self._bells)
+
+    def post(self, task: int, array: U8) -> None:
+        """
+        Give the helpers their shares.
+
+        :param task: see :func:`~hecogrid_envs.core.sharing.play_share`
+        :param array: of the task
+        """
+        self.wait()  # an interrupt may have come between the last task and its end
+        self._array = array  # stays where it is until the next task
+        self._post(self._desk, task, array.ctypes.data, array.size)
+        for helper, bell in enumerate(self._bells, 1):
+            if self.is_asleep(helper):
+                bell.release()
+
+    def is_asleep(self, helper: int) -> bool:
+        """
+        Whether a helper waits for its bell.
+
+        :param helper: from 1 on
+        """
+        return bool(self._asleep(self._desk, helper))
+
+    def wait(self) -> None:
+        """Wait for the end of the last task."""
+        while not self._wait(self._desk, _POLLS_OF_CALLER):
+            time.sleep(0)
+
+
+def _serve(compiled: Any, arguments: tuple[Any, ...], bell: threading.Semaphore) -> None:
+    while not compiled(*arguments):
+        bell.acquire()
+
+
+def _send_away(desk: npt.NDArray[np.int64], bells: list[threading.Semaphore]) -> None:
+    post_leave(desk)
+    for bell in bells:
+        bell.release()
+
+
+class Shares:
+    """
+    Plays whole tasks: on the calling thread and, if there are more, on helpers that start with the first task.
+
+    :param games: E games
+    :param book: their rules
+    :param pictures: what drawing needs
+    :param n_threads: threads, the calling one included
+    """
+
+    def __init__(self, games: Games, book: RuleBook, pictures: Pictures, n_threads: int):
+        self._arguments = (games, book, pictures)
+        n_games = len(games.rng)
+        edges = np.linspace(0, n_games, min(n_threads, n_games) + 1).astype(int).tolist()
+        *self._others, self._own = pairwise(edges)
+        self._helpers: Helpers | None = None
+        self._play = entry_point(play_share, *self._arguments, STEP, pictures.codes, 0, 0)
+
+    def play(self, task: int, array: U8) -> None:
+        """
+        Do one task for all games.
+
+        :param task: see :func:`~hecogrid_envs.core.sharing.play_share`
+        :param array: contiguous, of the task
+        """
+        if not self._others:
+            self._play(*self._arguments, task, array, *self._own)
+            return
+        if self._helpers is None or self._helpers.process != os.getpid():
+            self._helpers = Helpers(self._arguments, self._others)
+        self._helpers.post(task, array)
+        self._play(*self._arguments, task, array, *self._own)
+        self._helpers.wait()
+
+    def play_game(self, task: int, array: U8, game: int) -> None:
+        """
+        Do one task for one game.
+
+        :param task: see :func:`~hecogrid_envs.core.sharing.play_share`
+        :param array: of the task, for all games
+        :param game: index
+        """
+        self._play(*self._arguments, task, array, game, game + 1)
+
+    def draw(self, codes: U8, facing: U8, out: U8) -> None:
+        """
+        Draw some views.
+
+        :param codes: (B * V * V,) of B views
+        :param facing: (B,) directions of the viewers
+        :param out: (B * V t * V t * 3,) pixels to write
+        """
+        _, book, pictures = self._arguments
+        atlas = (pictures.atlas, pictures.turn_bytes, book.view_size, pictures.tile)
+        draw_pictures(codes, facing, *atlas, out, 0, len(facing))

@@ -1,0 +1,98 @@
+"""Games whose players take turns, as games in which all act at once and those who wait can do nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from pettingzoo import AECEnv
+from pettingzoo.utils import BaseParallelWrapper
+from pettingzoo.utils.conversions import turn_based_aec_to_parallel
+
+ACTION_MASK: Final = "action_mask"
+
+#: What generators of other projects take (OpenSpiel's, and NumPy's older one). Seeds of games here have 63 bits.
+_SEEDS: Final = 2**31
+
+
+class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
+    """
+    A turn-based game (PettingZoo's AEC form: Connect Four, Hanabi, Leduc hold'em, ...) as a ParallelEnv for
+    ``make_team_env``.
+
+    At each step one agent moves. All others have one legal action, 0, which nobody looks at: their mask says so, so
+    that they learn nothing from it. The mask is where the game has it, in observations of the form
+    {"observation", "action_mask"}; a game without masks gets them in ``infos[agent]["action_mask"]``, with all actions
+    legal for the agent that moves.
+
+    ::
+
+        env = sb3_saf.make_team_env(lambda: sb3_saf.TurnsInParallel(hanabi_v5.env(colors=2, players=2)), n_envs=16)
+
+    Seeds are taken modulo 2^31. Rewards come at the step at which the game gives them, also to agents that wait.
+
+    :param env: an AECEnv whose agents act one after another, with Discrete actions
+    :raises ValueError: if it is no AECEnv, or its actions are not Discrete
+    """
+
+    def __init__(self, env: AECEnv[Any, Any, Any]):
+        if not isinstance(env, AECEnv):
+            name = getattr(env, "__name__", type(env).__name__)
+            raise ValueError(
+                f"expected a PettingZoo AECEnv, whose agents take turns, got {name}; pass what the module's env() "
+                "returns, for instance TurnsInParallel(connect_four_v3.env())"
+            )
+        super().__init__(turn_based_aec_to_parallel(env))
+        self._aec = env
+        self._n_actions: dict[Any, int] = {}
+        for agent in env.possible_agents:
+            space = env.action_space(agent)
+            if not isinstance(space, spaces.Discrete):
+                raise ValueError(f"taking turns needs Discrete actions, of which 0 is to wait, got {space} of {agent}")
+            self._n_actions[agent] = int(space.n)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """
+        Begin a game.
+
+        :param seed: of the game
+        :param options: for the game
+        :return: observations and infos by agent
+        """
+        observations, infos = super().reset(None if seed is None else seed % _SEEDS, options)
+        return self._with_masks(observations, infos)
+
+    def step(self, actions: dict[Any, Any]) -> Any:
+        """
+        Let the agent move whose turn it is.
+
+        :param actions: by agent; those of agents that wait are not read
+        :return: observations, rewards, terminations, truncations and infos by agent
+        """
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        observations, infos = self._with_masks(observations, infos)
+        return observations, rewards, terminations, truncations, infos
+
+    def _with_masks(
+        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]
+    ) -> tuple[dict[Any, Any], dict[Any, Any]]:
+        """Say of each agent what it can do; the game's own dicts stay as they are."""
+        shown, told = dict(observations), {agent: dict(info) for agent, info in infos.items()}
+        for agent, observation in observations.items():
+            if isinstance(observation, Mapping) and ACTION_MASK in observation:
+                shown[agent] = {**observation, ACTION_MASK: self._mask(agent, observation[ACTION_MASK])}
+            else:
+                own = told.setdefault(agent, {})
+                own[ACTION_MASK] = self._mask(agent, own.get(ACTION_MASK))
+        return shown, told
+
+    def _mask(self, agent: Any, mask: Any) -> npt.NDArray[Any]:
+        """(A,) what an agent can do; ``mask`` is what the game says, None for nothing."""
+        if agent == self._aec.agent_selection:
+            return np.ones(self._n_actions[agent], np.int8) if mask is None else np.asarray(mask)
+        wait = np.zeros(self._n_actions[agent], np.int8 if mask is None else np.asarray(mask).dtype)
+        wait[0] = 1
+        return wait

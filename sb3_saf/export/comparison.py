@@ -1,0 +1,78 @@
+"""Whether an exported network gives the model's numbers."""
+
+from __future__ import annotations
+
+import copy
+from typing import Final, TypeAlias
+
+import numpy as np
+import torch as th
+
+from sb3_saf.common.policies import TeamPolicy
+from sb3_saf.contrib.recurrent import TeamRecurrentPolicy
+from sb3_saf.export.errors import ExportError
+from sb3_saf.export.manifest import MemoryNet
+from sb3_saf.export.network import ActorNetwork
+from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.saf.policy_pool import PolicyPool
+
+#: Policies whose actors read one agent's own observation, mask and memory, and nothing else.
+ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy
+
+#: Largest difference between the model's and the exported network's outputs, beside the outputs' own size.
+_TOLERANCE: Final = 1e-4
+_N_CHECKED: Final = 16
+
+
+def some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str, th.Tensor]:
+    """Random inputs of the network, by name; the space's own generator and torch's are left alone."""
+    space = copy.deepcopy(policy.team_spaces.own)
+    space.seed(0)
+    inputs = {"observation": th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))}
+    if policy.actor.reads_agent:
+        inputs["agent"] = th.arange(_N_CHECKED) % policy.team_spaces.n_agents
+    if memory is not None:
+        generator = th.Generator().manual_seed(0)
+        for name in ("hidden", "cell"):
+            inputs[name] = th.randn(memory.n_layers, _N_CHECKED, memory.hidden_size, generator=generator)
+    return inputs
+
+
+def compare(policy: ExportablePolicy, network: ActorNetwork, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
+    """The exported network's outputs, once they are known to be the model's."""
+    was_training = policy.training
+    policy.set_training_mode(False)
+    with th.no_grad():
+        expected, states = _of_model(policy, {name: value.to(policy.device) for name, value in inputs.items()})
+        outputs = network(**inputs)
+    policy.set_training_mode(was_training)
+    n_outputs = len(outputs) - len(states)
+    found = outputs[n_outputs - 1].flatten(1)
+    if not isinstance(policy.actor, PolicyPool):
+        found = outputs[1].flatten(1)
+    elif found.shape != expected.shape:
+        found = th.cat([outputs[0], outputs[1].flatten(1)], dim=1)
+    otherwise = f"{type(policy).__name__} does more than its encoder and actor show"
+    check_close(found, expected.cpu(), otherwise)
+    for state, wanted in zip(outputs[n_outputs:], states, strict=True):
+        check_close(state, wanted.cpu(), otherwise)
+    return tuple(outputs)
+
+
+def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
+    """What the model's own actor gives, and what it remembers then."""
+    latent = policy.extract_features(inputs["observation"])
+    states: tuple[th.Tensor, ...] = ()
+    if isinstance(policy, TeamRecurrentPolicy):
+        latent, states = policy.remember(latent, (inputs["hidden"], inputs["cell"]))
+    return policy.actor(latent, inputs.get("agent")), states
+
+
+def check_close(found: th.Tensor, expected: th.Tensor, otherwise: str) -> None:
+    """
+    Compare outputs.
+
+    :raises ExportError: if they differ by more than rounding does
+    """
+    if found.shape != expected.shape or not th.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
+        raise ExportError(f"the exported network does not give the model's numbers: {otherwise}")

@@ -1,0 +1,168 @@
+"""What people who bring an environment of their own get wrong at first, and what they are told."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from sb3_saf import RandomPolicy, make_team_env
+from sb3_saf.common.stock_policies import warn_of_stock_policies
+from tests.toy_envs import CounterEnv, TellingEnv
+
+
+class SilentReset(CounterEnv):
+    """Gives observations alone at a reset, as before PettingZoo 1.24."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return super().reset(seed, options)[0]
+
+
+class OneDone(CounterEnv):
+    """Gives one dict of dones at a step, as before PettingZoo 1.24."""
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        observations, rewards, terminations, _, infos = super().step(actions)
+        return observations, rewards, terminations, infos
+
+
+class NoTuple(CounterEnv):
+    """Gives lists by agent instead of dicts."""
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        return tuple(list(part.values()) for part in super().step(actions))
+
+
+class Unseeded(CounterEnv):
+    """Has a reset without arguments."""
+
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset()
+
+
+class BrokenReset(CounterEnv):
+    """Goes wrong in a reset with a TypeError of its own."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return len(3)  # type: ignore[arg-type]
+
+
+class SpaceTable(CounterEnv):
+    """Has a dict where PettingZoo has a method."""
+
+    @property
+    def observation_space(self) -> Any:
+        return dict.fromkeys(self.possible_agents, self._observation_space)
+
+
+SINCE = "as PettingZoo 1.24 and later do"
+STEP = "(observations, rewards, terminations, truncations, infos)"
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (
+            SilentReset,
+            f"expected reset of counter_v0 to return (observations, infos), {SINCE}, got a dict with the keys "
+            "['agent_0', 'agent_1'] (observations alone, as before 1.24): return observations, {agent: {}",
+        ),
+        (
+            OneDone,
+            f"expected step of counter_v0 to return {STEP}, {SINCE}, got 4 values: dict, dict, dict, dict (one dict of "
+            "dones, as before 1.24): return terminations for",
+        ),
+        (NoTuple, "got 5 values: list, list, list, list, list"),
+        (Unseeded, f"expected counter_v0 to have reset(seed=None, options=None), {SINCE}, got reset() -> "),
+        (
+            SpaceTable,
+            "expected observation_space(agent) to be a method that gives an agent's space, got dict; write it as: "
+            "def observation_space(self, agent): return self.observation_spaces[agent]",
+        ),
+    ],
+)
+def test_environments_of_an_older_pettingzoo(env: type[CounterEnv], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        _played(env)
+
+
+def test_a_type_error_of_the_game_itself_comes_out_as_it_is() -> None:
+    with pytest.raises(TypeError, match="has no len"):
+        _played(BrokenReset)
+
+
+# --- policies ---------------------------------------------------------------------------------------------------------
+
+
+def test_sb3s_own_policy_warns_that_it_sees_the_team() -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    with pytest.raises(ValueError, match="You must use `MultiInputPolicy`"):  # SB3's own advice, which leads here:
+        PPO("MlpPolicy", env)
+    settings: dict[str, Any] = {"n_steps": 2, "batch_size": 8, "n_epochs": 1, "device": "cpu"}
+    model = PPO("MultiInputPolicy", env, **settings)
+    with pytest.warns(
+        UserWarning, match=r"its actor sees 'team', .*: IPPOPolicy, .*, SAFPolicy, as in PPO\('SAFPolicy'"
+    ):
+        model.learn(8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PPO("SAFPolicy", env, **settings).learn(8)
+        PPO("MlpPolicy", "CartPole-v1", **settings | {"n_steps": 8}).learn(8)
+    assert warn_of_stock_policies(PPO) is PPO
+    once = PPO.learn
+    assert warn_of_stock_policies(PPO).learn is once
+
+
+@pytest.mark.parametrize("policy", ["SAFPolicy", "MAPPOPolicy"])
+def test_observations_by_agent_are_refused_with_what_to_pass(policy: str) -> None:
+    model = PPO(policy, make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
+    observations, _ = CounterEnv().reset(seed=0)
+    with pytest.raises(ValueError, match=r"got 'agent_0'. .* model.predict\(np.stack\(list\(observations.values\(\)"):
+        model.predict(observations)
+    alone, _ = model.predict(observations["agent_1"], deterministic=True)
+    stacked, _ = model.predict(np.stack(list(observations.values())), deterministic=True)
+    assert stacked.shape == (2,)
+    assert stacked[1] == alone
+    with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a mistake in it is no dict of agents
+        model.predict({"obs": observations["agent_1"], "team_view": observations["agent_1"]})
+
+
+def test_masks_in_pettingzoos_form_are_understood() -> None:
+    env = make_team_env(lambda: TellingEnv(n_agents=2), n_envs=1, seed=0)
+    model = PPO("MAPPOPolicy", env, device="cpu", seed=0)
+    observations, _ = TellingEnv(n_agents=2).reset(seed=0)
+    for agent in ("agent_0", "agent_1"):
+        given = observations[agent]
+        action, _ = model.predict(given, deterministic=True)
+        assert given["action_mask"][action] == 1
+        assert (
+            action
+            == model.predict({"obs": given["observation"], "action_mask": given["action_mask"]}, None, None, True)[0]
+        )
+    unmasked = PPO("MAPPOPolicy", make_team_env(CounterEnv, seed=0), device="cpu")
+    with pytest.raises(ValueError, match=r"got 'observation'"):
+        unmasked.predict(given)
+
+
+def test_a_random_policy_of_an_environment() -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    of_space, of_env, of_game = (RandomPolicy(source, seed=3) for source in (env.action_space, env, CounterEnv()))
+    rows = env.reset()
+    assert isinstance(rows, dict)
+    drawn = [of_space.predict(rows)[0].tolist() for _ in range(20)]
+    assert len({tuple(actions) for actions in drawn}) > 1
+    assert [of_env.predict(rows)[0].tolist() for _ in range(20)] == drawn
+    assert [of_game.predict(rows)[0].tolist() for _ in range(20)] == drawn
+    for wrong in (None, 4, "Discrete(4)"):
+        with pytest.raises(ValueError, match=r"expected one agent's action space, or an environment that has it, got"):
+            RandomPolicy(cast(Any, wrong))
+
+
+def _played(env: Any) -> None:
+    venv = make_team_env(env, n_envs=2, seed=0)
+    venv.reset()
+    venv.step(np.zeros(venv.num_envs, dtype=int))

@@ -1,0 +1,104 @@
+"""Helpers of a batch: they sleep and wake, leave with their batch, and are made anew after a fork."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
+
+PARAMS = HECOGridParams(n_agents=5, grid_size=12, n_treasures=30, observation="tiles")
+
+
+def batch_of(n_threads: int, n_games: int = 6) -> GameBatch:
+    """A batch of seeded games."""
+    batch = GameBatch("TeamSupport", PARAMS, n_games, n_threads)
+    batch.reset(seeds=game_seeds(0, n_games))
+    return batch
+
+
+def helpers_of(batch: GameBatch) -> list[threading.Thread]:
+    """The threads that a batch has started, told by the desk that they share."""
+    helpers = batch._shares._helpers
+    assert helpers is not None
+    return helpers.threads
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 30.0) -> None:
+    """Wait for what another thread does."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.01)
+
+
+def test_helpers_fall_asleep_and_are_woken() -> None:
+    alone, shared = batch_of(1), batch_of(3)
+    for row in np.random.default_rng(0).integers(0, 7, size=(5, 6, 5)):
+        alone.step(row)
+        shared.step(row)
+        np.testing.assert_array_equal(alone.observe(), shared.observe())
+        helpers = shared._shares._helpers
+        assert helpers is not None
+        wait_until(lambda helpers=helpers: all(map(helpers.is_asleep, (1, 2))))  # type: ignore[misc]
+
+
+def test_helpers_leave_with_their_batch() -> None:
+    batch = batch_of(3)
+    batch.step(np.zeros((6, 5), dtype=np.uint8))
+    threads = helpers_of(batch)
+    assert len(threads) == 2 and all(thread.is_alive() for thread in threads)
+    del batch
+    wait_until(lambda: not any(thread.is_alive() for thread in threads))
+
+
+def test_one_game_needs_no_helpers() -> None:
+    batch = batch_of(4, n_games=1)
+    batch.step(np.zeros((1, 5), dtype=np.uint8))
+    assert batch._shares._helpers is None
+
+
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork here")
+def test_a_forked_process_plays_on() -> None:
+    script = """
+        import os, numpy as np
+        from tests.test_threads import batch_of
+
+        batch, alone = batch_of(2), batch_of(1)
+        step = np.ones((6, 5), dtype=np.uint8)
+        batch.step(step)
+        child = os.fork()
+        batch.step(step)
+        if child == 0:
+            alone.step(step)
+            alone.step(step)
+            os._exit(0 if (batch.observe() == alone.observe()).all() else 1)
+        raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    """
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", textwrap.dedent(script)]
+    subprocess.run(command, check=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("out", "what"),
+    [
+        (np.zeros((6, 5, 7, 7), dtype=np.int16), r"int16 \(6, 5, 7, 7\)"),
+        (np.zeros((6, 5, 49), dtype=np.uint8), r"uint8 \(6, 5, 49\)"),
+        (np.zeros((7, 7, 5, 6), dtype=np.uint8).T, r"uint8 \(6, 5, 7, 7\)"),
+    ],
+)
+def test_views_go_to_arrays_that_fit(out: np.ndarray, what: str) -> None:
+    with pytest.raises(ValueError, match=rf"contiguous uint8 array of shape \(6, 5, 7, 7\), got {what}"):
+        batch_of(1).observe(out)
+
+
+def test_actions_of_other_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"actions must have shape \(6, 5\), \(games, agents\), got \(30,\)"):
+        batch_of(2).step(np.zeros(30, dtype=np.uint8))
