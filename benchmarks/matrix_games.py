@@ -33,7 +33,7 @@ def learned_payoff(payoffs: Floats, mixer: MixerName, seed: int, game_steps: int
         env,
         mixer=mixer,
         seed=seed,
-        learning_rate=lambda remaining: 1e-3 * remaining,
+        learning_rate=1e-3,
         batch_size=32,
         buffer_size=2_000,
         learning_starts=500,
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--game", choices=list(GAMES), default="one-step")
     parser.add_argument("--mixers", nargs="+", choices=MIXER_NAMES, default=list(MIXER_NAMES))
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--game-steps", type=int, default=16_000)
+    parser.add_argument("--game-steps", type=int, default=4_000)
     options = parser.parse_args()
     payoffs = GAMES[options.game]
     print(f"{options.game}: best payoff {payoffs.max():g}; {options.game_steps} game steps, {options.seeds} seeds")

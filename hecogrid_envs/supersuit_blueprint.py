@@ -118,7 +118,7 @@ def _check_is_parallel(env: Any, is_factory: bool) -> None:
         raise ValueError(
             f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
             "convert it with pettingzoo.utils.conversions.aec_to_parallel, or, where agents take turns, with "
-            "hecogrid_envs.turns.TurnsInParallel (which is sb3_saf.TurnsInParallel)"
+            "sb3_saf.TurnsInParallel"
         )
     if not isinstance(env, ParallelEnv):
         hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""

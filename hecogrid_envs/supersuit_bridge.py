@@ -112,7 +112,9 @@ class SuperSuitVecEnv(VecEnv):
             seed = cast(int, np.random.SeedSequence().entropy)
         if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
             raise ValueError(f"seed must be an integer, 0 or larger, or None, got {seed!r}")
-        self._seeds = [game_seed for game_seed in game_seeds(int(seed), self.n_games) for _ in range(self.n_agents)]
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training.
+        self.seeded_with = tuple(game_seeds(int(seed), self.n_games))
+        self._seeds = [game_seed for game_seed in self.seeded_with for _ in range(self.n_agents)]
         return self._seeds
 
     def set_options(self, options: list[Info] | Info | None = None) -> None:

@@ -51,7 +51,9 @@ def reset(env: Any, seed: int | None, options: dict[str, Any] | None) -> tuple[M
     if not _are_dicts(result, 2):
         hint = ""
         if isinstance(result, Mapping):
-            hint = " (observations alone, as before 1.24): return observations, {agent: {} for agent in self.agents}"
+            hint = (
+                " (observations alone, as in older versions): return observations, {agent: {} for agent in self.agents}"
+            )
         raise ValueError(f"expected reset of {env} to return {_RESET}, {_SINCE}, got {_described(result)}{hint}")
     observations, infos = result
     return observations, infos
@@ -70,7 +72,7 @@ def step(env: Any, actions: dict[Any, Any]) -> Step:
         hint = ""
         if _are_dicts(result, 4):
             hint = (
-                " (one dict of dones, as before 1.24): return terminations for agents whose game is over and, "
+                " (one dict of dones, as in older versions): return terminations for agents whose game is over and, "
                 "beside them, truncations for those whom a time limit stops"
             )
         raise ValueError(f"expected step of {env} to return {_STEP}, {_SINCE}, got {_described(result)}{hint}")

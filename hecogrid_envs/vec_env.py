@@ -48,6 +48,8 @@ class NativeVecEnv(VecEnv):
         self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
         self._actions: npt.NDArray[np.integer[Any]] | None = None
         self._running = False
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training.
+        self.seeded_with: tuple[int | None, ...] = (None,) * batch.n_games
         own_space = observation_space(batch.task, batch.params)
         super().__init__(self.n_games * self.n_agents, own_space, spaces.Discrete(N_ACTIONS))
         if seed is not None:
@@ -59,7 +61,8 @@ class NativeVecEnv(VecEnv):
 
         :return: (B,) the seed of each row's game
         """
-        per_game = [None] * self.n_games if seed is None else game_seeds(seed, self.n_games)
+        per_game: list[int | None] = [None] * self.n_games if seed is None else [*game_seeds(seed, self.n_games)]
+        self.seeded_with = tuple(per_game)
         self._seeds = [game_seed for game_seed in per_game for _ in range(self.n_agents)]
         return self._seeds
 

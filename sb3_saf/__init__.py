@@ -22,7 +22,6 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
-    from hecogrid_envs.turns import TurnsInParallel
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
@@ -31,6 +30,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.common.centralized import CentralizedValueWrapper
     from sb3_saf.common.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.common.env import make_team_env
+    from sb3_saf.common.errors import NonFiniteError
     from sb3_saf.common.evaluation import (
         EvaluationResult,
         RandomPolicy,
@@ -38,7 +38,9 @@ if _is_installed("stable_baselines3"):
         evaluate_policy,
         evaluate_team,
     )
+    from sb3_saf.common.finite import FiniteCallback
     from sb3_saf.common.monitor import TeamMonitor
+    from sb3_saf.common.turns import TurnsInParallel
     from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
     from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
     from sb3_saf.export.weights import load_weights
@@ -74,6 +76,7 @@ __all__ = [
     "CheckpointError",
     "EvaluationResult",
     "ExportError",
+    "FiniteCallback",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -85,6 +88,7 @@ __all__ = [
     "MAPPOPolicy",
     "MLPEncoder",
     "NatureEncoder",
+    "NonFiniteError",
     "ObservationEncoder",
     "PaperCNN",
     "QPLEXLstmPolicy",

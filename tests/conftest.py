@@ -25,6 +25,7 @@ for variable, value in {
 
 # No deadline: the first example compiles the kernels. In CI the examples are the same in every run.
 settings.register_profile("sb3_saf", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile("thorough", deadline=None, max_examples=10_000)
 settings.load_profile("sb3_saf")
 
 

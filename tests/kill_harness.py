@@ -1,93 +1,215 @@
 """
-Kill a training run with SIGKILL at random moments, start it again until it is done, and compare its weights bit for bit
-with those of an undisturbed run::
+Kill training runs with SIGKILL, resume them, and compare what they end with, bit for bit, with undisturbed runs::
 
-    python -m tests.kill_harness --kills 20
+    python -m tests.kill_harness --algo saf --kills 20
 
-Every moment is drawn from the time that the undisturbed run takes, so kills fall into imports, rollouts, updates,
-evaluations and the writing of checkpoints (which is made frequent: one per rollout).
+Kills go round these kinds, each at a moment drawn anew:
+
+=========== ==================================================================================================
+rollout     after a step of the games, before SB3 has stored it
+update      after a step of the optimiser, in the middle of an update
+writing     around the syncing and renaming of a checkpoint, half of its file on the disk included
+clock       at any moment of the run's time; what the run was doing then is told
+=========== ==================================================================================================
+
+All but the last are counted inside the run, so the same seed kills at the same moments on every machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import json
+import multiprocessing as mp
 import os
 import random
 import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple
+from shutil import rmtree
+from typing import Any, Final, NamedTuple
+from unittest import mock
 
 import numpy as np
+import torch as th
 
-N_AGENTS, N_GAMES, N_STEPS = 3, 4, 16
-ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
+import sb3_saf
+from sb3_saf.checkpoints.callback import TeamCheckpointCallback
+from sb3_saf.checkpoints.store import CheckpointFolder
+from tests.killed_runs import ALGOS, ROLLOUT, Run, make_run
+
+#: What is counted in a run.
+KINDS: Final = ("rollout", "update", "writing")
+CLOCK: Final = "clock"
+#: What a run may be doing, by the number that it leaves in shared memory.
+PHASES: Final = ("between", "rollout", "update", "writing", "evaluation")
 
 
-class Result(NamedTuple):
+class Moment(NamedTuple):
     """
-    What came out.
+    When to kill.
 
-    :param kills: how often the run was killed
-    :param starts: how often it was started
-    :param equal: whether weights, monitor.csv without times, and evaluations are those of the undisturbed run
+    :param kind: one of KINDS, or CLOCK
+    :param when: the how-manieth event of its kind since the process began, or seconds
     """
 
-    kills: int
-    starts: int
-    equal: bool
+    kind: str
+    when: float
 
 
-def train(folder: Path, rollouts: int) -> None:
+class Watch:
+    """
+    What a run tells about itself in shared memory, which outlives it; and where it kills itself.
+
+    :param moment: when; None to let it live
+    """
+
+    def __init__(self, moment: Moment | None = None) -> None:
+        self.moment = moment
+        self._counts = mp.RawArray(ctypes.c_long, len(KINDS))
+        self._phase = mp.RawValue(ctypes.c_int, 0)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Events by their kind."""
+        return dict(zip(KINDS, self._counts, strict=True))
+
+    @property
+    def phase(self) -> str:
+        """What the run was doing last."""
+        return PHASES[self._phase.value]
+
+    def event(self, kind: str, last_words: Callable[[], object] | None = None) -> None:
+        """
+        Count an event; if its time has come, it is the last one.
+
+        :param last_words: called just before the end
+        """
+        self._counts[KINDS.index(kind)] += 1
+        if self.moment == (kind, self.counts[kind]):
+            if last_words is not None:
+                last_words()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def during(self, phase: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, which says what it does."""
+
+        def watched(*args: Any, **kwargs: Any) -> Any:
+            before, self._phase.value = self._phase.value, PHASES.index(phase)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self._phase.value = before
+
+        return watched
+
+    @contextmanager
+    def on(self, run: Run) -> Iterator[None]:
+        """Watch a run."""
+        model, env = run.model, run.model.env
+        step = env.step_wait
+
+        def counted_step() -> Any:
+            result = step()
+            self.event("rollout")
+            return result
+
+        model.policy.optimizer.register_step_post_hook(lambda *_: self.event("update"))
+        with (
+            mock.patch.object(env, "step_wait", counted_step),
+            mock.patch.object(model, "collect_rollouts", self.during("rollout", model.collect_rollouts)),
+            mock.patch.object(model, "train", self.during("update", model.train)),
+            mock.patch.object(run.evaluation, "_evaluate", self.during("evaluation", run.evaluation._evaluate)),
+            mock.patch.object(TeamCheckpointCallback, "_take", self.during("writing", TeamCheckpointCallback._take)),
+            mock.patch.object(CheckpointFolder, "write", self.during("writing", CheckpointFolder.write)),
+            self._on_files(),
+        ):
+            yield
+
+    @contextmanager
+    def _on_files(self) -> Iterator[None]:
+        fsync, replace = os.fsync, os.replace
+
+        def counted_fsync(file: int) -> None:
+            self.event("writing", lambda: _halve(file))
+            fsync(file)
+            self.event("writing")
+
+        def counted_replace(source: Any, target: Any) -> None:
+            self.event("writing")
+            replace(source, target)
+            self.event("writing")
+
+        with mock.patch.object(os, "fsync", counted_fsync), mock.patch.object(os, "replace", counted_replace):
+            yield
+
+
+def _halve(file: int) -> None:
+    """What a power cut may leave of a temporary file that was not synced."""
+    if Path(os.readlink(f"/proc/self/fd/{file}")).name.startswith(".writing-"):
+        os.ftruncate(file, os.fstat(file).st_size // 2)
+
+
+# --- one run ----------------------------------------------------------------------------------------------------------
+
+
+def train(algo: str, folder: Path, rollouts: int, watch: Watch) -> None:
     """The run: started again in the same folder, it goes on."""
-    import torch as th
-    from stable_baselines3 import PPO
-
-    import sb3_saf
-
     th.set_num_threads(1)
-    task: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 9, "n_treasures": 4, "coordination": 1, "max_cycles": 20}
-    env = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=0, monitor_dir=str(folder), **task)
-    eval_env = sb3_saf.make_team_env("TeamTogether", 2, seed=99, **task)
-    policy = {"features_extractor_class": sb3_saf.LightEncoder, "net_arch": [16], "normalize_values": True}
-    model = PPO(
-        "SAFPolicy",
-        env,
-        learning_rate=lambda progress: 1e-3 * progress,
-        n_steps=N_STEPS,
-        batch_size=ROLLOUT // 4,
-        n_epochs=2,
-        seed=0,
-        policy_kwargs=policy,
-        rollout_buffer_class=sb3_saf.TeamRolloutBuffer,
-        tensorboard_log=str(folder / "tb"),
-    )
-    evaluation = sb3_saf.TeamEvalCallback(
-        eval_env, n_eval_episodes=2, eval_freq=200, log_path=str(folder), deterministic=False, verbose=0
-    )
-    steps = rollouts * ROLLOUT
-    sb3_saf.resumable_learn(model, steps, folder / "checkpoints", evaluation, every_game_steps=1)
-    weights = {name: tensor.numpy() for name, tensor in model.policy.state_dict().items()}
-    np.savez(folder / "weights.npz", **weights)
-    (folder / "done").touch()
+    run = make_run(algo, folder)
+    with watch.on(run):
+        sb3_saf.resumable_learn(
+            run.model, rollouts * ROLLOUT, folder / "checkpoints", run.evaluation, every_game_steps=run.every
+        )
+    np.savez(folder / "weights.npz", allow_pickle=False, **run.arrays())
 
 
-def start(folder: Path, rollouts: int, *arguments: str) -> subprocess.Popen[bytes]:
-    """Start the run in a process of its own."""
-    command = [sys.executable, "-m", "tests.kill_harness", "--train", str(folder), "--rollouts", str(rollouts)]
-    return subprocess.Popen([*command, *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"})
+def start(algo: str, folder: Path, rollouts: int, watch: Watch) -> BaseProcess:
+    """Start the run in a process of its own, which has all imports already."""
+    process = mp.get_context("fork").Process(target=train, args=(algo, folder, rollouts, watch))
+    process.start()
+    return process
 
 
-def compare(one: Path, other: Path) -> bool:
-    """Whether two finished runs are equal: weights bit for bit, episodes, evaluations."""
-    return (
-        _same_arrays(one / "weights.npz", other / "weights.npz")
-        and _same_arrays(one / "evaluations.npz", other / "evaluations.npz")
-        and _episodes(one) == _episodes(other)
+def finish(algo: str, folder: Path, rollouts: int) -> Watch:
+    """
+    Start the run and wait for its end.
+
+    :raises RuntimeError: if it fails
+    """
+    watch = Watch()
+    process = start(algo, folder, rollouts, watch)
+    process.join()
+    if process.exitcode:
+        raise RuntimeError(f"the run in {folder} failed with exit code {process.exitcode}")
+    return watch
+
+
+def kill(algo: str, folder: Path, rollouts: int, moment: Moment) -> str | None:
+    """
+    Start the run and kill it.
+
+    :return: what it was doing; None if it was done before its moment came
+    """
+    watch = Watch(None if moment.kind == CLOCK else moment)
+    process = start(algo, folder, rollouts, watch)
+    if moment.kind == CLOCK:
+        time.sleep(moment.when)
+        process.kill()
+    process.join()
+    return watch.phase if process.exitcode == -signal.SIGKILL else None
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether finished runs are equal: weights and replay bit for bit, evaluations, and episodes but for their time."""
+    return all(_same_arrays(one / name, other / name) for name in ("weights.npz", "evaluations.npz")) and (
+        _episodes(one) == _episodes(other) != []
     )
 
 
@@ -97,67 +219,84 @@ def _same_arrays(one: Path, other: Path) -> bool:
 
 
 def _episodes(folder: Path) -> list[str]:
-    """Return and length of each episode; its time differs."""
     lines = (folder / "monitor.csv").read_text().splitlines()[1:]
     return [line.rsplit(",", 1)[0] for line in lines]
 
 
-def kill_until_done(folder: Path, rollouts: int, delays: Sequence[float], say: bool = False) -> Result:
+# --- many kills -------------------------------------------------------------------------------------------------------
+
+
+def kill_in_a_row(algo: str, rollouts: int, moments: Sequence[Moment]) -> tuple[list[str | None], bool]:
     """
-    Start a run, kill it after each delay, and let the last start finish.
+    Kill one run several times, then let it finish.
 
-    :param folder: with the undisturbed run in ``undisturbed``
-    :param rollouts: length of the run
-    :param delays: seconds from a start to its kill
+    :return: what it was doing at each kill, and whether it ended as the undisturbed run
     """
-    killed, kills = folder / "killed", 0
-    for delay in delays:
-        process = start(killed, rollouts)
-        time.sleep(delay)
-        process.send_signal(signal.SIGKILL)
-        kills += process.wait() == -signal.SIGKILL
-        newest = sorted(killed.glob("checkpoints/checkpoint-*"))[-1:]
-        if say:
-            print(f"killed after {delay:5.2f} s; newest checkpoint: {newest[0].name if newest else 'none'}", flush=True)
-    if start(killed, rollouts).wait():
-        raise RuntimeError("the resumed run failed")
-    return Result(kills, len(delays) + 1, compare(folder / "undisturbed", killed))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        finish(algo, folder / "undisturbed", rollouts)
+        doing = [kill(algo, folder / "killed", rollouts, moment) for moment in moments]
+        finish(algo, folder / "killed", rollouts)
+        return doing, same(folder / "undisturbed", folder / "killed")
 
 
-def undisturbed_seconds(folder: Path, rollouts: int) -> float:
-    """Make the undisturbed run: how long it takes."""
-    began = time.monotonic()
-    if start(folder / "undisturbed", rollouts).wait():
-        raise RuntimeError("the undisturbed run failed")
-    return time.monotonic() - began
+def kill_one_by_one(algo: str, rollouts: int, kills: int, seed: int) -> tuple[Counter[str], Counter[str]]:
+    """
+    Kill as many runs, each once, at drawn moments; resume and compare each.
+
+    :return: kills, and those that ended bit-equal, by their kind
+    """
+    rng = random.Random(seed)
+    done, equal = Counter[str](), Counter[str]()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        began = time.monotonic()
+        counts = finish(algo, folder / "undisturbed", rollouts).counts
+        seconds = time.monotonic() - began
+        print(f"{algo}, undisturbed: {seconds:.1f} s, {counts}", flush=True)
+        while sum(done.values()) < kills:
+            kind = (*KINDS, CLOCK)[sum(done.values()) % 4]
+            when = rng.uniform(0, seconds) if kind == CLOCK else rng.randint(1, counts[kind])
+            doing = kill(algo, folder / "killed", rollouts, Moment(kind, when))
+            newest = sorted(folder.glob("killed/checkpoints/checkpoint-*"))[-1:]
+            finish(algo, folder / "killed", rollouts)
+            is_equal = same(folder / "undisturbed", folder / "killed")
+            if doing is not None:
+                done[kind] += 1
+                equal[kind] += is_equal
+                from_ = newest[0].name if newest else "the start"
+                print(
+                    f"{algo} killed at {kind} {when:.5g} ({doing}), went on from {from_}: "
+                    f"{'bit-equal' if is_equal else 'DIFFERENT'}",
+                    flush=True,
+                )
+            rmtree(folder / "killed")
+    return done, equal
 
 
 def main() -> None:
-    """Run the harness, or the run that it kills."""
+    """Run the harness, or one run alone."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
+    parser.add_argument("--algo", choices=ALGOS, default="saf")
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--rollouts", type=int, default=60, help="length of the run")
+    parser.add_argument("--rollouts", type=int, default=40, help="length of the run")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--train", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--at", nargs="+", default=[], metavar="KIND:NUMBER", help="kill one run at these, in a row")
+    parser.add_argument("--train", type=Path, metavar="FOLDER", help="only train, in this process")
     options = parser.parse_args()
     if options.train is not None:
-        train(options.train, options.rollouts)
+        train(options.algo, options.train, options.rollouts, Watch())
         return
-    moments = random.Random(options.seed)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        seconds = undisturbed_seconds(folder, options.rollouts)
-        print(f"undisturbed run: {seconds:.1f} s")
-        equal = kills = 0
-        while kills < options.kills:
-            # Each run is killed once, then resumed and compared.
-            result = kill_until_done(folder, options.rollouts, [moments.uniform(0.3, 1.0) * seconds], say=True)
-            kills += result.kills
-            equal += result.equal if result.kills else 0
-            print(f"{equal} of {kills} end bit-equal", flush=True)
-            for path in sorted((folder / "killed").rglob("*"), reverse=True):
-                path.rmdir() if path.is_dir() else path.unlink()
-    sys.exit(equal != kills)
+    make_run(options.algo, None).warm_up()  # before the forks: they inherit what is compiled
+    if options.at:
+        moments = [Moment(kind, int(number)) for kind, number in (text.split(":") for text in options.at)]
+        doing, is_equal = kill_in_a_row(options.algo, options.rollouts, moments)
+        print(json.dumps({"killed": doing, "equal": is_equal}))
+        return
+    done, equal = kill_one_by_one(options.algo, options.rollouts, options.kills, options.seed)
+    for kind in (*KINDS, CLOCK):
+        print(f"{options.algo}, {kind}: {equal[kind]} of {done[kind]} end bit-equal")
+    sys.exit(equal != done)
 
 
 if __name__ == "__main__":

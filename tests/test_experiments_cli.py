@@ -10,6 +10,7 @@ import pytest
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cells import Choice, Protocol, Shard
 from sb3_saf.experiments.definitions import EXPERIMENTS, find_experiment
+from sb3_saf.experiments.measure import Burst, full_rate
 from sb3_saf.experiments.plan import _duration
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine, run
@@ -73,6 +74,14 @@ def test_plan_counts_what_is_finished_and_names_what_is_left_out(
         "left out    TeamSupport: training at c=4, h=4 is left out: coordination must be an integer from 1" in printed
     )
     assert "nothing is left to train" in output(capsys, *words, "--methods", "ippo", "--seeds", "0")
+
+
+def test_rates_are_extrapolated_to_all_games() -> None:
+    """A rollout that costs 2 s and a tenth of a second more for every game."""
+    few, many = (Burst(n, 50 * n, 2 + 0.1 * n, "cpu") for n in (2, 8))
+    assert full_rate(few, many, 64) == pytest.approx(50 * 64 / (2 + 0.1 * 64))
+    assert full_rate(few, many, 8) == pytest.approx(50 * 8 / 2.8)
+    assert full_rate(few._replace(seconds=3.0), many, 16) == pytest.approx(50 * 16 / 2.8)  # noise, not negative costs
 
 
 def test_plan_measures(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

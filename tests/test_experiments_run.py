@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from hecogrid_envs.vec_env import NativeVecEnv
 from sb3_saf.experiments import cli
 from sb3_saf.experiments import run as run_module
 from sb3_saf.experiments.cells import Cell, Choice, Protocol, Shard
@@ -232,7 +235,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(run_module, "do", _interrupted)
     monkeypatch.setattr(cli, "engine_of", lambda options: InlineEngine())
     assert cli.main(["run", "joint", "--size", "smoke", "-f", str(tmp_path)]) == 130
-    assert "finished cells are kept; the same command continues" in capsys.readouterr().err
+    assert "finished cells and checkpoints are kept; the same command continues" in capsys.readouterr().err
 
 
 def _refused(folder: Path, protocol: Protocol) -> str:
@@ -294,3 +297,68 @@ def test_curve(tmp_path: Path) -> None:
     path = tmp_path / "monitor.csv"
     path.write_text("#{}\nr,l,t\n1,10,0\n2,10,0\n6,10,0\n4,10,0\n8,10,0\n")
     assert curve(path, 2) == "game_steps,mean_return,episodes\n30,3.0,3\n50,6.0,2\n"
+
+
+def struck_at(monkeypatch: pytest.MonkeyPatch, step: int | None) -> list[int]:
+    """Count the steps that vector environments play; at one of them the process dies, as far as anybody can tell."""
+    played, play = [0], NativeVecEnv.step_wait
+
+    def counted(self: NativeVecEnv) -> Any:
+        played[0] += 1
+        if played[0] == step:
+            raise RuntimeError("struck")
+        return play(self)
+
+    monkeypatch.setattr(NativeVecEnv, "step_wait", counted)
+    return played
+
+
+@pytest.mark.parametrize("method", ["saf", "qplex"])
+def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(method: str, tmp_path: Path) -> None:
+    cell = Cell(method, "TeamSupport", Level(2, 1), 0, (Level(2, 1), Level(1, 1)))
+    work = Work(cell, SMOKE, cell.tests, unfinished=str(tmp_path / "unfinished"))
+
+    def attempt(work: Work, step: int | None = None) -> tuple[bytes | None, int]:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            played = struck_at(monkeypatch, step)
+            if step is None:
+                return do(work), played[0]
+            with pytest.raises(RuntimeError, match="struck"):
+                do(work)
+            return None, played[0]
+
+    whole, n_steps = attempt(replace(work, unfinished=None))
+    n_tested = 2 * 20
+    attempt(work, n_steps // 3)
+    attempt(work, n_steps // 3)
+    killed, n_rest = attempt(work)
+    assert n_rest - n_tested < (n_steps - n_tested) / 2
+    folders = tmp_path / "undisturbed", tmp_path / "killed"
+    for archive, folder in zip((whole, killed), folders, strict=True):
+        assert archive is not None
+        unpack(archive, folder)
+    assert what_counts(folders[0]) == what_counts(folders[1])
+
+
+def what_counts(cell_folder: Path) -> dict[str, Any]:
+    """All that a cell's folder tells but times."""
+    tests = {path.name: json.loads(path.read_text())["returns"] for path in (cell_folder / "tests").iterdir()}
+    files = sorted(str(path.relative_to(cell_folder)) for path in cell_folder.rglob("*") if path.is_file())
+    with zipfile.ZipFile(cell_folder / "model.zip") as model:
+        weights = model.read("policy.pth")
+    texts = [(cell_folder / name).read_text() for name in ("curve.csv", "config.json", "command.txt")]
+    return {"tests": tests, "files": files, "weights": weights, "texts": texts}
+
+
+def test_checkpoints_of_other_settings_are_left_alone_and_finished_cells_keep_none(tmp_path: Path) -> None:
+    experiment = find_experiment("joint")
+    results, choice = Results(tmp_path), Choice((0,), ("ippo",), ("TeamSupport",))
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        struck_at(monkeypatch, 15)
+        summary = run(experiment, choice, SMOKE, results, InlineEngine(), Machine(retries=0), Shard())
+    (failed,) = summary.failed
+    folder = results.unfinished(failed)
+    assert list(folder.glob("checkpoints/*.ckpt"))
+    (folder / "config.json").write_text("{}")  # as if the settings had been others
+    run(experiment, choice, SMOKE, results, InlineEngine(), Machine(retries=0), Shard())
+    assert results.is_finished(failed) and not (tmp_path / "unfinished").exists()

@@ -16,14 +16,14 @@ from tests.toy_envs import CounterEnv, TellingEnv
 
 
 class SilentReset(CounterEnv):
-    """Gives observations alone at a reset, as before PettingZoo 1.24."""
+    """Gives observations alone at a reset, as in older versions of PettingZoo."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         return super().reset(seed, options)[0]
 
 
 class OneDone(CounterEnv):
-    """Gives one dict of dones at a step, as before PettingZoo 1.24."""
+    """Gives one dict of dones at a step, as in older versions of PettingZoo."""
 
     def step(self, actions: dict[str, Any]) -> Any:
         observations, rewards, terminations, _, infos = super().step(actions)
@@ -69,12 +69,12 @@ STEP = "(observations, rewards, terminations, truncations, infos)"
         (
             SilentReset,
             f"expected reset of counter_v0 to return (observations, infos), {SINCE}, got a dict with the keys "
-            "['agent_0', 'agent_1'] (observations alone, as before 1.24): return observations, {agent: {}",
+            "['agent_0', 'agent_1'] (observations alone, as in older versions): return observations, {agent: {}",
         ),
         (
             OneDone,
             f"expected step of counter_v0 to return {STEP}, {SINCE}, got 4 values: dict, dict, dict, dict (one dict of "
-            "dones, as before 1.24): return terminations for",
+            "dones, as in older versions): return terminations for",
         ),
         (NoTuple, "got 5 values: list, list, list, list, list"),
         (Unseeded, f"expected counter_v0 to have reset(seed=None, options=None), {SINCE}, got reset() -> "),

@@ -81,6 +81,26 @@ def test_qplex_is_the_published_sum() -> None:
     assert all(parameter.grad is not None for parameter in mixer.parameters())
 
 
+@pytest.mark.parametrize(("n_agents", "state_dim"), [(2, 128), (5, 320)])
+def test_lambda_tells_joint_actions_apart_from_the_start(n_agents: int, state_dim: int) -> None:
+    """
+    Standard deviation of log lambda over joint actions, and of what is left of it after a sum over agents.
+
+    Measured for (2, 128): 0.33 and 0.06. With torch's own initialisation: 0.005 and 0.0007.
+    """
+    mixer = QPLEXMixer(state_dim, n_agents, N_ACTIONS)
+    joint = th.tensor(list(product(range(N_ACTIONS), repeat=n_agents)))
+    nothing = th.zeros(joint.shape)
+    with th.no_grad():
+        weights = mixer.advantage_weights(
+            th.randn(1, state_dim).expand(len(joint), -1), JointChoice(nothing, nothing, joint)
+        ).log()
+    actions = th.nn.functional.one_hot(joint, N_ACTIONS).flatten(1).to(weights.dtype)
+    rest = weights - actions @ th.linalg.lstsq(actions, weights, driver="gelsd").solution
+    assert weights.std(dim=0).mean() > 0.08
+    assert rest.std(dim=0).mean() > 0.02
+
+
 @pytest.mark.parametrize("name", ["vdn", "qmix", "qplex"])
 def test_agents_that_take_no_part_do_not_count(name: str) -> None:
     mixer = make_mixer(name, 2)

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from sb3_contrib import RecurrentPPO
-from stable_baselines3 import A2C, PPO
+from gymnasium import spaces
+from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_saf
-from sb3_saf import CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
-from tests.kill_harness import kill_until_done, start, undisturbed_seconds
+from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
+from sb3_saf.common.teams import TeamVecEnvWrapper
+from tests.killed_runs import ALGOS
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
@@ -28,7 +33,7 @@ TASK: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 7, "n_treasures": 3, 
 LIGHT = {"features_extractor_class": sb3_saf.LightEncoder, "net_arch": [8]}
 
 
-MADE: list[OnPolicyAlgorithm] = []
+MADE: list[BaseAlgorithm] = []
 
 
 @pytest.fixture(autouse=True)
@@ -60,7 +65,9 @@ def make(folder: Path | None = None, algorithm: Any = PPO, policy: str = "SAFPol
     env = sb3_saf.make_team_env(
         "TeamTogether", N_GAMES, seed=3, monitor_dir=None if folder is None else str(folder), **TASK
     )
-    settings: dict[str, Any] = {"n_steps": N_STEPS, "seed": 3, "policy_kwargs": LIGHT} | arguments
+    settings: dict[str, Any] = {"seed": 3, "policy_kwargs": LIGHT} | arguments
+    if algorithm is not QPLEX:
+        settings = {"n_steps": N_STEPS} | settings
     if algorithm is PPO:
         settings = {
             "batch_size": ROLLOUT // 2,
@@ -74,7 +81,7 @@ def make(folder: Path | None = None, algorithm: Any = PPO, policy: str = "SAFPol
     return model
 
 
-def weights(model: OnPolicyAlgorithm) -> dict[str, bytes]:
+def weights(model: BaseAlgorithm) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in model.policy.state_dict().items()}
 
 
@@ -99,6 +106,53 @@ def go_on(folder: Path, model: Any, others: Any = (), rollouts: int = 10) -> Any
     )
 
 
+def qplex(policy: str, **parts: Any) -> Any:
+    """Its replay buffer holds a third of the run."""
+    settings: dict[str, Any] = {
+        "buffer_size": 80,
+        "learning_starts": 12,
+        "batch_size": 8,
+        "train_freq": 6,
+        "exploration_fraction": 0.9,
+    }
+    return make(algorithm=QPLEX, policy=policy, target_update_interval=30, policy_kwargs=LIGHT | parts, **settings)
+
+
+class Masking(TeamVecEnvWrapper):
+    """Forbids each row one action, another one at each step."""
+
+    def __init__(self, venv: VecEnv) -> None:
+        own, mask = venv.observation_space, spaces.MultiBinary(7)
+        super().__init__(venv, observation_space=spaces.Dict(obs=own, action_mask=mask))
+        self.n_steps = 0
+
+    def _told(self, own: Any) -> dict[str, Any]:
+        return {"obs": own, "action_mask": np.arange(7) != (self.n_steps + np.arange(len(own))[:, np.newaxis]) % 7}
+
+    def reset(self) -> Any:
+        return self._told(self.venv.reset())
+
+    def step_wait(self) -> Any:
+        own, rewards, dones, infos = self.venv.step_wait()
+        self.n_steps += 1
+        for row in np.flatnonzero(dones):
+            last = self._told(infos[row]["terminal_observation"][np.newaxis])
+            infos[row]["terminal_observation"] = {key: part[0] for key, part in last.items()}
+        return self._told(own), rewards, dones, infos
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        return {"n_steps": self.n_steps}
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        self.n_steps = state["n_steps"]
+
+
+def masked_games() -> sb3_saf.CentralizedValueWrapper:
+    """Games that forbid some actions, which change from step to step."""
+    native = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=3, **TASK).venv
+    return sb3_saf.CentralizedValueWrapper(Masking(native))
+
+
 MODELS: dict[str, Callable[[], Any]] = {
     "PPO": make,
     "schedules and normalised values": lambda: make(
@@ -107,6 +161,12 @@ MODELS: dict[str, Callable[[], Any]] = {
         policy_kwargs=LIGHT | {"normalize_values": True},
     ),
     "A2C": lambda: make(algorithm=A2C, policy="MAPPOPolicy"),
+    "TRPO": lambda: make(algorithm=TRPO, policy="IPPOPolicy", batch_size=ROLLOUT),
+    "MaskablePPO": lambda: make(
+        algorithm=MaskablePPO, policy="SAFMaskablePolicy", env=masked_games(), batch_size=ROLLOUT, n_epochs=1
+    ),
+    "QPLEX": lambda: qplex("QPLEXPolicy"),
+    "QPLEX with memory": lambda: qplex("QPLEXLstmPolicy", sequence_length=4, burn_in=2),
     "RecurrentPPO": lambda: make(algorithm=RecurrentPPO, policy="SAFLstmPolicy", batch_size=ROLLOUT, n_epochs=1),
 }
 
@@ -122,6 +182,14 @@ def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: 
     assert model.num_timesteps == 10 * ROLLOUT and model._n_updates == undisturbed._n_updates
     assert weights(model) == weights(undisturbed)
     assert weights(model) != weights(MODELS[name]())
+
+
+def test_what_agents_remember_goes_on(tmp_path: Path) -> None:
+    done, resumed = go_on(tmp_path, MODELS["QPLEX with memory"](), rollouts=2), MODELS["QPLEX with memory"]()
+    resume(tmp_path, resumed, Lightning(-1))
+    assert resumed._agent_state[0].any()
+    for part, expected in zip(resumed._agent_state, done._agent_state, strict=True):
+        assert np.array_equal(part, expected)
 
 
 def test_checkpoints_do_not_change_the_run(tmp_path: Path) -> None:
@@ -217,6 +285,32 @@ def test_a_damaged_checkpoint_costs_a_rollout_and_no_bit(tmp_path: Path) -> None
     assert weights(model) == weights(undisturbed)
 
 
+def test_replay_of_another_size_and_algorithms_without_teams_are_refused(tmp_path: Path) -> None:
+    go_on(tmp_path / "run", qplex("QPLEXPolicy"), rollouts=1)
+    with pytest.raises(CheckpointError, match="buffer_size is 80 there and 90 in the model"):
+        resume(tmp_path / "run", make(algorithm=QPLEX, policy="QPLEXPolicy", buffer_size=90, batch_size=8))
+    dqn = DQN("MlpPolicy", "CartPole-v1", buffer_size=100)
+    with pytest.raises(CheckpointError, match=r"exact resume is for PPO.*QPLEX, got DQN"):
+        resumable_learn(dqn, 10, tmp_path / "dqn")
+
+
+def test_ctrl_c_stops_qplex_at_the_next_step_and_the_second_one_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class CtrlC(Lightning):
+        def _on_step(self) -> bool:
+            self.strikes_in -= 1
+            for _ in range(times if self.strikes_in == 0 else 0):
+                signal.raise_signal(signal.SIGINT)
+            return True
+
+    for times, saved_at in ((1, 4), (2, 0)):
+        folder = tmp_path / str(times)
+        with pytest.raises(KeyboardInterrupt):
+            resumable_learn(qplex("QPLEXPolicy"), 10 * ROLLOUT, folder, CtrlC(4), every_game_steps=10**6)
+        assert f"checkpoint-{saved_at * N_GAMES:012d}.ckpt is saved" in capsys.readouterr().out
+
+
 def test_foreign_games_are_refused_or_begin_anew(tmp_path: Path) -> None:
     def supersuit() -> Any:
         return make(env=sb3_saf.make_team_env("TeamTogether", N_GAMES, backend="supersuit", **TASK))
@@ -239,17 +333,25 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.Captu
     assert weights(go_on(tmp_path, make())) == weights(make().learn(10 * ROLLOUT))
 
 
-def test_sigterm_saves_and_ends_with_its_status(tmp_path: Path) -> None:
-    process = start(tmp_path, 10_000)
-    while not list(tmp_path.glob("checkpoints/*.ckpt")):
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=60) == 128 + signal.SIGTERM
+@pytest.mark.parametrize("algo", ALGOS)
+def test_sigterm_saves_and_ends_with_its_status(algo: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.kill_harness", "--algo", algo, "--rollouts", "100000"]
+    with subprocess.Popen([*command, "--train", str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
+        while not list(tmp_path.glob("checkpoints/*.ckpt")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM
+    newest = max((tmp_path / "checkpoints").glob("*.ckpt"))
+    assert f"{newest} is saved; start the same command again" in out
 
 
-def test_killed_runs_end_bit_equal(tmp_path: Path) -> None:
-    seconds = undisturbed_seconds(tmp_path, rollouts=30)
-    result = kill_until_done(tmp_path, 30, [0.6 * seconds, 0.75 * seconds])
-    # On a busy machine the second moment may come after the end.
-    assert result.kills >= 1 and result.equal
+@pytest.mark.parametrize("algo", ALGOS)
+def test_killed_runs_end_bit_equal(algo: str) -> None:
+    command = [sys.executable, "-m", "tests.kill_harness", "--algo", algo, "--rollouts", "12"]
+    moments = ["rollout:40", "update:6", "writing:5", "writing:12"]
+    out = subprocess.run(
+        [*command, "--at", *moments], stdout=subprocess.PIPE, text=True, check=True, timeout=240
+    ).stdout
+    assert json.loads(out) == {"killed": ["rollout", "update", "writing", "writing"], "equal": True}

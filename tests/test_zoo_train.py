@@ -274,6 +274,28 @@ def test_mistakes_are_one_line(
     assert not list(Path("logs").rglob("*.yml"))  # it would pass for the latest run
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("default: [", "bad.yml is not valid YAML"),
+        ("- 1", "bad.yml must map 'default' and environment ids to settings, got [1]"),
+        ("default: {learning_rat: 1}", "bad.yml: unknown setting 'learning_rat' (did you mean 'learning_rate'?)"),
+        ("default: {gamma: 0.9, gamma: 0.8}", "the key 'gamma' is there twice"),
+        ("default: {gamma: high}", "gamma must be a number, got 'high'"),
+        ("default: {sizes: {tiny: {gamma: 0.9}}}", "unknown size 'tiny'"),
+        ("TeamTogehter-v0: {}", "unknown environment 'TeamTogehter-v0' (did you mean 'TeamTogether-v0'?)"),
+        ("default: !!python/object/apply:os.system ['touch evaluated']", "bad.yml is not valid YAML"),
+    ],
+)
+def test_bad_files_are_one_line(
+    text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bad.yml").write_text(text)
+    assert words in failed(["--size", "smoke", "-conf", "bad.yml"], capsys)
+    assert not Path("evaluated").exists()
+
+
 def test_help_tells_defaults_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
     text = zoo_train.make_parser().format_help()
     assert "(default: saf)" in text

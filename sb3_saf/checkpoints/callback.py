@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import uuid
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.checkpoints.callbacks import all_callbacks, callback_states
 from sb3_saf.checkpoints.data import Tree, encode
@@ -17,17 +18,17 @@ from sb3_saf.checkpoints.environments import environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.generators import generator_states
 from sb3_saf.checkpoints.logs import logger_state
-from sb3_saf.checkpoints.models import description, model_state
+from sb3_saf.checkpoints.models import description, is_off_policy, model_state, require_resumable
 from sb3_saf.checkpoints.software import software
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.common.game_steps import game_steps
 from sb3_saf.common.teams import check_count, require_n_agents
 
 #: The run that a model is in: its name is in every checkpoint, so that no other run goes on in the folder.
-_RUNS: weakref.WeakKeyDictionary[OnPolicyAlgorithm, str] = weakref.WeakKeyDictionary()
+_RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, str] = weakref.WeakKeyDictionary()
 
 
-def enter_run(model: OnPolicyAlgorithm, run: str) -> None:
+def enter_run(model: BaseAlgorithm, run: str) -> None:
     """Say that a model goes on with a run."""
     _RUNS[model] = run
 
@@ -38,6 +39,10 @@ class TeamCheckpointCallback(BaseCallback):
 
     The state is taken at the start of a rollout: the update before is done, and the buffer is empty. The end of
     training writes one, too. Between them the last state waits in memory, which :meth:`write_last` puts on the disk.
+
+    A rollout of QPLEX is one step of all games, and its state holds the replay buffer: a copy of it at every step would
+    cost more than learning. So its state is taken only where it is written, and who wants to stop a run says so with
+    :meth:`stop_soon`.
 
     Give it as the first of several callbacks, for what others do at the start of a rollout comes again on resuming.
 
@@ -52,7 +57,7 @@ class TeamCheckpointCallback(BaseCallback):
     :raises ValueError: if a number is not at least 1
     """
 
-    model: OnPolicyAlgorithm
+    model: BaseAlgorithm
 
     def __init__(
         self,
@@ -72,10 +77,10 @@ class TeamCheckpointCallback(BaseCallback):
         self._between_rollouts = False
         self._last: tuple[int, bytes] | None = None
         self._written: int | None = None
+        self._stop: Callable[[], NoReturn] | None = None
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, OnPolicyAlgorithm):
-            raise CheckpointError(f"exact resume is for PPO, A2C and their like, got {type(self.model).__name__}")
+        require_resumable(self.model)
         require_n_agents(self.training_env)
         self.store.acquire()
         self._run = _RUNS.setdefault(self.model, uuid.uuid4().hex)
@@ -89,9 +94,13 @@ class TeamCheckpointCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._between_rollouts = True  # until the first step
-        self._take()
-        if self._written is None or self._game_steps() - self._written >= self.every_game_steps:
+        is_due = self._written is None or self._game_steps() - self._written >= self.every_game_steps
+        if is_due or self._stop is not None or not is_off_policy(self.model):
+            self._take()
+        if is_due:
             self.write_last()
+        if self._stop is not None:
+            self._stop()
 
     def _on_step(self) -> bool:
         self._between_rollouts = False
@@ -105,6 +114,18 @@ class TeamCheckpointCallback(BaseCallback):
             self._take()
         self.write_last()
         self.store.release()
+
+    def can_stop_at_once(self) -> bool:
+        """Whether the last state between rollouts is at hand at any moment."""
+        return not is_off_policy(self.model)
+
+    def stop_soon(self, stop: Callable[[], NoReturn]) -> None:
+        """
+        End training before the next rollout, with the state of that moment at hand for :meth:`write_last`.
+
+        :param stop: raises what shall end it
+        """
+        self._stop = stop
 
     def _game_steps(self) -> int:
         steps = game_steps(self.model)
@@ -139,6 +160,8 @@ class TeamCheckpointCallback(BaseCallback):
         steps, data = self._last
         path = self.store.write(data, steps)
         self._written = steps
+        if is_off_policy(self.model):
+            self._last = None  # memory for as much as the replay buffer
         if self.verbose >= 1:
             print(f"Checkpoint {path}")
         return path

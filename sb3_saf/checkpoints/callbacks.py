@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import (
     EvalCallback,
     EventCallback,
     EveryNTimesteps,
+    ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
@@ -19,6 +20,7 @@ from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import Stateful, environment_state, load_environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.common.callbacks import TeamEvalCallback
+from sb3_saf.inspection.callback import InspectionCallback
 
 _COUNTERS: Final[dict[Any, tuple[str, ...]]] = {
     BaseCallback: ("n_calls",),
@@ -32,12 +34,15 @@ _COUNTERS: Final[dict[Any, tuple[str, ...]]] = {
     StopTrainingOnNoModelImprovement: ("last_best_mean_reward", "no_improvement_evals"),
 }
 
+#: A run may go on without them, or with them: progress bars of a terminal, looks into the policy.
+_ONLY_SHOWING: Final = (ProgressBarCallback, InspectionCallback)
+
 Callbacks = BaseCallback | Iterable[BaseCallback] | None
 
 
 def all_callbacks(callback: Callbacks) -> Iterator[BaseCallback]:
-    """Callbacks in lists, and those that others call."""
-    if callback is None:
+    """Callbacks in lists, and those that others call, but for those that only show something."""
+    if callback is None or isinstance(callback, _ONLY_SHOWING):
         return
     if not isinstance(callback, BaseCallback):
         for one in callback:

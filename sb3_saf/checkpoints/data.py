@@ -47,8 +47,10 @@ def encode(tree: Tree, version: str) -> bytes:
     text = json.dumps(_pack(tree, arrays, "state"), separators=(",", ":"))
     arrays[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
     header = f"sb3_saf checkpoint, format {FORMAT}, written by sb3_saf {version}\n".encode()
-    content = header + save(arrays)
-    return content + hashlib.sha256(content).digest()
+    body = save(arrays)
+    digest = hashlib.sha256(header)
+    digest.update(body)
+    return b"".join((header, body, digest.digest()))  # one copy: it may hold a replay buffer
 
 
 def decode(data: bytes) -> Tree:
@@ -59,7 +61,7 @@ def decode(data: bytes) -> Tree:
     :raises DamagedCheckpointError: if a bit was changed or the file was cut short
     :raises UnknownFormatError: if another version wrote it in another format
     """
-    content, digest = data[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]
+    content, digest = memoryview(data)[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]  # no copy: it may hold a replay buffer
     if hashlib.sha256(content).digest() != digest:
         raise DamagedCheckpointError("its checksum does not match: it was cut short or changed")
     header = _HEADER.match(content)
@@ -72,7 +74,7 @@ def decode(data: bytes) -> Tree:
             f"reads format {FORMAT}; install that version to go on"
         )
     try:
-        arrays = load(content[header.end() :])
+        arrays = load(bytes(content[header.end() :]))
         return _unpack(json.loads(arrays.pop(_TREE).tobytes()), arrays)
     except Exception as error:  # a right checksum over wrong content: not written by this package
         raise DamagedCheckpointError(f"its content cannot be read: {error}") from error
@@ -101,7 +103,7 @@ def _pack_array(kind: str, array: Array, arrays: dict[str, Array], where: str) -
     if array.dtype.kind not in "biuf":
         raise CheckpointError(f"{where} has the dtype {array.dtype}, which a checkpoint cannot hold")
     name = str(len(arrays))
-    arrays[name] = np.array(array, order="C")
+    arrays[name] = array.copy() if array.ndim == 0 else np.ascontiguousarray(array)
     return {_KIND: kind, "is": name}
 
 

@@ -74,7 +74,7 @@ def _layer_state(layer: VecEnv) -> Tree:
     if isinstance(layer, VecNormalize):
         return _normalize_state(layer)
     if isinstance(layer, CentralizedValueWrapper):
-        return {"n_steps": layer._n_steps}
+        return {"n_steps": layer._n_steps, "masks_shown": layer._masks_shown}
     if isinstance(layer, VecTransposeImage):
         return {}
     raise CheckpointError(
@@ -91,7 +91,7 @@ def _load_layer_state(layer: VecEnv, state: Tree) -> None:
     elif isinstance(layer, VecNormalize):
         _load_normalize_state(layer, state)
     elif isinstance(layer, CentralizedValueWrapper):
-        layer._n_steps = state["n_steps"]
+        layer._n_steps, layer._masks_shown = state["n_steps"], state["masks_shown"]
 
 
 def _statistics(layer: VecNormalize) -> dict[str, RunningMeanStd]:

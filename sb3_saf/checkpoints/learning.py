@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.checkpoints.callback import TeamCheckpointCallback, enter_run
 from sb3_saf.checkpoints.callbacks import all_callbacks, load_callback_states
@@ -22,14 +24,19 @@ from sb3_saf.checkpoints.environments import load_environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.generators import load_generator_states
 from sb3_saf.checkpoints.logs import continue_logs
-from sb3_saf.checkpoints.models import check_description, load_model_state
+from sb3_saf.checkpoints.models import check_description, is_off_policy, load_model_state, require_resumable
 from sb3_saf.checkpoints.software import warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.common.errors import NonFiniteError
+from sb3_saf.common.finite import FiniteCallback
+
+#: Torch's own words for distributions of actions that weights too large have made of NaN.
+_OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)
 
 
 def resume(
     folder: str | os.PathLike[str],
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     callback: BaseCallback | Sequence[BaseCallback] | None = None,
 ) -> Path:
     """
@@ -46,6 +53,7 @@ def resume(
     :raises CheckpointError: if there is no good checkpoint, or model, environment or callbacks differ from those of the
         first start, naming the first difference
     """
+    require_resumable(model)
     loaded = CheckpointFolder(folder).newest()
     if loaded is None:
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
@@ -63,7 +71,7 @@ def resume(
     return loaded.path
 
 
-def _load_environment(model: OnPolicyAlgorithm, state: Tree) -> None:
+def _load_environment(model: BaseAlgorithm, state: Tree) -> None:
     assert model.env is not None
     if state is not None:
         load_environment_state(model.env, state)
@@ -74,7 +82,7 @@ def _load_environment(model: OnPolicyAlgorithm, state: Tree) -> None:
 
 
 def resumable_learn(
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     total_timesteps: int,
     folder: str | os.PathLike[str],
     callback: BaseCallback | Sequence[BaseCallback] | None = None,
@@ -82,12 +90,15 @@ def resumable_learn(
     every_game_steps: int = 100_000,
     keep: int = 3,
     exact: bool = True,
+    finite: bool = True,
+    again: str = "start the same command again to go on from there",
     **learn_arguments: Any,
-) -> OnPolicyAlgorithm:
+) -> BaseAlgorithm:
     """
     ``model.learn`` with checkpoints: started again after whatever ended it, the same script goes on where it was.
 
-    Ctrl-C and SIGTERM write the last state between two rollouts before the process ends.
+    Ctrl-C and SIGTERM write the last state between two rollouts before the process ends. So does NaN or infinity in
+    observations, rewards, losses or gradients, which ends training.
 
     :param model: made the same way at every start
     :param total_timesteps: agents' steps of the whole run, as SB3 counts them
@@ -96,13 +107,17 @@ def resumable_learn(
     :param every_game_steps: see :class:`TeamCheckpointCallback`
     :param keep: see :class:`TeamCheckpointCallback`
     :param exact: see :class:`TeamCheckpointCallback`
+    :param finite: whether to look for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
+    :param again: what a message after Ctrl-C and SIGTERM tells to do
     :param learn_arguments: of ``model.learn``
     :return: the model
     :raises CheckpointError: see :func:`resume`; also if another run is at work in the folder
+    :raises NonFiniteError: at NaN or infinity, naming the step, what it is in, and the last good checkpoint
     """
     others = list(all_callbacks(callback))
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
     checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, others, exact, verbose=model.verbose)
+    before: list[BaseCallback] = [FiniteCallback()] if finite else []  # first: what is written has been looked at
     checkpoints.store.acquire()
     try:
         if checkpoints.store.checkpoints():
@@ -111,37 +126,74 @@ def resumable_learn(
                 print(f"Going on from {path}")
             learn_arguments["reset_num_timesteps"] = False
             total_timesteps -= model.num_timesteps
-        with _saved_on_interrupt(checkpoints):
-            model.learn(total_timesteps, [checkpoints, *given], **learn_arguments)
+        with _saved_on_interrupt(checkpoints, is_off_policy(model), again):
+            model.learn(total_timesteps, [*before, checkpoints, *given], **learn_arguments)
     finally:
         checkpoints.store.release()
     return model
 
 
 @contextmanager
-def _saved_on_interrupt(checkpoints: TeamCheckpointCallback) -> Iterator[None]:
-    with _sigterm_raises():
+def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, again: str) -> Iterator[None]:
+    """
+    Save when something stops training.
+
+    :param at_rollout: signals stop it at the start of the next rollout only, where its state can be taken
+    :param again: how to go on
+    """
+    signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
+    with _handled(signals, _Stopper(checkpoints, at_rollout)):
         try:
             yield
         except (KeyboardInterrupt, SystemExit):
             checkpoints.write_last()
             newest = checkpoints.store.checkpoints()
             if newest:
-                print(f"\nStopped. {newest[0]} is saved; start the same command again to go on from there.", flush=True)
+                print(f"\nStopped. {newest[0]} is saved; {again}.", flush=True)
             raise
+        except ValueError as error:
+            if not isinstance(error, NonFiniteError) and not _OF_TORCH.match(str(error)):
+                raise
+            checkpoints.write_last()  # of before this rollout
+            newest = checkpoints.store.checkpoints()
+            last = f"the last good checkpoint is {newest[0]}" if newest else "there is no checkpoint yet"
+            what = str(error).partition("\n")[0].rstrip(":")
+            raise NonFiniteError(f"{what}; {last}") from error
 
 
-def _stop(number: int, frame: FrameType | None) -> NoReturn:
+class _Stopper:
+    """
+    What a signal does: it raises, at once or at the start of the next rollout; the second one at once.
+
+    :param checkpoints: of the run
+    :param at_rollout: whether the first one waits
+    """
+
+    def __init__(self, checkpoints: TeamCheckpointCallback, at_rollout: bool) -> None:
+        self._checkpoints = checkpoints
+        self._waits = at_rollout
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not self._waits:
+            _stop(number)
+        self._waits = False
+        self._checkpoints.stop_soon(partial(_stop, number))
+
+
+def _stop(number: int) -> NoReturn:
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
     raise SystemExit(128 + number)
 
 
 @contextmanager
-def _sigterm_raises() -> Iterator[None]:
+def _handled(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
         yield
         return
-    before = signal.signal(signal.SIGTERM, _stop)
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, kept in before.items():
+            signal.signal(number, kept)

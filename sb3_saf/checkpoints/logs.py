@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_saf.checkpoints.data import Tree
@@ -38,7 +38,7 @@ def logger_state(logger: Logger) -> Tree:
     }
 
 
-def continue_logs(model: OnPolicyAlgorithm, state: Tree) -> None:
+def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
     """Give the model a logger that goes on in the same folder; one that the caller has set stays."""
     if not model._custom_logger:
         model.set_logger(_continued_logger(model, state))
@@ -48,7 +48,7 @@ def continue_logs(model: OnPolicyAlgorithm, state: Tree) -> None:
         model.logger.name_to_count[name] = state["counts"][name]
 
 
-def _continued_logger(model: OnPolicyAlgorithm, state: Tree) -> Logger:
+def _continued_logger(model: BaseAlgorithm, state: Tree) -> Logger:
     formats = ["stdout"] if model.verbose >= 1 else [""]
     if not state["tensorboard"] or model.tensorboard_log is None:
         return configure(None, formats)

@@ -6,26 +6,53 @@ from collections import deque
 from typing import Any, Final
 
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.qplex.qplex import QPLEX
+from sb3_saf.qplex.replay_buffer import TeamReplayBuffer
 
 #: Arguments that have to be those of the checkpoint. Schedules are compared by their values, see :func:`description`.
 _ARGUMENTS: Final = (
     *("n_envs", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "normalize_advantage", "ent_coef"),
     *("vf_coef", "max_grad_norm", "target_kl", "use_sde", "sde_sample_freq"),
+    # TRPO's
+    *("cg_max_steps", "cg_damping", "line_search_shrinking_factor", "line_search_max_iter", "n_critic_updates"),
+    "sub_sampling_factor",
+    # QPLEX's
+    *("buffer_size", "learning_starts", "tau", "update_interval", "gradient_steps", "target_update_interval"),
+    *("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"),
 )
 _SCHEDULES: Final = ("lr_schedule", "clip_range", "clip_range_vf")
 _COUNTERS: Final = (
     *("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"),
-    "_current_progress_remaining",
+    *("_current_progress_remaining", "exploration_rate"),
 )
 _LAST: Final = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _INFO_BUFFERS: Final = ("ep_info_buffer", "ep_success_buffer")
 
 
-def description(model: OnPolicyAlgorithm) -> dict[str, Tree]:
+def require_resumable(model: BaseAlgorithm) -> None:
+    """
+    Check that an algorithm's state can be given completely.
+
+    :raises CheckpointError: if it cannot, naming those that can
+    """
+    if not isinstance(model, (OnPolicyAlgorithm, QPLEX)):
+        raise CheckpointError(
+            "exact resume is for PPO, A2C, TRPO, RecurrentPPO, MaskablePPO and QPLEX, got "
+            f"{type(model).__name__}; train it with model.learn and SB3's CheckpointCallback, which begins new episodes"
+        )
+
+
+def is_off_policy(model: BaseAlgorithm) -> bool:
+    """Whether a rollout is one step and the state holds a replay buffer, which is dear to copy."""
+    return isinstance(model, QPLEX)
+
+
+def description(model: BaseAlgorithm) -> dict[str, Tree]:
     """
     How the model was made, as far as that can be compared.
 
@@ -41,14 +68,18 @@ def description(model: OnPolicyAlgorithm) -> dict[str, Tree]:
         "policy": type(policy).__name__,
         "observation_space": str(model.observation_space),
         "action_space": str(model.action_space),
-        "rollout_buffer_class": type(model.rollout_buffer).__name__,
+        **{f"{name}_class": _class_name(getattr(model, name, None)) for name in ("rollout_buffer", "replay_buffer")},
         **values,
         **{f"policy's {name}": _plain(value) for name, value in _policy_arguments(model).items()},
         **{f"parameter {name}": [str(p.dtype), *p.shape] for name, p in policy.state_dict().items()},
     }
 
 
-def _policy_arguments(model: OnPolicyAlgorithm) -> dict[str, Any]:
+def _class_name(value: object) -> str | None:
+    return None if value is None else type(value).__name__
+
+
+def _policy_arguments(model: BaseAlgorithm) -> dict[str, Any]:
     arguments = model.policy._get_constructor_parameters()
     return {
         name: arguments[name] for name in arguments if name not in ("observation_space", "action_space", "lr_schedule")
@@ -66,7 +97,7 @@ def _plain(value: object) -> Tree:
     return str(getattr(value, "__qualname__", type(value).__qualname__))
 
 
-def check_description(model: OnPolicyAlgorithm, saved: dict[str, Tree]) -> None:
+def check_description(model: BaseAlgorithm, saved: dict[str, Tree]) -> None:
     """
     Compare a model with the one that the checkpoint is of.
 
@@ -81,14 +112,17 @@ def check_description(model: OnPolicyAlgorithm, saved: dict[str, Tree]) -> None:
             )
 
 
-def model_state(model: OnPolicyAlgorithm) -> Tree:
-    """Weights, optimiser, counters, last observations and averages, at the start of a rollout."""
+def model_state(model: BaseAlgorithm) -> Tree:
+    """Weights, optimiser, counters, last observations, memories, averages, replay; at the start of a rollout."""
+    replay = getattr(model, "replay_buffer", None)
     return {
         "weights": dict(model.policy.state_dict()),
         "optimizer": model.policy.optimizer.state_dict(),
-        "counters": {name: getattr(model, name) for name in _COUNTERS},
+        "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
         "last": {name: getattr(model, name) for name in _LAST},
         "lstm": _tensors(getattr(model, "_last_lstm_states", None)),
+        "agent_state": getattr(model, "_agent_state", None),
+        "replay": None if replay is None else replay.checkpoint_state(),
         **{name: [dict(i) if isinstance(i, dict) else i for i in getattr(model, name) or ()] for name in _INFO_BUFFERS},
     }
 
@@ -98,7 +132,7 @@ def _tensors(states: Any) -> Tree:
     return None if states is None else [list(pair) for pair in states]
 
 
-def load_model_state(model: OnPolicyAlgorithm, state: Tree) -> None:
+def load_model_state(model: BaseAlgorithm, state: Tree) -> None:
     """Go on from there; the model must have passed :func:`check_description`."""
     model.policy.load_state_dict(state["weights"])
     model.policy.optimizer.load_state_dict(state["optimizer"])
@@ -106,6 +140,10 @@ def load_model_state(model: OnPolicyAlgorithm, state: Tree) -> None:
         setattr(model, name, value)
     for name in _INFO_BUFFERS:
         setattr(model, name, deque(state[name], maxlen=model._stats_window_size))
+    if isinstance(model, QPLEX):
+        assert isinstance(model.replay_buffer, TeamReplayBuffer)
+        model.replay_buffer.load_checkpoint_state(state["replay"])
+        model._agent_state = state["agent_state"]
     if state["lstm"] is not None:
         own: Any = model._last_lstm_states  # type: ignore[attr-defined]
         model._last_lstm_states = type(own)(*(_on(pair, model.device) for pair in state["lstm"]))  # type: ignore[attr-defined]

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_saf.common.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.common.game_steps import GAME_STEPS_TAG, game_steps
-from sb3_saf.common.teams import require_n_agents
+from sb3_saf.common.teams import check_other_games, require_n_agents
 
 
 class TeamEvalCallback(EvalCallback):
@@ -32,7 +32,7 @@ class TeamEvalCallback(EvalCallback):
     :param render: whether to render the evaluation
     :param verbose: 0 for silence, 1 to print results
     :param warn: warn if ``eval_env`` has no TeamMonitor
-    :raises ValueError: if ``eval_env`` is not made of teams
+    :raises ValueError: if ``eval_env`` is not made of teams, or its games are those of training
     """
 
     def __init__(
@@ -68,6 +68,7 @@ class TeamEvalCallback(EvalCallback):
 
     def _init_callback(self) -> None:
         require_n_agents(self.training_env)
+        check_other_games(self.training_env, self.eval_env)
         super()._init_callback()
 
     def _on_training_start(self) -> None:

@@ -16,6 +16,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_saf.common.errors import NonFiniteError
+
 TeamKey = Literal["obs", "team", "agent"]
 
 #: The row's own observation.
@@ -283,6 +285,30 @@ def team_dones(dones: Array, n_agents: int) -> npt.NDArray[np.bool_]:
     return ended.copy()
 
 
+def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
+    """
+    Check that evaluation does not play the games that are trained on.
+
+    :param training: environment of teams; one that does not tell its seeds in an attribute ``seeded_with`` passes
+    :param evaluation: the other
+    :raises ValueError: if the seed of a game is in both
+    """
+    common = _seeds_of(training) & _seeds_of(evaluation)
+    if common:
+        raise ValueError(
+            f"expected games of evaluation that are not trained on, got {len(common)} with seeds of training games; "
+            "the environments, or the algorithm and the environment of evaluation, have equal seeds; give evaluation "
+            "another one, for instance make_team_env(..., seed=10_000)"
+        )
+
+
+def _seeds_of(venv: VecEnv) -> set[int]:
+    layer = venv
+    while isinstance(layer, VecEnvWrapper):
+        layer = layer.venv
+    return {seed for seed in getattr(layer, "seeded_with", ()) if seed is not None}
+
+
 def check_finite(name: str, values: Array, n_agents: int, step: int, first_game: int = 0) -> None:
     """
     Stop at NaN and infinity; integers pass unread.
@@ -292,13 +318,13 @@ def check_finite(name: str, values: Array, n_agents: int, step: int, first_game:
     :param n_agents: N
     :param step: steps since the environment was made, for the message
     :param first_game: game of the first row, for the message
-    :raises ValueError: naming step, game and agent of the first bad row
+    :raises NonFiniteError: naming step, game and agent of the first bad row
     """
     if values.dtype.kind not in "fc" or np.isfinite(values).all():
         return
     bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
     row = int(np.flatnonzero(bad)[0])
-    raise ValueError(
+    raise NonFiniteError(
         f"{name} must be finite, got {_short(values[row])} at step {step} for agent {row % n_agents} of game "
         f"{first_game + row // n_agents}{_others(int(bad.sum()) - 1)}; repair the environment, learning from it would "
         "ruin the model"

@@ -97,7 +97,10 @@ def _run(options: argparse.Namespace) -> int:
         with _ending_like_interrupted(signal.SIGTERM):
             summary = run(experiment, choice, protocol, results, engine, machine, shard)
     except KeyboardInterrupt:
-        print("\ninterrupted: workers have ended, finished cells are kept; the same command continues", file=sys.stderr)
+        print(
+            "\ninterrupted: workers have ended, finished cells and checkpoints are kept; the same command continues",
+            file=sys.stderr,
+        )
         return _INTERRUPTED
     print(f"table: {results.folder / experiment.name / 'table.csv'}")
     if summary.failed:

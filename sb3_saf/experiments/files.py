@@ -35,9 +35,13 @@ def unpack(archive: bytes, folder: Path) -> None:
     The opposite of :func:`pack`.
 
     :param folder: made if it is not there
+    :raises ValueError: before anything is written, if a name leads out of the folder
     """
     folder.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(io.BytesIO(archive)) as packed:
+        for name in packed.namelist():
+            if not (folder / name).resolve().is_relative_to(folder.resolve()):
+                raise ValueError(f"the archive's {name!r} leads out of {folder}; it was not packed by this package")
         packed.extractall(folder)
 
 

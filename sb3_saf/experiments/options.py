@@ -17,6 +17,7 @@ from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine
 from sb3_saf.zoo.algorithms import ALGOS
 from sb3_saf.zoo.commands import KeyValues
+from sb3_saf.zoo.devices import check_device
 from sb3_saf.zoo.names import unknown_name
 from sb3_saf.zoo.seeds import check_seed
 from sb3_saf.zoo.yaml_files import SIZES, Size
@@ -61,6 +62,13 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
     """How a run goes on."""
     group = parser.add_argument_group("running")
     group.add_argument("--retries", type=int, default=1, help="further attempts for a cell that fails or is killed")
+    group.add_argument(
+        "--resume",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="cells that were killed go on, exactly, from their last checkpoint (the default); --no-resume starts them "
+        "over. On Ray they always start over",
+    )
     group.add_argument("--shard", default="1/1", metavar="I/N", help="run only the I-th of N parts")
     group.add_argument("--tensorboard", action="store_true", help="keep TensorBoard logs in the cells' folders")
     group.add_argument("--ray", action="store_true", help="on Ray instead of processes of this machine")
@@ -155,7 +163,14 @@ def machine_of(options: argparse.Namespace) -> Machine:
     threads = positive("--threads", options.threads)
     if options.retries < 0:
         raise ValueError(f"--retries must be 0 or more, got {options.retries}")
-    return Machine(options.device, threads, options.retries, options.tensorboard, not _is_on_ray(options))
+    return Machine(
+        check_device(options.device),
+        threads,
+        options.retries,
+        options.tensorboard,
+        not _is_on_ray(options),
+        options.resume,
+    )
 
 
 def engine_of(options: argparse.Namespace) -> Engine:

@@ -9,6 +9,7 @@ The folder of results. One cell is one folder, which appears at once and complet
         curve.csv  model.zip         returns of the training episodes; the model
         tests/c2-h1.json             returns of the test episodes
         error.txt                    in the place of all this for a cell that failed
+    unfinished/                          checkpoints of cells that are at work, or were killed at it
     coordination/requests/*.json     what somebody asked for, so that a report knows what is missing
     coordination/table.csv           one row per cell and test level, made from the cells
 """
@@ -21,7 +22,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any, Final
@@ -93,6 +94,10 @@ class Results:
         """Where a cell is, or will be."""
         return self.folder / "cells" / cell.id
 
+    def unfinished(self, cell: Cell) -> Path:
+        """Checkpoints of a training that has not reached its end."""
+        return self.folder / "unfinished" / cell.id
+
     def status(self, cell: Cell) -> dict[str, Any]:
         """How a cell ended; empty if it has not."""
         return read_json(self.cell_folder(cell) / "status.json") or {}
@@ -136,6 +141,7 @@ class Results:
         with self._unpacked(archive) as fresh:
             if not self.is_finished(cell):
                 self._replace_cell(cell, fresh)
+                self._forget_checkpoints(cell)
                 return
             tests = self.cell_folder(cell) / "tests"
             tests.mkdir(exist_ok=True)
@@ -159,6 +165,13 @@ class Results:
         }
         with self._unpacked(pack_texts(files)) as fresh:
             self._replace_cell(cell, fresh)
+
+    def _forget_checkpoints(self, cell: Cell) -> None:
+        folder = self.unfinished(cell)
+        shutil.rmtree(folder, ignore_errors=True)
+        for parent in folder.parents[: len(Path(cell.id).parts)]:
+            with suppress(OSError):  # others are at work beside it
+                parent.rmdir()
 
     def _replace_cell(self, cell: Cell, fresh: Path) -> None:
         target = self.cell_folder(cell)

@@ -29,6 +29,7 @@ class Machine:
     :param retries: further attempts for a cell that failed or whose process died
     :param tensorboard: whether cells keep TensorBoard logs
     :param shared_disk: whether workers see the folder of results
+    :param resume: whether cells that were killed go on from their last checkpoint, which takes a shared disk
     """
 
     device: str = "auto"
@@ -36,6 +37,7 @@ class Machine:
     retries: int = 1
     tensorboard: bool = False
     shared_disk: bool = True
+    resume: bool = True
 
 
 class Summary(NamedTuple):
@@ -124,6 +126,7 @@ def _work(cell: Cell, protocol: Protocol, results: Results, machine: Machine) ->
         machine.threads,
         machine.tensorboard,
         scratch,
+        str(results.unfinished(cell)) if machine.shared_disk and machine.resume else None,
     )
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import shutil
 import socket
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,10 +19,11 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_saf import RandomPolicy, evaluate_team
+from sb3_saf import RandomPolicy, evaluate_team, resumable_learn
+from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.experiments.cells import Cell, Protocol
 from sb3_saf.experiments.definitions import Level
-from sb3_saf.experiments.files import pack, to_json
+from sb3_saf.experiments.files import pack, read_json, to_json, write_text
 from sb3_saf.experiments.results import FINISHED, config_of
 from sb3_saf.zoo.commands import option_words
 from sb3_saf.zoo.inspection import inspection
@@ -29,6 +32,8 @@ from sb3_saf.zoo.versions import software_versions
 
 #: Points of a learning curve at most.
 CURVE_POINTS: Final = 100
+#: Checkpoints of a training, from which another worker goes on if this one is killed.
+CHECKPOINTS: Final = 20
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,7 @@ class Work:
     :param threads: of torch
     :param tensorboard: whether to keep TensorBoard logs of the training
     :param scratch: folder for unfinished files; None for the machine's temporary folder
+    :param unfinished: folder that outlives this worker, for checkpoints from which another one goes on; None for none
     """
 
     cell: Cell
@@ -54,6 +60,7 @@ class Work:
     threads: int = 1
     tensorboard: bool = False
     scratch: str | None = None
+    unfinished: str | None = None
 
 
 def do(work: Work) -> bytes:
@@ -100,19 +107,55 @@ def _write(path: Path, text: str) -> None:
 def _train(work: Work, folder: Path) -> BaseAlgorithm:
     """A trained model, which leaves its file and its learning curve."""
     settings = work.protocol.settings(work.cell)
-    env = settings.make_env(work.cell.seed, monitor_dir=folder)
-    logs = str(folder / "tb") if work.tensorboard else None
-    model = settings.make_model(env, work.cell.seed, device=work.device, tensorboard_log=logs)
-    look = inspection(settings, work.cell.seed) if work.tensorboard else None
-    model.learn(settings.total_timesteps, callback=look, tb_log_name=work.cell.method)
-    if look is not None:
-        look.eval_env.close()
+    with _training_folder(work) as place:
+        env = settings.make_env(work.cell.seed, monitor_dir=place)
+        logs = str(place / "tb") if work.tensorboard else None
+        model = settings.make_model(env, work.cell.seed, device=work.device, tensorboard_log=logs)
+        look = inspection(settings, work.cell.seed) if work.tensorboard else None
+        resumable_learn(
+            model,
+            settings.total_timesteps,
+            place / "checkpoints",
+            look,
+            every_game_steps=max(1, settings.game_steps // CHECKPOINTS),
+            keep=2,
+            tb_log_name=work.cell.method,
+        )
+        env.close()
+        if look is not None:
+            look.eval_env.close()
+        # Of monitor.csv, hundreds of thousands of lines at the paper's size, the curve is kept.
+        _write(folder / "curve.csv", curve(place / "monitor.csv", settings.n_envs))
+        if work.tensorboard:
+            shutil.copytree(place / "tb", folder / "tb")
     model.save(folder / "model.zip")
-    env.close()
-    monitor = folder / "monitor.csv"
-    _write(folder / "curve.csv", curve(monitor, settings.n_envs))
-    monitor.unlink()  # hundreds of thousands of lines at the paper's size
     return model
+
+
+@contextlib.contextmanager
+def _training_folder(work: Work) -> Iterator[Path]:
+    """Where training writes; a folder that outlives this worker is emptied if it is not of the same settings."""
+    if work.unfinished is None:
+        with tempfile.TemporaryDirectory(dir=work.scratch, prefix="training-") as name:
+            yield Path(name)
+        return
+    folder, config = Path(work.unfinished), config_of(work.cell, work.protocol)
+    if not _can_go_on(folder, config):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        write_text(folder / "config.json", to_json(config))
+    yield folder
+
+
+def _can_go_on(folder: Path, config: dict[str, Any]) -> bool:
+    try:
+        return (
+            read_json(folder / "config.json") == config
+            and CheckpointFolder(folder / "checkpoints").newest() is not None
+        )
+    except ValueError as error:  # no checkpoint can be read, or this version cannot
+        print(f"Beginning anew: {error}")
+        return False
 
 
 def _load(work: Work, folder: Path) -> BaseAlgorithm:

@@ -115,15 +115,16 @@ def chosen_by_agent(table: Doubles) -> Figure:
     return figure
 
 
-def policy_differences(table: Doubles) -> Figure:
+def policy_differences(table: Doubles, unit: str) -> Figure:
     """
     How differently policies act.
 
-    :param table: (U, U) Hellinger distances
+    :param table: (U, U) from 0 to 1
+    :param unit: what its numbers are
     """
     names = [f"policy {policy}" for policy in range(len(table))]
     figure, (axes,) = _figure(5.6, 4.4, title="How differently policies act (0 alike, 1 never alike)")
-    _heat_map(axes, table, "Hellinger distance", vmax=1.0, percent=False)
+    _heat_map(axes, table, unit, vmax=1.0, percent=False)
     _ticks(axes, names, names)
     return figure
 

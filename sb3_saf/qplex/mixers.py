@@ -9,6 +9,7 @@ Letters: G team steps, N agents, A actions, S size of the state, K attention ker
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -133,6 +134,11 @@ class ParallelMLPs(nn.Module):
         return x
 
 
+def _he_uniform(weight: th.Tensor, n_inputs: int) -> None:
+    bound = math.sqrt(6 / n_inputs)
+    weight.uniform_(-bound, bound)
+
+
 class AttentionKernels(nn.Module):
     """
     lambda_i(s, a) = sum over K kernels of |key_k(s)| sigmoid(agents_ki(s)) sigmoid(action_ki(s, a)).
@@ -149,6 +155,21 @@ class AttentionKernels(nn.Module):
         self.key = ParallelMLPs(n_kernels, [state_dim, *hidden, 1])
         self.agents = ParallelMLPs(n_kernels, [state_dim, *hidden, n_agents])
         self.action = ParallelMLPs(n_kernels, [state_dim + n_agents * n_actions, *hidden, n_agents])
+        self._tell_joint_actions_apart(n_agents, n_agents * n_actions)
+
+    @th.no_grad()
+    def _tell_joint_actions_apart(self, n_agents: int, n_inputs: int) -> None:
+        """
+        He initialisation of the networks that read the joint action.
+
+        One-hot actions count as N inputs, those that are not zero. Counted together with a wide state they would hardly
+        reach the hidden layers, and lambda would start as a sum over agents of what each does. Where an advantage is
+        close to zero its lambda gets no gradient, so it would stay what that sum makes of the others (docs/qplex.md).
+        """
+        first, *others = self.action.weights
+        _he_uniform(first[:, -n_inputs:], n_agents)
+        for weight in others:
+            _he_uniform(weight, weight.shape[1])
 
     def forward(self, state: th.Tensor, state_and_actions: th.Tensor) -> th.Tensor:
         """(G, N): (G, S) and (G, S + N A)."""

@@ -305,6 +305,47 @@ class TeamReplayBuffer(ReplayBuffer):
         self._free += places[places >= 0].tolist()
         self.aside_index[slot] = -1
 
+    # --- checkpoints ------------------------------------------------------------------------------------------------
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        All that is stored, for exact resume; slots that were never filled are left out.
+
+        :return: plain data for :meth:`load_checkpoint_state` of a buffer that was made with the same arguments
+        """
+        n_filled = self.n_slots if self.full else self.pos + 1
+        return {
+            "n_slots": self.n_slots,
+            "slots": {name: array[:n_filled] for name, array in self._by_slot().items()},
+            "aside": dict(self.aside),
+            "free": list(self._free),
+            "pos": self.pos,
+            "n_steps": self._n_steps,
+        }
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: if it is that of a buffer of another size
+        """
+        if state["n_slots"] != self.n_slots:
+            raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state['n_slots']}")
+        self.reset()
+        for name, array in self._by_slot().items():
+            saved = state["slots"][name]
+            array[: len(saved)] = saved
+        self.aside = {key: np.array(part) for key, part in state["aside"].items()}
+        self._free, self.pos, self._n_steps = list(state["free"]), state["pos"], state["n_steps"]
+        self.full = self._n_steps == self.buffer_size
+
+    def _by_slot(self) -> dict[str, Array]:
+        """All arrays with one entry per slot, by name."""
+        seen = {f"seen {key}": array for key, array in self.seen.items()}
+        names = ("actions", "rewards", "terminal", "ended", "starts", "aside_index")
+        return seen | {name: getattr(self, name) for name in names}
+
     # --- sampling ---------------------------------------------------------------------------------------------------
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> TeamReplaySamples:  # type: ignore[override]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,18 @@ class ZooEvalCallback(TeamEvalCallback):
         self._evaluated_at = self._game_steps()
         with own_randomness(self._seed + self._n_evaluations, self.model.device):
             return super()._evaluate()
+
+    def checkpoint_state(self) -> dict[str, int]:
+        """Counters, for exact resume."""
+        return {"n_evaluations": self._n_evaluations, "evaluated_at": self._evaluated_at}
+
+    def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
+        """
+        Go on from there.
+
+        :param state: what :meth:`checkpoint_state` gave
+        """
+        self._n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
 
     def _on_training_end(self) -> None:
         # RL-Zoo3 ends its first callback once more, and ends it even if training never began.

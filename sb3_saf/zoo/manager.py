@@ -38,6 +38,7 @@ from sb3_saf.zoo.callbacks import (
 from sb3_saf.zoo.commands import CommandError, replaced, user_errors
 from sb3_saf.zoo.inspection import inspection
 from sb3_saf.zoo.request import Request
+from sb3_saf.zoo.resuming import checkpoint_interval, forget_checkpoints, learn_with_checkpoints
 from sb3_saf.zoo.sampling import sample_overrides, to_overrides
 from sb3_saf.zoo.settings import Settings
 from sb3_saf.zoo.storage import open_storage
@@ -74,6 +75,8 @@ class TeamExperimentManager(ExperimentManager):
         self.deterministic_eval = request.deterministic_eval or not ALGOS[algo].draws_actions
         # RL-Zoo3 would divide these by the number of games.
         self.eval_freq = self.save_freq = -1
+        if request.resume is not None:
+            self.save_path = str(request.resume)
         self._envs: list[VecEnv] = []
         self._has_folder = False
         HYPERPARAMS_SAMPLER[algo] = self._sample
@@ -136,7 +139,7 @@ class TeamExperimentManager(ExperimentManager):
             # SB3's checks of what it is given, and folders that cannot be written
             with user_errors(AssertionError, TypeError, OSError):
                 prepared = super().setup_experiment()
-                if prepared is not None:
+                if prepared is not None and self.request.resume is None:  # which brings its logs along
                     model, _ = prepared
                     # SB3 would call every run PPO.
                     model.set_logger(configure_logger(self.verbose, self.tensorboard_log, self.algo, True))
@@ -154,9 +157,36 @@ class TeamExperimentManager(ExperimentManager):
         :param model: from :meth:`setup_experiment`
         """
         try:
-            super().learn(model)
+            if checkpoint_interval(self.request):
+                self._learn_with_checkpoints(model)
+            else:
+                super().learn(model)
         finally:
             self._close_envs()
+
+    def _learn_with_checkpoints(self, model: BaseAlgorithm) -> None:
+        """As RL-Zoo3 does; a run that is interrupted leaves its model, too, and a checkpoint to go on from."""
+        # -1 is for the algorithm's own, anything below for none.
+        log_interval = {} if self.log_interval == -1 else {"log_interval": max(self.log_interval, 0) or None}
+        folder = Path(self.save_path)
+        try:
+            learn_with_checkpoints(model, self.n_timesteps, folder, self.callbacks, self.request, **log_interval)
+        except (KeyboardInterrupt, SystemExit):
+            super().save_trained_model(model)
+            raise
+        finally:
+            for callback in self.callbacks:
+                if isinstance(callback, GameStepsProgressBar):
+                    callback.on_training_end()
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        Save the model of a finished run, which needs its checkpoints no longer.
+
+        :param model: the model
+        """
+        super().save_trained_model(model)
+        forget_checkpoints(Path(self.save_path))
 
     def _close_envs(self) -> None:
         """Close those of training again, which does no harm, and those of evaluation, which RL-Zoo3 leaves open."""
@@ -167,7 +197,7 @@ class TeamExperimentManager(ExperimentManager):
         """Take a folder of our own; tuning leaves none, which would pass for the latest run."""
         if self.optimize_hyperparameters:
             return
-        while True:
+        while self.request.resume is None:
             try:
                 Path(self.save_path).mkdir(parents=True)
                 self._has_folder = True
@@ -231,6 +261,8 @@ class TeamExperimentManager(ExperimentManager):
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Keep what was used and asked for; RL-Zoo3's ``args.yml`` and command would be those it was called with."""
+        if self.request.resume is not None:
+            return  # it is there
         super()._save_config(saved_hyperparams)
         folder = Path(self.params_path)
         for name, content in {"args.yml": dict(self.request.options), "versions.yml": software_versions()}.items():

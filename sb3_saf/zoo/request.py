@@ -24,8 +24,11 @@ class Request:
     :param overrides: settings that win over the files
     :param config: a file in place of the algorithm's
     :param eval_freq: game steps between evaluations; 0 or less for none, None for 20 in a run
-    :param save_freq: game steps between checkpoints; 0 or less for none
+    :param save_freq: game steps between saved models; 0 or less for none
     :param inspect_freq: game steps between looks into the policy for TensorBoard; 0 or less for none, None for 10
+    :param checkpoint_freq: game steps between checkpoints to go on from; 0 or less for none, None for 10 in a run
+    :param resume: folder of a run to go on with; None for a new one
+    :param seed: the run's seed; None if any will do
     :param deterministic_eval: whether evaluation takes the most likely actions
     :param trial: number of the trial to train again, or ``"best"``
     :param options: all options as given, to be kept
@@ -42,6 +45,9 @@ class Request:
     eval_freq: int | None = None
     save_freq: int = -1
     inspect_freq: int | None = None
+    checkpoint_freq: int | None = None
+    resume: Path | None = None
+    seed: int | None = None
     deterministic_eval: bool = False
     trial: int | str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)

@@ -7,6 +7,7 @@ import secrets
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -22,6 +23,7 @@ from sb3_saf.zoo.commands import (
     run_command,
     user_errors,
 )
+from sb3_saf.zoo.devices import check_device
 from sb3_saf.zoo.request import Request
 from sb3_saf.zoo.seeds import MAX_SEED, check_seed
 from sb3_saf.zoo.settings import ENV_IDS
@@ -106,11 +108,19 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--eval-episodes", type=int, default=32, help="team episodes of an evaluation")
     group.add_argument("--n-eval-envs", type=int, default=32, help="games of an evaluation")
     group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
-    group.add_argument("--save-freq", type=int, default=-1, help="game steps between checkpoints, -1 for none")
+    group.add_argument("--save-freq", type=int, default=-1, help="game steps between saved models, -1 for none")
     group.add_argument(
         "--inspect-freq",
         type=int,
         help="game steps between looks into the policy for TensorBoard, -1 for none; by default 10 a run",
+    )
+    group.add_argument(
+        "--checkpoint-freq", type=int, help="game steps between checkpoints for --resume, -1 for none; 10 a run"
+    )
+    group.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on, exactly, with the latest run of this command that did not reach its end; without one, begin",
     )
     group.add_argument("--log-interval", type=int, default=-1, help="rollouts between logs, -1 for SB3's")
     group.add_argument("--num-threads", type=int, default=-1, help="threads of torch, -1 for its own choice")
@@ -166,6 +176,8 @@ def train(arguments: Sequence[str] | None = None) -> None:
         eval_freq=options.eval_freq,
         save_freq=options.save_freq,
         inspect_freq=options.inspect_freq,
+        checkpoint_freq=options.checkpoint_freq,
+        seed=options.seed,
         deterministic_eval=options.deterministic_eval,
         trial=options.trial_id,
         options={key: str(value) if isinstance(value, Path) else value for key, value in vars(options).items()},
@@ -176,19 +188,51 @@ def train(arguments: Sequence[str] | None = None) -> None:
         request.settings(evaluation=True)
     register_carriers()
     install_algorithm(options.algo)
+    request = _continued(request, options) if options.resume else request
+    if options.seed is None:
+        options.seed = secrets.randbelow(MAX_SEED)
+    request = replace(request, options={**request.options, "seed": options.seed})
     _run_rl_zoo(request, _zoo_arguments(options))
+
+
+def _continued(request: Request, options: argparse.Namespace) -> Request:
+    """The request, with the run to go on with if there is one."""
+    from sb3_saf.zoo.resuming import find_unfinished
+
+    found = find_unfinished(request, options.log_folder)
+    if found is None:
+        print(f"No run of this command in {options.log_folder} is unfinished: a new one begins")
+        return request
+    folder, options.seed = found
+    print(f"Going on with {folder}")
+    return replace(request, resume=folder)
 
 
 def _check(options: argparse.Namespace) -> None:
     """What can be said before anything is made."""
-    if options.seed != -1:
+    if options.seed == -1:
+        options.seed = None
+    else:
         with user_errors():
             check_seed(options.seed)
+    if options.resume and (options.optimize_hyperparameters or options.trial_id is not None):
+        raise CommandError(
+            "--resume is for training with settings, without -optimize and --trial-id; a study goes on by itself when "
+            "it is called again, and a trial's settings can be given with -params"
+        )
+    with user_errors():
+        check_device(options.device)
     for name in ("eval_episodes", "n_eval_envs", "n_trials", "n_evaluations"):
         if getattr(options, name) < 1:
             raise CommandError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
     if options.trained_agent and not (options.trained_agent.endswith(".zip") and Path(options.trained_agent).is_file()):
         raise CommandError(f"--trained-agent must be a .zip that is there, got {options.trained_agent!r}")
+    if options.trained_agent:
+        print(
+            f"{options.trained_agent} is unpickled, which can run code from it; from a file that you do not trust take "
+            "the weights alone: sb3_saf.load_weights",
+            file=sys.stderr,
+        )
     if options.trial_id is None:
         return
     if options.storage is None or options.study_name is None:
@@ -201,8 +245,6 @@ def _check(options: argparse.Namespace) -> None:
 
 def _complete(options: argparse.Namespace) -> None:
     """Defaults that depend on where we are."""
-    if options.seed == -1:
-        options.seed = secrets.randbelow(MAX_SEED)
     if options.progress is None:
         options.progress = sys.stdout.isatty()
     if options.verbose is None:

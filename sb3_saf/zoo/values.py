@@ -17,14 +17,14 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_saf.common.buffers import TeamRolloutBuffer
-from sb3_saf.common.encoders import LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN
+from sb3_saf.common.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.zoo.names import unknown_name
 
 #: What may be named under each key that takes a class. Names are looked up here; nothing is imported or evaluated.
 CLASSES: Final[dict[str, dict[str, type]]] = {
     "rollout_buffer_class": {"TeamRolloutBuffer": TeamRolloutBuffer},
     "features_extractor_class": {
-        encoder.__name__: encoder for encoder in (LightEncoder, MLPEncoder, ObservationEncoder, PaperCNN)
+        encoder.__name__: encoder for encoder in (LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN)
     },
     "activation_fn": {
         "tanh": nn.Tanh,

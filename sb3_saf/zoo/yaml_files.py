@@ -19,6 +19,8 @@ DEFAULT: Final = "default"
 SIZES_KEY: Final = "sizes"
 #: Keys whose mappings are merged key by key; all other values are replaced.
 MERGED: Final = ("env_kwargs", "policy_kwargs")
+#: What a file may hold: some aliases of aliases unfold to more than a memory.
+_MAX_VALUES: Final = 100_000
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -43,13 +45,35 @@ def load_yaml(text: str, source: str) -> Any:
 
     :param text: the YAML
     :param source: where it came from, for errors
-    :raises ValueError: for what is no YAML, or needs more than plain data
+    :raises ValueError: for what is no YAML, needs more than plain data, or unfolds to more than a person would write
     """
     try:
-        return yaml.load(text, Loader=_UniqueKeyLoader)
+        content = yaml.load(text, Loader=_UniqueKeyLoader)
+        size = _size(content, {})
     except yaml.YAMLError as error:
         what = " ".join(str(error).split())
         raise ValueError(f"{source} is not valid YAML: {what}") from None
+    except RecursionError:
+        raise ValueError(f"{source} is nested too deep, or refers to itself; settings are a few levels deep") from None
+    if size > _MAX_VALUES:
+        raise ValueError(
+            f"{source} unfolds to more than {_MAX_VALUES:,} values; write out what its aliases (*) stand for"
+        )
+    return content
+
+
+def _size(content: object, known: dict[int, int]) -> int:
+    """
+    How many values there are when all aliases are unfolded.
+
+    :param known: sizes of containers by identity, so that none is counted twice
+    """
+    if not isinstance(content, (dict, list, set)):
+        return 1
+    if id(content) not in known:
+        parts = [*content, *content.values()] if isinstance(content, dict) else content
+        known[id(content)] = 1 + sum(_size(part, known) for part in parts)
+    return known[id(content)]
 
 
 def parse_value(text: str) -> Any:

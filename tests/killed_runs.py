@@ -1,0 +1,110 @@
+"""The runs that the kill harness kills: small, with everything in them that a resumed run could lose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from stable_baselines3 import PPO
+
+import sb3_saf
+
+N_AGENTS, N_GAMES, N_STEPS = 3, 4, 16
+#: Agent-steps of a rollout of PPO; the unit of a run's length for both algorithms.
+ROLLOUT: Final = N_AGENTS * N_GAMES * N_STEPS
+ALGOS: Final = ("saf", "qplex")
+
+_TASK: Final[dict[str, Any]] = {
+    "n_agents": N_AGENTS,
+    "grid_size": 9,
+    "n_treasures": 4,
+    "coordination": 1,
+    "max_cycles": 20,
+}
+_LIGHT: Final[dict[str, Any]] = {"features_extractor_class": sb3_saf.LightEncoder, "net_arch": [16]}
+
+
+class Run(NamedTuple):
+    """
+    A run.
+
+    :param model: made as at every start
+    :param evaluation: its callback
+    :param every: game steps between checkpoints
+    """
+
+    model: Any
+    evaluation: sb3_saf.TeamEvalCallback
+    every: int
+
+    def warm_up(self) -> None:
+        """Compile what is compiled at its first use."""
+        self.model.learn(2 * ROLLOUT)
+        self.close()
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.model.env.close()
+        self.evaluation.eval_env.close()
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All that was learned, and what a replay buffer holds."""
+        found = {name: tensor.numpy() for name, tensor in self.model.policy.state_dict().items()}
+        buffer = getattr(self.model, "replay_buffer", None)
+        if buffer is not None:
+            found |= {f"replay {name}": array for name, array in buffer.checkpoint_state()["slots"].items()}
+            found["exploration_rate"] = np.array(self.model.exploration_rate)
+        return found
+
+
+def make_run(algo: str, folder: Path | None) -> Run:
+    """
+    Make a run as a user's script makes it at every start.
+
+    :param algo: one of ALGOS
+    :param folder: for monitor.csv, TensorBoard and evaluations; None for none
+    """
+    where = None if folder is None else str(folder)
+    env = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=0, monitor_dir=where, **_TASK)
+    eval_env = sb3_saf.make_team_env("TeamTogether", 2, seed=99, **_TASK)
+    evaluation = sb3_saf.TeamEvalCallback(
+        eval_env, n_eval_episodes=2, eval_freq=200, log_path=where, deterministic=False, verbose=0
+    )
+    tensorboard = None if folder is None else str(folder / "tb")
+    make, every = (_saf, 1) if algo == "saf" else (_qplex, 100)
+    return Run(make(env, tensorboard), evaluation, every)
+
+
+def _saf(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None) -> PPO:
+    return PPO(
+        "SAFPolicy",
+        env,
+        learning_rate=lambda progress: 1e-3 * progress,
+        n_steps=N_STEPS,
+        batch_size=ROLLOUT // 4,
+        n_epochs=2,
+        seed=0,
+        policy_kwargs=_LIGHT | {"normalize_values": True},
+        rollout_buffer_class=sb3_saf.TeamRolloutBuffer,
+        tensorboard_log=tensorboard,
+    )
+
+
+def _qplex(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None) -> sb3_saf.QPLEX:
+    """Its replay buffer is full after a third of the run; targets, exploration and learning rate change all along."""
+    return sb3_saf.QPLEX(
+        "QPLEXPoolPolicy",
+        env,
+        learning_rate=lambda progress: 1e-3 * progress,
+        buffer_size=800,
+        learning_starts=100,
+        batch_size=16,
+        train_freq=16,
+        target_update_interval=150,
+        exploration_fraction=0.8,
+        seed=0,
+        policy_kwargs=_LIGHT,
+        tensorboard_log=tensorboard,
+    )
