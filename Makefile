@@ -10,7 +10,7 @@ VENV = .venv
 RUN = $(VENV)/bin/python -m
 INSTALLED = $(VENV)/.installed
 
-.PHONY: help install train test bench docs check format-check lint types format clean distclean
+.PHONY: help install train test bench docs notebooks check format-check lint types format clean distclean
 
 help: ## this list (the default)
 	@echo "make TARGET, with TARGET one of"
@@ -22,18 +22,25 @@ train: $(INSTALLED) ## train SAF on TeamSupport, compare it with a random team, 
 test: $(INSTALLED) ## run the tests
 	@$(RUN) pytest -n $(JOBS) --dist loadscope $(PYTEST_ARGS)
 
-check: $(INSTALLED) ## what CI runs: format, lint, types, tests
+check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, notebooks, tests
 	@$(MAKE) --no-print-directory format-check
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory types
+	@$(MAKE) --no-print-directory docs
+	@$(MAKE) --no-print-directory notebooks
 	@$(MAKE) --no-print-directory test
 
 bench: $(INSTALLED) ## measure speed, side by side; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
 
 docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors, and check their links
+	@echo "== documentation"
 	@$(RUN) sphinx -b html -W --keep-going -n -q docs build/docs/html
 	@$(RUN) docs.tools.check_links build/docs/html
+
+notebooks: $(INSTALLED) ## run the notebooks with small numbers; whole: .venv/bin/python -m notebooks.execute --full
+	@echo "== notebooks"
+	@$(RUN) notebooks.execute --jobs $(JOBS)
 
 format-check: $(INSTALLED)
 	@echo "== format"
@@ -62,7 +69,7 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	@echo "== install into $(VENV) (some minutes the first time)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
-	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,dev]'
+	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,notebooks,dev]'
 	@touch $@
 
 clean: ## remove caches and what was built

@@ -46,6 +46,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.export.weights import load_weights
     from sb3_saf.export.writer import export_actors
     from sb3_saf.inspection.callback import InspectionCallback
+    from sb3_saf.inspection.inspection import Inspection, inspect_team
     from sb3_saf.ippo.policies import IPPOPolicy
     from sb3_saf.mappo.policies import MAPPOPolicy
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
@@ -79,6 +80,7 @@ __all__ = [
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
+    "Inspection",
     "InspectionCallback",
     "LightEncoder",
     "MAPPOLstmPolicy",
@@ -106,6 +108,7 @@ __all__ = [
     "evaluate_policy",
     "evaluate_team",
     "export_actors",
+    "inspect_team",
     "load_weights",
     "make_team_env",
     "resumable_learn",

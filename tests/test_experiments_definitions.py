@@ -170,3 +170,27 @@ def test_views_show_what_belongs_to_them() -> None:
     assert not inside.shows(Level(2, 1), Level(1, 1))
     assert outside.shows(Level(2, 1), Level(1, 1))
     assert not outside.shows(Level(1, 1), Level(1, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "levels", "trains", "tests"),
+    [
+        ("heterogeneity", (5, 1, 3), {(1, 1), (1, 3), (1, 5)}, {(1, 1), (1, 3), (1, 5)}),
+        ("coordination", (2,), {(2, 1)}, {(2, 1)}),
+        ("ood-coordination", (1, 3), {(2, 1)}, {(1, 1), (3, 1)}),
+        ("ablation", (3,), {(3, 1), (1, 3)}, {(3, 1), (1, 3)}),
+        ("ablation", (4,), {(1, 4)}, {(1, 4)}),
+    ],
+)
+def test_some_levels_only(
+    name: str, levels: tuple[int, ...], trains: set[tuple[int, int]], tests: set[tuple[int, int]]
+) -> None:
+    cells = grid_of(name, choice=Choice((0,), levels=levels)).cells
+    assert {cell.level for cell in cells if cell.is_trained} == trains
+    assert {level for cell in cells for level in cell.tests} == tests
+    assert {cell.id for cell in cells} < {cell.id for cell in grid_of(name, choice=Choice((0,))).cells}
+
+
+def test_levels_that_are_not_there_are_refused() -> None:
+    with pytest.raises(ValueError, match="coordination has no level 4 on its dials; there are 1, 2, 3"):
+        grid_of("coordination", choice=Choice((0,), levels=(1, 4)))

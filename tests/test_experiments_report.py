@@ -15,6 +15,7 @@ from sb3_saf.experiments import cli
 from sb3_saf.experiments.cells import Protocol
 from sb3_saf.experiments.comparisons import compare
 from sb3_saf.experiments.definitions import EXPERIMENTS
+from sb3_saf.experiments.frames import read_results
 from sb3_saf.experiments.options import protocol_of
 from sb3_saf.experiments.page import _protocol_words
 from sb3_saf.experiments.page_tables import losses
@@ -123,6 +124,29 @@ def test_part_of_an_experiment(folder: Path, tmp_path: Path) -> None:
     page = report(part, "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "1")
     assert "ippo and a random team, seeds 1." in page
     assert "TeamTogether" not in page.split("## Run it again")[0]
+
+
+def test_some_levels_of_an_experiment(folder: Path, tmp_path: Path) -> None:
+    part = shutil.copytree(folder, tmp_path / "part")
+    page = report(part, "--levels", "1", "3", "--tasks", "TeamSupport").split("## Run it again")[0]
+    assert "| TeamSupport | c=1, h=1 | c=3, h=1 | seeds |" in page
+    assert "curve-TeamSupport-c3-h1.png" in page and "curve-TeamSupport-c2-h1.png" not in page
+
+
+def test_results_as_tables(folder: Path) -> None:
+    tests, curves = read_results(folder, "coordination")
+    stored = pd.read_csv(folder / "coordination" / "table.csv")
+    pd.testing.assert_frame_equal(tests, stored[list(tests.columns)])
+    assert len(curves.groupby(["method", "task", "level", "seed"])) == 3 * 9 * 2
+    last = curves.groupby(["method", "task", "level", "seed"])["game_steps"].max()
+    assert set(last) == {400}
+
+
+def test_results_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="has no finished cell of 'joint'; run it first"):
+        read_results(tmp_path, "joint")
+    with pytest.raises(ValueError, match="unknown experiment 'jont'"):
+        read_results(tmp_path, "jont")
 
 
 def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

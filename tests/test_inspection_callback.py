@@ -21,7 +21,14 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamMonitor, TeamRolloutBuffer, make_team_env
+from sb3_saf import (
+    CentralizedValueWrapper,
+    InspectionCallback,
+    TeamMonitor,
+    TeamRolloutBuffer,
+    inspect_team,
+    make_team_env,
+)
 from sb3_saf.common.policies import TeamPolicy
 from sb3_saf.common.teams import TeamSpaces
 from sb3_saf.inspection import film
@@ -78,6 +85,10 @@ def learn(
     return model.learn(5 * env.num_envs * n_updates, callback=callback)
 
 
+def level_games() -> CentralizedValueWrapper:
+    return make_team_env("TeamSupport", n_envs=2, seed=0, **LEVEL)
+
+
 def events(folder: Path) -> EventAccumulator:
     (file,) = folder.rglob("events.*")
     return EventAccumulator(
@@ -103,6 +114,34 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> EventAccumulator:
     callback = InspectionCallback(eval_env, every_game_steps=20, n_eval_episodes=3, hparams={"task": "TeamSupport"})
     learn(folder, callback, env=env, n_updates=3)
     return events(folder)
+
+
+class TestInHand:
+    def test_is_what_the_callback_writes(self, tmp_path: Path) -> None:
+        eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
+        model = learn(tmp_path, InspectionCallback(eval_env, n_eval_episodes=3), env=level_games())
+        before = th.get_rng_state()
+        look = inspect_team(model, eval_env, n_eval_episodes=3)
+        assert th.equal(th.get_rng_state(), before)
+        written, found = scalars_of(tmp_path), events(tmp_path)
+        assert {tag: pytest.approx(written[tag][-1], rel=1e-5) for tag in look.scalars} == look.scalars
+        assert {*look.figures, "episode/strip", "episode/film"} == set(found.Tags()["images"])
+        assert look.film is not None and look.strip is not None
+        shown = found.Images("episode/film")[-1].encoded_image_string
+        np.testing.assert_array_equal(
+            np.asarray(Image.open(io.BytesIO(look.film))), np.asarray(Image.open(io.BytesIO(shown)))
+        )
+
+    def test_without_pictures_there_is_no_film(self) -> None:
+        model = learn(None, None, "IPPOPolicy", env=level_games())
+        look = inspect_team(model, level_games(), n_eval_episodes=2)
+        assert (look.film, look.strip) == (None, None)
+        assert list(look.figures) == ["critic/calibration"]
+
+    def test_refuses_policies_of_others(self) -> None:
+        env = level_games()
+        with pytest.raises(ValueError, match=r"expected a policy of sb3_saf .* got MultiInputActorCriticPolicy"):
+            inspect_team(PPO("MultiInputPolicy", env, n_steps=5, batch_size=30), env)
 
 
 class TestPage:

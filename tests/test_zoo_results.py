@@ -10,6 +10,7 @@ from typing import Any
 import imageio.v3 as imageio
 import imageio_ffmpeg
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -23,7 +24,7 @@ from sb3_saf import EvaluationResult, evaluate_team
 from sb3_saf.zoo import enjoy as zoo_enjoy
 from sb3_saf.zoo import plot as zoo_plot
 from sb3_saf.zoo import train as zoo_train
-from sb3_saf.zoo.runs import Run, describe, find_runs, setting_names
+from sb3_saf.zoo.runs import Run, describe, find_runs, setting_names, training_curve
 from sb3_saf.zoo.settings import load_settings, saved_settings
 from sb3_saf.zoo.watching import play
 
@@ -200,6 +201,7 @@ def test_results_of_a_run(logs: Path) -> None:
     assert curve["score"].tolist() == means.tolist()
     assert run.final_score("evaluation") == means[-1]
     training = run.curve("training")
+    pd.testing.assert_frame_equal(training_curve(run.folder), training)
     returns = np.genfromtxt(run.folder / "monitor.csv", delimiter=",", skip_header=2)[:, 0]
     assert training["game_steps"].iloc[-1] == 160
     assert run.final_score("training") == returns[-2:].mean()  # of 16 episodes, those that ended after 144 steps

@@ -129,20 +129,23 @@ class Choice:
     :param seeds: seeds of the runs
     :param methods: empty for the experiment's own
     :param tasks: empty for the experiment's own
+    :param levels: positions on the experiment's dials; empty for all of them
     """
 
     seeds: tuple[int, ...]
     methods: tuple[str, ...] = ()
     tasks: tuple[TaskName, ...] = ()
+    levels: tuple[int, ...] = ()
 
 
 def expand(experiment: Experiment, choice: Choice, protocol: Protocol) -> Grid:
     """
     The grid of an experiment: its methods and a random team, at every level that fits.
 
-    :raises ValueError: for methods that are no algorithms, or if nothing fits
+    :raises ValueError: for methods that are no algorithms, levels that it does not have, or if nothing fits
     """
     methods = check_methods(experiment, choice.methods)
+    experiment = experiment.at(choice.levels)
     tasks = choice.tasks or experiment.tasks
     left_out: list[LeftOut] = []
     fitting: list[tuple[TaskName, Level, tuple[Level, ...]]] = []

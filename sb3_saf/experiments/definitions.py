@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final, NamedTuple
 
 from hecogrid_envs.params import TASK_NAMES, TaskName
@@ -64,6 +65,10 @@ class View(NamedTuple):
         """Where a level is on the axis."""
         return level.heterogeneity if self.axis == HETEROGENEITY else level.coordination
 
+    def at(self, positions: Collection[int]) -> View:
+        """The same with fewer levels to test at: those whose position is among the given ones."""
+        return self._replace(levels=tuple(level for level in self.levels if self.position(level) in positions))
+
     def shows(self, train: Level, test: Level) -> bool:
         """Whether something trained and tested at these levels belongs to it."""
         return test in self.levels and train == (self.train or test)
@@ -108,6 +113,24 @@ class Experiment(NamedTuple):
     def settings(self) -> list[Setting]:
         """Each level that is trained at, once, with where it is tested."""
         return list(dict.fromkeys(setting for view in self.views for setting in view.settings))
+
+    def at(self, positions: Collection[int]) -> Experiment:
+        """
+        The part of it at some positions of its dials.
+
+        :param positions: such as 1, 3, 5; empty for all of it
+        :raises ValueError: for a position that none of its dials has
+        """
+        if not positions:
+            return self
+        known = sorted({view.position(level) for view in self.views for level in view.levels})
+        for position in positions:
+            if position not in known:
+                raise ValueError(
+                    f"{self.name} has no level {position} on its dials; there are {', '.join(map(str, known))}"
+                )
+        views = (view.at(positions) for view in self.views)
+        return self._replace(views=tuple(view for view in views if view.levels))
 
 
 COORDINATION: Final = "coordination"

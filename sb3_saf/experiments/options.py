@@ -36,6 +36,7 @@ def add_choice(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--seeds", type=int, nargs="+", default=[], help="default: 0 1 2 (smoke: 0 1)")
     group.add_argument("--methods", nargs="+", default=[], metavar="ALGO", help="default: the experiment's")
     group.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="default: the experiment's")
+    group.add_argument("--levels", type=int, nargs="+", default=[], help="on its dials, such as 1 3 5; default: all")
 
 
 def add_protocol(parser: argparse.ArgumentParser) -> None:
@@ -124,7 +125,7 @@ def existing_results_of(options: argparse.Namespace) -> Results:
 def choice_of(options: argparse.Namespace) -> Choice:
     """The part of the experiment to run."""
     wanted = wanted_of(options)
-    return Choice(wanted.seeds or DEFAULT_SEEDS[size_of(options)], wanted.methods, wanted.tasks)
+    return Choice(wanted.seeds or DEFAULT_SEEDS[size_of(options)], wanted.methods, wanted.tasks, wanted.levels)
 
 
 def wanted_of(options: argparse.Namespace) -> Choice:
@@ -140,6 +141,7 @@ def wanted_of(options: argparse.Namespace) -> Choice:
         tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
         tuple(dict.fromkeys(options.methods)),
         tuple(dict.fromkeys(check_task(task.removesuffix("-v0")) for task in options.tasks)),
+        tuple(dict.fromkeys(options.levels)),
     )
 
 

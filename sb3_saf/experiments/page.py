@@ -111,7 +111,7 @@ def _reproduction(content: Content) -> str:
     lines = ["## Run it again", "", "```sh"]
     for request in content.results.requests(content.experiment.name):
         words = [*PROGRAM.split(), "run", content.experiment.name, *_protocol_words(content.protocol)]
-        for option in ("seeds", "methods", "tasks"):
+        for option in ("seeds", "methods", "tasks", "levels"):
             if values := getattr(request, option):
                 words += [f"--{option}", *map(str, values)]
         lines.append(f"{shlex.join(words)} -f {shlex.quote(str(folder))}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,10 +10,11 @@ from matplotlib.figure import Figure
 
 from sb3_saf.experiments.cells import Cell, Choice
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
+from sb3_saf.experiments.frames import frame_of_curves, frame_of_tests
 from sb3_saf.experiments.page import Content, write_page
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.selection import complete, of_view, strata
-from sb3_saf.experiments.table import Row, requested, rows, write_table
+from sb3_saf.experiments.table import requested, rows, write_table
 from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels
 from sb3_saf.zoo.statistics import score_matrices
 
@@ -39,53 +39,39 @@ def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Re
     """
     Draw and write what is there of an experiment, complete or not.
 
-    :param wanted: the seeds, methods and tasks to show; empty ones for all that were run
+    :param wanted: the seeds, methods, tasks and levels to show; empty ones for all that were run
     :raises ValueError: if nothing is finished
     """
     protocol = results.protocol()
     assert protocol is not None
-    asked = requested(experiment, results)
-    cells = [cell for cell in asked.cells if _is_wanted(cell, wanted)]
+    asked, shown = requested(experiment, results), experiment.at(wanted.levels)
+    cells = [cell for cell in asked.cells if _is_wanted(cell, wanted, shown)]
     finished = rows(results, cells)
     if not finished:
         raise ValueError(f"{results.folder} has no finished cell of {experiment.name!r} among those to be shown")
     folder = results.folder / experiment.name
     write_table(experiment, results)
-    table = _frame(finished)
-    curves = _curves(results, cells)
+    table = frame_of_tests(finished)
+    curves = frame_of_curves(results, cells)
     figures = [
-        *_draw_views(experiment, table, folder),
-        *_draw_aggregates(experiment, table, folder),
-        *_draw_curves(experiment, curves, table, folder),
+        *_draw_views(shown, table, folder),
+        *_draw_aggregates(shown, table, folder),
+        *_draw_curves(shown, curves, table, folder),
     ]
     missing = [cell for cell in cells if results.missing_tests(cell)]
-    content = Content(experiment, protocol, results, cells, missing, asked.left_out, table, figures)
+    content = Content(shown, protocol, results, cells, missing, asked.left_out, table, figures)
     return Report(write_page(content, folder / "report.md"), figures, missing, len(cells))
 
 
-def _is_wanted(cell: Cell, wanted: Choice) -> bool:
+def _is_wanted(cell: Cell, wanted: Choice, shown: Experiment) -> bool:
     """Whether a cell is to be shown; the random team always is, on what is."""
+    levels = {level for train, tests in shown.settings for level in ((train,) if cell.is_trained else tests)}
     return (
         (not wanted.seeds or cell.seed in wanted.seeds)
         and (not wanted.tasks or cell.task in wanted.tasks)
         and (not wanted.methods or cell.method in wanted.methods or not cell.is_trained)
+        and cell.level in levels
     )
-
-
-def _frame(finished: Iterable[Row]) -> pd.DataFrame:
-    """The table, without what only files need."""
-    return pd.DataFrame(finished, columns=Row._fields).drop(columns=["returns", "cell"])
-
-
-def _curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
-    """Learning curves of all trained cells, in one table."""
-    found = []
-    for cell in cells:
-        path = results.cell_folder(cell) / "curve.csv"
-        if results.is_finished(cell) and path.exists():
-            names = {"method": cell.method, "task": cell.task, **cell.level._asdict(), "seed": cell.seed}
-            found.append(pd.read_csv(path).rename(columns={"mean_return": "score"}).assign(**names))
-    return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
 
 
 def _save(figure: Figure, path: Path) -> Path:

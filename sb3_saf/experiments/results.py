@@ -23,7 +23,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any, Final
 
@@ -203,8 +203,8 @@ class Results:
         """Everything that was asked for."""
         paths = (self.folder / experiment / "requests").glob("*.json")
         stored = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-        choices = [Choice(*(tuple(entry[key]) for key in ("seeds", "methods", "tasks"))) for entry in stored]
-        return sorted(choices, key=lambda choice: (choice.seeds, choice.methods, choice.tasks))
+        choices = [Choice(**{key: tuple(value) for key, value in entry.items()}) for entry in stored]
+        return sorted(choices, key=astuple)
 
     # Only one run at a time
 

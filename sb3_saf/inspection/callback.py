@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
@@ -15,19 +14,13 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.common.centralized import CentralizedValueWrapper
 from sb3_saf.common.game_steps import game_steps
-from sb3_saf.common.randomness import own_randomness
 from sb3_saf.common.teams import check_count, require_n_agents
-from sb3_saf.inspection import figures, film, report
-from sb3_saf.inspection.calibration import calibrate, lambda_returns
-from sb3_saf.inspection.doors import Zones, check_zones, return_scale, zone_colours, zone_function
-from sb3_saf.inspection.episodes import Played, Player
+from sb3_saf.inspection.doors import Zones, check_zones, zone_function
+from sb3_saf.inspection.episodes import Player
+from sb3_saf.inspection.inspection import Inspection, inspect_with
 from sb3_saf.inspection.kinds import require_our_policy
 from sb3_saf.inspection.page import Page, hparams, hyperparameters
-from sb3_saf.inspection.pool import chosen_by, differences
 from sb3_saf.qplex.policies import QPLEXPolicy
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MplFigure
 
 
 class InspectionCallback(BaseCallback):
@@ -133,15 +126,10 @@ class InspectionCallback(BaseCallback):
         began = time.perf_counter()
         now = self._game_steps()
         self._last, self._next = now, (now // self.every_game_steps + 1) * self.every_game_steps
-        policy = require_our_policy(self.model.policy)
-        training = policy.training
-        policy.set_training_mode(False)
-        with own_randomness(self.player.seed, self.model.device):
-            played = self.player.play(policy, self._reward_normalisation(), draw=self.pictures)
-            scalars = self._scalars(played)
-            if self.pictures and self._page.has_tensorboard:
-                self._draw(played)
-        policy.set_training_mode(training)
+        seen = inspect_with(self.player, self.model, self._reward_normalisation(), draw=self.pictures)
+        scalars = seen.scalars
+        if self.pictures and self._page.has_tensorboard:
+            self._draw(seen)
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began
         self._page.scalars(self._costs())
@@ -162,71 +150,23 @@ class InspectionCallback(BaseCallback):
             sync_envs_normalization(self.training_env, self.eval_env)
         return normalising
 
-    def _scalars(self, played: Played) -> dict[str, float]:
-        gamma = self._number("gamma", 1.0)
-        assert self.model.action_space is not None
-        return {
-            **report.team_scalars(played, return_scale(self.eval_env)),
-            **report.pool_scalars(played, self.model.action_space),
-            **report.knowledge_scalars(played),
-            **report.critic_scalars(played, gamma, self._number("gae_lambda", 1.0)),
-            **report.message_scalars(played, gamma),
-        }
-
-    def _number(self, name: str, default: float) -> float:
-        return float(getattr(self.model, name, default))
-
     def _costs(self) -> dict[str, float]:
         # At the start there is no training yet that it could be a share of.
         elapsed = time.perf_counter() - self._started
         costs = {"time/inspection_seconds": self.seconds}
         return costs | {"time/inspection_share": self.seconds / elapsed} if self._game_steps() else costs
 
-    def _draw(self, played: Played) -> None:
-        self._page.show("team/return_of_each_episode", th.tensor(played.returns))
+    def _draw(self, seen: Inspection) -> None:
+        self._page.show("team/return_of_each_episode", th.tensor(seen.played.returns))
         if self.model.ep_info_buffer:
             recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
             self._page.show("rollout/team_return_of_each_episode", recent)
-        for tag, figure in self._figures(played).items():
+        for tag, figure in seen.figures.items():
             self._page.show(tag, Figure(figure, close=True))
-        if played.pictures:
-            self._page.show("episode/strip", Image(film.strip(played.pictures), "HWC"))
-            self._page.gif("episode/film", film.gif(played.pictures), self.num_timesteps)
-
-    def _figures(self, played: Played) -> dict[str, MplFigure]:
-        counted, gamma = played.counted, self._number("gamma", 1.0)
-        values, returns = played.values[counted], lambda_returns(played, gamma)[counted]
-        unit = return_scale(self.eval_env).unit
-        per = f"{unit} of the team" if played.of_team else f"{unit} per agent"
-        found = calibrate(values, returns)
-        drawn = {"critic/calibration": figures.calibration(values, returns, found, per if unit else None)}
-        if played.weights is not None and played.actions is not None:
-            weights, agents = played.weights[counted], report.counted_agents(played)
-            drawn["pool/by_agent"] = figures.chosen_by_agent(chosen_by(weights, agents, self.n_agents))
-            table = differences(self.model.action_space, played.actions[counted])
-            drawn["pool/differences"] = figures.policy_differences(table)
-            if played.zones is not None:
-                drawn["pool/by_zone"] = self._by_zone(played)
-        write, read = report.write_attention(played), report.read_attention(played)
-        if write is not None and read is not None and played.write is not None:
-            drawn["knowledge_source/attention"] = figures.attention(write, read)
-            drawn["knowledge_source/one_episode"] = figures.attention_over_time(_first_episode(played, played.write))
-        return drawn
-
-    def _by_zone(self, played: Played) -> MplFigure:
-        assert played.weights is not None and played.zones is not None
-        zones = played.zones[played.counted]
-        colours = zone_colours(self.eval_env)
-        n_zones = max(int(zones.max(initial=0)) + 1, len(colours or ()))
-        table = chosen_by(played.weights[played.counted], zones, n_zones)
-        return figures.chosen_by_zone(table, colours)
-
-
-def _first_episode(played: Played, attention: np.ndarray) -> np.ndarray:
-    """(T', ...) of the first game that was played, up to the end of its first episode."""
-    game = int(np.flatnonzero(report.counted_games(played).any(axis=0))[0])
-    ends = played.ends.reshape(len(played.ends), -1, played.n_agents)[:, game].all(axis=1)
-    return attention[: int(np.flatnonzero(ends)[0]) + 1, game]
+        strip, film = seen.strip, seen.film
+        if strip is not None and film is not None:
+            self._page.show("episode/strip", Image(strip, "HWC"))
+            self._page.gif("episode/film", film, self.num_timesteps)
 
 
 def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:

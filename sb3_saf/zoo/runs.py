@@ -19,7 +19,7 @@ from sb3_saf.zoo.yaml_files import load_yaml
 Source = Literal["evaluation", "training"]
 
 #: Points of a curve of training episodes.
-_N_BINS: Final = 50
+_N_POINTS: Final = 50
 #: Changed settings that a method's name spells out.
 _MOST_NAMED: Final = 2
 #: The part of training whose episodes count as its result.
@@ -89,13 +89,28 @@ class Run:
         path = self.folder / "monitor.csv"
         if not path.is_file():
             raise ValueError(f"{self.folder} has no monitor.csv; train with sb3_saf.train")
-        episodes = pd.read_csv(path, comment="#")
-        if episodes.empty:
-            raise ValueError(f"no episode has ended in {self.folder}; train longer")
-        steps = episodes["l"].cumsum()
-        bins = np.ceil(steps / steps.iloc[-1] * _N_BINS).astype(int)
-        means = episodes["r"].groupby(bins).mean()
-        return pd.DataFrame({"game_steps": means.index * steps.iloc[-1] / _N_BINS, "score": means.to_numpy()})
+        return training_curve(path)
+
+
+def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFrame:
+    """
+    The learning curve of the games that were trained on.
+
+    :param monitor: a ``monitor.csv``, or the ``monitor_dir`` that ``make_team_env`` was given
+    :param n_points: means of about as many episodes each
+    :return: columns ``game_steps``, ``score``, the mean team return
+    :raises ValueError: if no episode has ended
+    """
+    path = Path(monitor)
+    if path.is_dir():
+        path /= "monitor.csv"
+    episodes = pd.read_csv(path, comment="#")
+    if episodes.empty:
+        raise ValueError(f"no episode has ended in {path.parent}; train longer")
+    steps = episodes["l"].cumsum()
+    bins = np.ceil(steps / steps.iloc[-1] * n_points).astype(int)
+    means = episodes["r"].groupby(bins).mean()
+    return pd.DataFrame({"game_steps": means.index * steps.iloc[-1] / n_points, "score": means.to_numpy()})
 
 
 def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:

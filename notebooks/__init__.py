@@ -1,0 +1,1 @@
+"""Tutorials that run from top to bottom, and what runs them."""
