@@ -81,10 +81,7 @@ class Inspection(NamedTuple):
         by_agent = chosen_by(played.weights[counted], report.counted_agents(played), played.n_agents)
         drawn = {
             "pool/by_agent": figures.chosen_by_agent(by_agent),
-            "pool/differences": figures.policy_differences(
-                differences(self.action_space, played.actions[counted]),
-                "share with other best actions" if played.of_team else "Hellinger distance",
-            ),
+            "pool/differences": figures.policy_differences(differences(self.action_space, played.actions[counted])),
         }
         if played.zones is not None:
             zones = played.zones[counted]
