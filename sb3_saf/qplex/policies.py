@@ -67,7 +67,7 @@ class QPLEXPolicy(TeamRowsPolicy):
     :param features_extractor_class: encoder, built on the space of ``obs``
     :param features_extractor_kwargs: its further arguments
     :param normalize_images: whether pictures are divided by 255
-    :param optimizer_class: optimizer; RMSprop as published; Adam does not solve the game of docs/qplex.md
+    :param optimizer_class: optimizer; RMSprop as published
     :param optimizer_kwargs: its arguments, but for the learning rate; None for the published ones of RMSprop
     :param kwargs: fields of :class:`QPLEXParts`
     """
