@@ -22,6 +22,8 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode
 
+import hecogrid_envs
+
 FOLDER: Final = Path(__file__).resolve().parent
 #: Tag of the one cell whose numbers can be replaced, as papermill and others have it.
 PARAMETERS: Final = "parameters"
@@ -155,6 +157,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     paths = [path for path in source_files() if path.name.startswith(names)]
     if not paths:
         parser.error(f"no notebook begins with {' or '.join(names)}")
+
+    hecogrid_envs.GameBatch("TeamSupport", hecogrid_envs.HECOGridParams())  # on a new machine, says that it compiles
 
     def tried(path: Path) -> str | NotebookError:
         try:
