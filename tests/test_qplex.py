@@ -355,7 +355,9 @@ def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
 
 
 def test_evaluation_callback(tmp_path: Path) -> None:
-    callback = TeamEvalCallback(toy_env(2), n_eval_episodes=2, eval_freq=20, log_path=str(tmp_path), verbose=0)
+    games = toy_env(2)
+    games.seed(10_000)
+    callback = TeamEvalCallback(games, n_eval_episodes=2, eval_freq=20, log_path=str(tmp_path), verbose=0)
     make_model(policy="QPLEXLstmPolicy").learn(60 * 3, callback=callback)
     assert np.load(tmp_path / "evaluations.npz")["game_steps"].tolist() == [20, 40, 60]
 
