@@ -158,6 +158,7 @@ def programs() -> dict[str, Callable[[], Work]]:
             rows[f"batch, {observation}, {task}"] = lambda t=task, o=observation: batch_work(t, o)  # type: ignore[misc]
     rows |= {
         "batch, tiles, TeamSupport, two threads": lambda: batch_work("TeamSupport", "tiles", n_threads=2),
+        "batch, rgb, TeamSupport, two threads": lambda: batch_work("TeamSupport", "rgb", n_threads=2),
         "batch, tiles, TeamSupport, 1 game, N = 1000, 300 x 300": lambda: batch_work(
             "TeamSupport", "tiles", n_games=1, **large
         ),

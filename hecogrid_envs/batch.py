@@ -10,10 +10,9 @@ import numpy.typing as npt
 
 from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain, TreasureState
 from hecogrid_envs.core import announce_compilation
-from hecogrid_envs.core.batch_step import reset_games
 from hecogrid_envs.core.generation import clear, draw_level
 from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
-from hecogrid_envs.core.sharing import PICTURES, STEP, TILES, Pictures
+from hecogrid_envs.core.sharing import PICTURES, RESET, STEP, TILES, Pictures
 from hecogrid_envs.core.types import Games, RuleBook
 from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, TASK_NAMES, HECOGridParams, TaskName, check_task
@@ -88,9 +87,11 @@ class GameBatch:
         :param seeds: (E,) a seed starts a game's randomness and history anew, None continues it
         """
         chosen = np.ones(self.n_games, dtype=bool) if which is None else np.asarray(which, dtype=bool)
+        if chosen.shape != (self.n_games,):
+            raise ValueError(f"which must have shape ({self.n_games},), one per game, got {chosen.shape}")
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
-        reset_games(self._games, self._book, chosen.astype(np.uint8), 0, self.n_games)
+        self._shares.play(RESET, chosen.astype(np.uint8))
 
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:

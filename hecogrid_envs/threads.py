@@ -27,9 +27,9 @@ from hecogrid_envs.core.sharing import (
 from hecogrid_envs.core.types import U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures
 
-#: Looks at the desk before a helper goes to sleep, some tenths of a millisecond: tight loops find it awake, and while a
-#: network computes it does not take its processor.
-_POLLS_OF_HELPERS: Final = 100_000
+#: Looks at the desk before a helper goes to sleep, about half a millisecond: tight loops find it awake, and while a
+#: network computes it does not take its processor for long.
+_POLLS_OF_HELPERS: Final = 1_000_000
 #: Looks at the desk before the calling thread offers its processor to others.
 _POLLS_OF_CALLER: Final = 10_000
 

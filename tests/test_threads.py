@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import textwrap
@@ -102,3 +103,28 @@ def test_views_go_to_arrays_that_fit(out: np.ndarray, what: str) -> None:
 def test_actions_of_other_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"actions must have shape \(6, 5\), \(games, agents\), got \(30,\)"):
         batch_of(2).step(np.zeros(30, dtype=np.uint8))
+
+
+def test_a_choice_of_other_games_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"which must have shape \(6,\), one per game, got \(5,\)"):
+        batch_of(2).reset(np.ones(5, dtype=bool))
+
+
+@pytest.mark.parametrize("view_size", [1, 3, 7, 9])
+@pytest.mark.parametrize("tile", [1, 2, 4, 5, 6, 12])
+def test_drawing_stays_inside_its_array(view_size: int, tile: int) -> None:
+    params = HECOGridParams(
+        n_agents=5, grid_size=12, n_treasures=30, view_size=view_size, view_offset=0, view_tile_size=tile
+    )
+    drawn = []
+    for n_threads in (1, 3):
+        batch = GameBatch("TeamSupport", params, 6, n_threads)
+        batch.reset(seeds=game_seeds(0, 6))
+        shape = (6, 5, params.view_pixels, params.view_pixels, 3)
+        memory = np.full(math.prod(shape) + 64, 77, dtype=np.uint8)
+        batch.observe(memory[:-64].reshape(shape))
+        assert (memory[-64:] == 77).all()
+        drawn.append(memory)
+        alone = [batch.observe_game(game) for game in range(6)]
+        np.testing.assert_array_equal(memory[:-64].reshape(shape), alone)
+    np.testing.assert_array_equal(drawn[0], drawn[1])

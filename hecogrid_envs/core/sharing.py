@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared
-from hecogrid_envs.core.batch_step import step_games
-from hecogrid_envs.core.jit import hot
+from hecogrid_envs.core.batch_step import reset_games, step_games
+from hecogrid_envs.core.jit import hot, kernel
 from hecogrid_envs.core.types import U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures, observe_tiles
 
@@ -17,7 +17,8 @@ from hecogrid_envs.core.view import draw_pictures, observe_tiles
 STEP: Final = 0
 TILES: Final = 1
 PICTURES: Final = 2
-_LEAVE: Final = 3
+RESET: Final = 3
+_LEAVE: Final = 4
 
 #: Numbers of the desk, over which the calling thread and its helpers talk.
 _TICKET: Final = 0
@@ -48,18 +49,21 @@ class Pictures(NamedTuple):
     tile: int
 
 
-@hot
+@kernel
 def play_share(games: Games, book: RuleBook, pictures: Pictures, task: int, array: U8, first: int, last: int) -> None:
     """
     Do one task for games ``first`` to ``last - 1``.
 
-    :param task: ``STEP``, ``TILES`` or ``PICTURES``
-    :param array: (E * N,) actions, (E * N * V * V,) codes to write, or (E * N * V t * V t * 3,) pixels to write
+    :param task: ``STEP``, ``TILES``, ``PICTURES`` or ``RESET``
+    :param array: (E * N,) actions, (E * N * V * V,) codes to write, (E * N * V t * V t * 3,) pixels to write, or (E,) 1
+        for games to reset and 0 for others
     """
     if task == STEP:
         step_games(games, book, array, first, last)
     elif task == TILES:
         observe_tiles(games, book, array, first, last)
+    elif task == RESET:
+        reset_games(games, book, array, first, last)
     else:
         codes, n = pictures.codes, book.n_agents
         observe_tiles(games, book, codes, first, last)
@@ -121,7 +125,7 @@ def wait_for_helpers(desk: npt.NDArray[np.int64], polls: int) -> bool:
     return False
 
 
-@hot
+@kernel
 def serve(
     games: Games,
     book: RuleBook,

@@ -144,7 +144,28 @@ def draw_pictures(
     :param last: one beyond the last view to draw
     """
     line, tile_bytes = 3 * tile, 3 * tile * tile
-    end = last * size * size * tile_bytes
+    # As many views as a chunk may reach into are drawn line by line: nothing repairs what lies beyond the last.
+    repairing = 1 + (_CHUNK_BYTES - 1) // (size * size * tile_bytes)
+    quick = max(first, last - repairing) if line <= _CHUNK_BYTES else first
+    _draw_in_chunks(codes, facing, atlas, turn_bytes, size, tile, out, first, quick)
+    for view in range(quick, last):
+        turned = facing[view] * turn_bytes
+        to = view * size * size * tile_bytes
+        for row in range(size):
+            cell = (view * size + row) * size
+            for pixel_row in range(tile):
+                source = turned + pixel_row * line
+                for column in range(size):
+                    _copy_line(out, to, atlas, source + np.int64(codes[cell + column]) * tile_bytes, line)
+                    to += line
+
+
+@inlined
+def _draw_in_chunks(
+    codes: U8, facing: U8, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
+) -> None:
+    """As :func:`draw_pictures`, copying more than a tile's line; what comes next, written later, repairs it."""
+    line, tile_bytes = 3 * tile, 3 * tile * tile
     for view in range(first, last):
         turned = facing[view] * turn_bytes
         to = view * size * size * tile_bytes
@@ -154,12 +175,7 @@ def draw_pictures(
                 source = turned + pixel_row * line
                 for column in range(size):
                     # An unsigned index spares the check for counting from the end.
-                    at = source + np.int64(codes[np.uint64(cell + column)]) * tile_bytes
-                    if line <= _CHUNK_BYTES and to + _CHUNK_BYTES <= end:
-                        # Writes past the tile; what comes next, written later, repairs it.
-                        copy_16(out, to, atlas, at)
-                    else:
-                        _copy_line(out, to, atlas, at, line)
+                    copy_16(out, to, atlas, source + np.int64(codes[np.uint64(cell + column)]) * tile_bytes)
                     to += line
 
 
