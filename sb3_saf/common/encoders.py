@@ -6,7 +6,8 @@ Each takes raw observations (uint8 pictures, tile codes, indices) as well as wha
 features extractor (floats in [0, 1], one-hot vectors), so each also serves plain SB3 policies. A *tile-code space* is
 any Box of whole numbers with an attribute ``atlas`` (n_codes, t, t, C) that holds the pixels of every code; its codes
 become pixels on the training device. Encoders of tiles and of the same pictures have the same weights and give the
-same features.
+same features; on the CPU, those whose first layer allows it look up what tiles add to it instead of making pixels
+(``sb3_saf.common.tile_sums``).
 """
 
 from __future__ import annotations
@@ -22,6 +23,14 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 
 from sb3_saf.common.networks import HIDDEN_GAIN, Linear, mlp
+from sb3_saf.common.tile_sums import (
+    Places,
+    places_of_convolution,
+    places_of_linear,
+    sum_tiles,
+    table_of_convolution,
+    used_codes,
+)
 
 #: The least side of a picture from which NatureCNN's convolutions leave something.
 NATURE_PIXELS: Final = 36
@@ -88,6 +97,14 @@ class PixelInput(nn.Module):
             pictures = pictures.permute(0, 3, 1, 2)
         return pictures.contiguous(memory_format=th.channels_last)
 
+    def looks_up(self, observations: th.Tensor) -> bool:
+        """Whether a first layer may look up what tiles add to it: codes on the CPU. Elsewhere products are cheaper."""
+        return self.layout == "codes" and observations.device.type == "cpu"
+
+    def tiles(self, codes: th.Tensor) -> th.Tensor:
+        """(U, C, t, t) pictures of single tiles: (U,) codes."""
+        return self.atlas[codes].permute(0, 3, 1, 2)
+
 
 def _checked_atlas(space: Any) -> th.Tensor:
     """(n_codes, t, t, C) uint8 pixels of every code."""
@@ -99,6 +116,20 @@ def _checked_atlas(space: Any) -> th.Tensor:
             f"has every code, got {space} with an atlas of shape {atlas.shape} and dtype {atlas.dtype}"
         )
     return th.tensor(atlas)
+
+
+class _FlattenPictures(nn.Flatten):
+    """Flattens channels-last memory; the gradient comes back in that order, too, or the layer before is slow."""
+
+    def forward(self, pictures: th.Tensor) -> th.Tensor:
+        """(K, C, H, W) to (K, C * H * W)."""
+        if pictures.requires_grad:
+            pictures.register_hook(_channels_last)
+        return super().forward(pictures)
+
+
+def _channels_last(gradient: th.Tensor) -> th.Tensor:
+    return gradient.contiguous(memory_format=th.channels_last)
 
 
 class PaperCNN(BaseFeaturesExtractor):
@@ -123,19 +154,33 @@ class PaperCNN(BaseFeaturesExtractor):
             )
         self.net = nn.Sequential(
             nn.Conv2d(channels, 32, kernel_size=4, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, kernel_size=3, stride=2),
-            nn.ReLU(),
-            nn.Flatten(),
+            nn.ReLU(inplace=True),
+            _FlattenPictures(),
             Linear(64 * out_height * out_width, 512, gain=HIDDEN_GAIN),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             Linear(512, features_dim, gain=HIDDEN_GAIN),
         )
+        self._places: Places | None = None
+        if self.pixels.layout == "codes" and (tile := self.pixels.atlas.shape[1]) % 2 == 0:
+            self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """(K, *shape) views to (K, features_dim)."""
-        features: th.Tensor = self.net(self.pixels(observations))
-        return features
+        if self._places is None or not self.pixels.looks_up(observations):
+            features: th.Tensor = self.net(self.pixels(observations))
+            return features
+        looked_up: th.Tensor = self.net[1:](self._first_layer(observations, self._places))
+        return looked_up
+
+    def _first_layer(self, codes: th.Tensor, places: Places) -> th.Tensor:
+        """(K, 32, h, w) outputs of the first convolution: (K, rows, columns)."""
+        first = self.net[0]
+        assert isinstance(first, nn.Conv2d) and first.bias is not None
+        used = used_codes(codes.flatten(1))
+        table = table_of_convolution(self.pixels.tiles(used.codes), first.weight, stride=2)
+        return sum_tiles(used.views, table, places).add_(first.bias.view(-1, 1, 1))
 
 
 def _after_convolutions(size: int) -> int:
@@ -205,9 +250,13 @@ class LightEncoder(BaseFeaturesExtractor):
         n_tiles = height * width // self.tile_size**2
         self.embed = Linear(self.tile_size**2 * channels, embedding_dim, gain=HIDDEN_GAIN)
         self.net = mlp([n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
+        self._places = places_of_linear(n_tiles)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """(K, *shape) views to (K, features_dim)."""
+        if self.pixels.looks_up(observations):
+            looked_up: th.Tensor = self.net[1:](self._first_layer(observations))
+            return looked_up
         if self.pixels.layout == "codes":
             by_code = self.embed(self.pixels.atlas.flatten(1))
             tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
@@ -215,6 +264,17 @@ class LightEncoder(BaseFeaturesExtractor):
             tiles = self.embed(self._cut(self.pixels(observations)))
         features: th.Tensor = self.net(tiles.flatten(1))
         return features
+
+    def _first_layer(self, codes: th.Tensor) -> th.Tensor:
+        """(K, hidden) outputs of the first linear layer: (K, rows, columns)."""
+        first = self.net[0]
+        assert isinstance(first, nn.Linear)
+        used = used_codes(codes.flatten(1))
+        embedded = self.embed(self.pixels.atlas[used.codes].flatten(1))
+        # Weights are (hidden, T * e): what a code adds at each of the T places, (U, T, hidden).
+        by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
+        table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
+        return sum_tiles(used.views, table, self._places).add_(first.bias)
 
     def _cut(self, pictures: th.Tensor) -> th.Tensor:
         """(K, tiles, t * t * C) pixels of each tile, in the order of an atlas: (K, C, H, W)."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch as th
 from torch import nn
@@ -32,17 +32,46 @@ class Linear(nn.Linear):
         self.gain = gain
 
 
+class Tanh(nn.Tanh):
+    """
+    ``nn.Tanh``, on the CPU as 2 sigmoid(2 x) - 1: PyTorch's sigmoid takes a sixth of the time of its tanh, which would
+    be a fifth of SAF's forward pass. The two differ by 2e-7 at most.
+    """
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Of any shape."""
+        if x.device.type != "cpu" or th.compiler.is_compiling():
+            return super().forward(x)
+        result: th.Tensor = _TanhBySigmoid.apply(x)
+        return result
+
+
+class _TanhBySigmoid(th.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:
+        y = (x * 2).sigmoid_().mul_(2).sub_(1)
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> th.Tensor:
+        # Autograd's own formula, which can be differentiated again, as TRPO does.
+        gradient: th.Tensor = th.ops.aten.tanh_backward(gradients[0], *ctx.saved_tensors)
+        return gradient
+
+
 def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float = 1.0) -> nn.Sequential:
     """
     Multi-layer perceptron with a linear output.
 
     :param sizes: inputs, hidden layers, outputs
-    :param activation_fn: activation after every layer but the last
+    :param activation_fn: activation after every layer but the last; ``nn.Tanh`` becomes :class:`Tanh`
     :param output_gain: orthogonal gain of the last layer
     """
+    activation = Tanh if activation_fn is nn.Tanh else activation_fn
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(sizes[:-1]):
-        layers += [Linear(n_in, n_out, gain=HIDDEN_GAIN), activation_fn()]
+        layers += [Linear(n_in, n_out, gain=HIDDEN_GAIN), activation()]
     return nn.Sequential(*layers, Linear(sizes[-2], sizes[-1], gain=output_gain))
 
 

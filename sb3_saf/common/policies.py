@@ -69,7 +69,8 @@ class TeamPolicy(TeamRowsPolicy):
     :param features_extractor_class: encoder, built on the space of ``obs``
     :param features_extractor_kwargs: its further arguments
     :param kwargs: fields of ``parts_class``, and other arguments of SB3's ``ActorCriticPolicy``: activation_fn,
-        ortho_init, log_std_init, normalize_images, optimizer_class, optimizer_kwargs
+        ortho_init, log_std_init, normalize_images, optimizer_class, optimizer_kwargs (Adam and AdamW step all weights
+        at once, ``fused=True``, unless told otherwise)
     """
 
     #: The algorithm: which actor and critic to make.
@@ -144,7 +145,8 @@ class TeamPolicy(TeamRowsPolicy):
             orthogonal_init(self.value_net)
         self.value_normalizer = ValueNormalizer() if self.normalize_values else None
         learning_rate = lr_schedule(1)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+        kwargs = _with_fused_steps(self.optimizer_class, self.optimizer_kwargs)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **kwargs)  # type: ignore[call-arg]
 
     def _make_actor(self) -> Actor:
         return self.parts.actor(self._network_spec())
@@ -257,6 +259,13 @@ class TeamPolicy(TeamRowsPolicy):
         states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
         found = self.views.find(states)
         return self._in_chunks(critic, states[found.index], space)[found.inverse, self._agent(obs)]
+
+
+def _with_fused_steps(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of Adam with the implementation that takes a third of the time, if none is asked for."""
+    if optimizer_class not in (th.optim.Adam, th.optim.AdamW) or kwargs.keys() & {"fused", "foreach", "differentiable"}:
+        return kwargs
+    return {**kwargs, "fused": True}
 
 
 class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc]  # value_net, log_std: ours

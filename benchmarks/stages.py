@@ -1,0 +1,186 @@
+"""
+Where each millisecond of a training goes. ``python -m benchmarks.stages``
+
+One table per setting: SAF, MAPPO and IPPO in the ``small`` size of the zoo (light encoder), and SAF with the paper's
+network. Every stage counts its own time only: what the games take is not counted again in the rollout that steps them.
+Wall-clock; the stages are found by wrapping the functions that SB3's PPO calls, so the numbers are of the real program
+and sum to the whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any, Final, NamedTuple
+
+import torch as th
+from stable_baselines3 import PPO
+
+from sb3_saf import LightEncoder, PaperCNN, TeamRolloutBuffer, make_team_env
+
+REST: Final = "all else"
+
+
+class Stopwatch:
+    """Adds up the seconds of nested stages, each without those inside it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._stack: list[str] = []
+        self._since = time.perf_counter()
+
+    def _charge(self) -> None:
+        now = time.perf_counter()
+        self.seconds[self._stack[-1] if self._stack else REST] += now - self._since
+        self._since = now
+
+    def start(self) -> None:
+        """Forget everything; from now on it counts."""
+        self.seconds.clear()
+        self._since = time.perf_counter()
+
+    def stop(self) -> dict[str, float]:
+        """Seconds by stage."""
+        self._charge()
+        return dict(self.seconds)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """What happens inside counts for this stage."""
+        self._charge()
+        self._stack.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._stack.pop()
+
+    def watch(self, owner: Any, method: str, name: str) -> None:
+        """Count the calls of a function or method for a stage."""
+        inner: Callable[..., Any] = getattr(owner, method)
+
+        @wraps(inner)
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            with self.stage(name):
+                return inner(*args, **kwargs)
+
+        setattr(owner, method, timed)
+
+    def watch_items(self, owner: Any, method: str, name: str) -> None:
+        """The same for a generator: what it does between its items."""
+        inner: Callable[..., Any] = getattr(owner, method)
+
+        def timed(*args: Any, **kwargs: Any) -> Iterator[Any]:
+            items = inner(*args, **kwargs)
+            while True:
+                with self.stage(name):
+                    item = next(items, None)
+                if item is None:
+                    return
+                yield item
+
+        setattr(owner, method, timed)
+
+
+class Setting(NamedTuple):
+    """What is trained: a policy, its games and PPO's arguments."""
+
+    policy: str
+    encoder: type[Any]
+    env: dict[str, Any]
+    n_games: int
+    minibatches: int
+    n_epochs: int
+
+
+_SMALL: Final = {"n_agents": 5, "grid_size": 15, "n_treasures": 25, "coordination": 1}
+SETTINGS: Final = {
+    **{
+        f"{method}, small": Setting(f"{method}Policy", LightEncoder, _SMALL, 64, 8, 4)
+        for method in ("SAF", "MAPPO", "IPPO")
+    },
+    "SAF, paper network, 16 games": Setting("SAFPolicy", PaperCNN, {}, 16, 1, 10),
+}
+
+
+def make_model(setting: Setting, steps: int = 50) -> PPO:
+    """The algorithm of a setting, on TeamSupport."""
+    env = make_team_env("TeamSupport", n_envs=setting.n_games, seed=0, **setting.env)
+    rows = steps * env.num_envs
+    return PPO(
+        setting.policy,
+        env,
+        n_steps=steps,
+        batch_size=rows // setting.minibatches,
+        n_epochs=setting.n_epochs,
+        learning_rate=7e-4,
+        gae_lambda=1.0,
+        ent_coef=0.01,
+        max_grad_norm=9.0,
+        rollout_buffer_class=TeamRolloutBuffer,
+        policy_kwargs={"features_extractor_class": setting.encoder},
+        seed=0,
+        device="cpu",
+    )
+
+
+def watch(model: Any) -> Stopwatch:
+    """Watch everything that PPO does with its parts."""
+    watch = Stopwatch()
+    policy, buffer, env = model.policy, model.rollout_buffer, model.env
+    watch.watch(env.unwrapped, "step_wait", "games")
+    watch.watch(env, "step", "joint view, monitor")
+    watch.watch(buffer, "add", "rollout buffer")
+    watch.watch(buffer, "compute_returns_and_advantage", "advantages")
+    watch.watch_items(buffer, "get", "minibatches")
+    watch.watch(policy, "forward", "rollout: heads, drawing actions")
+    watch.watch(policy, "predict_values", "rollout: heads, drawing actions")
+    watch.watch(policy, "evaluate_actions", "update: likelihood, entropy, gathering")
+    for module, name in ((policy.features_extractor, "encoder"), (policy.actor, "actor"), (policy.value_net, "critic")):
+        watch.watch(module, "forward", f"{name}, forward")
+    watch.watch(policy.views, "find", "which views are equal")
+    watch.watch(th.Tensor, "backward", "backward")
+    watch.watch(th.nn.utils, "clip_grad_norm_", "clipping of gradients")
+    watch.watch(policy.optimizer, "step", "Adam")
+    return watch
+
+
+def profile(setting: Setting, rollouts: int) -> tuple[dict[str, float], int]:
+    """Seconds by stage, and agent-steps; one rollout and update before warm up."""
+    model = make_model(setting)
+    assert model.env is not None
+    rows = model.n_steps * model.env.num_envs
+    model.learn(rows)
+    backward, clip = th.Tensor.backward, th.nn.utils.clip_grad_norm_
+    stopwatch = watch(model)
+    try:
+        stopwatch.start()
+        model.learn(rollouts * rows, reset_num_timesteps=False)
+        return stopwatch.stop(), rollouts * rows
+    finally:
+        th.Tensor.backward, th.nn.utils.clip_grad_norm_ = backward, clip  # type: ignore[method-assign]
+
+
+def main() -> None:
+    """Print a Markdown table: microseconds per agent-step of each stage."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rollouts", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--only", choices=list(SETTINGS), help="one setting")
+    options = parser.parse_args()
+    th.set_num_threads(options.threads)
+    for name in [options.only] if options.only else SETTINGS:
+        seconds, rows = profile(SETTINGS[name], options.rollouts)
+        whole = sum(seconds.values())
+        print(f"\n{name}: {rows / whole:,.0f} agent-steps/s, {options.threads} thread(s)\n")
+        print("| stage | us per agent-step | share |\n| --- | --- | --- |")
+        for stage, spent in sorted(seconds.items(), key=lambda item: -item[1]):
+            print(f"| {stage} | {1e6 * spent / rows:.2f} | {100 * spent / whole:.1f} % |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,232 @@
+"""
+The first layer over tile codes without pixels: what a tile adds to the layer's output depends on its code alone, so it
+is computed once per code and looked up.
+
+A linear layer or a convolution over pictures made of tiles is a sum of what each tile adds. Few codes occur in a batch,
+so all that tiles can add fits a small table; a view's output is then a sum of rows of the table, some ten times cheaper
+than the products, and the gradient goes the same way back. Equal to the layer over pixels up to float summation order.
+
+Letters: K views, T tiles per view, U codes that occur, P places of the output, S ways in which a tile can meet a place,
+W numbers per place, J pairs of a place and a tile that it sees.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from numba import njit
+
+Ints: TypeAlias = npt.NDArray[np.int64]
+Floats: TypeAlias = npt.NDArray[Any]
+
+
+class Places(NamedTuple):
+    """
+    Which tiles each place of the output sees, and how.
+
+    :param size: of the output but for its W numbers per place: (), or (height, width); P is their product
+    :param first: (P + 1,) pairs ``first[p]`` to ``first[p + 1] - 1`` are those of place p; none has no pairs
+    :param tile: (J,) in 0..T-1
+    :param way: (J,) in 0..S-1
+    """
+
+    size: tuple[int, ...]
+    first: Ints
+    tile: Ints
+    way: Ints
+
+
+class UsedCodes(NamedTuple):
+    """
+    The codes that occur in some views.
+
+    :param codes: (U,) int64, increasing
+    :param views: (K, T) int64, each code's number among them
+    """
+
+    codes: th.Tensor
+    views: th.Tensor
+
+
+def places_of_linear(n_tiles: int) -> Places:
+    """A linear layer: a single place that sees every tile, each in a way of its own."""
+    tiles = np.arange(n_tiles)
+    return Places((), np.array([0, n_tiles]), tiles, tiles)
+
+
+def places_of_convolution(rows: int, columns: int, tile: int, kernel: int, stride: int) -> Places:
+    """
+    A convolution without padding whose stride divides the tile: how a window meets a tile does not depend on where.
+
+    Ways are numbered as in :func:`table_of_convolution`; places row by row.
+
+    :param rows: of tiles
+    :param columns: of tiles
+    :param tile: pixels per tile
+    :param kernel: pixels per side of the kernel
+    :param stride: pixels
+    """
+    n_rows, n_columns = ((n * tile - kernel) // stride + 1 for n in (rows, columns))
+    before, per_side = (kernel - 1) // stride, _ways_per_side(tile, kernel, stride)
+    pairs = [
+        (y * n_columns + x, row * columns + column, i * per_side + j)
+        for row in range(rows)
+        for column in range(columns)
+        for i in range(per_side)
+        for j in range(per_side)
+        if 0 <= (y := row * tile // stride + i - before) < n_rows
+        and 0 <= (x := column * tile // stride + j - before) < n_columns
+    ]
+    place, tiles, ways = np.array(sorted(pairs), dtype=np.int64).T.copy()
+    first = np.searchsorted(place, np.arange(n_rows * n_columns + 1))
+    return Places((n_rows, n_columns), first, tiles, ways)
+
+
+def _ways_per_side(tile: int, kernel: int, stride: int) -> int:
+    return (kernel - 1) // stride + (tile - 1) // stride + 1
+
+
+def table_of_convolution(pictures: th.Tensor, weight: th.Tensor, stride: int) -> th.Tensor:
+    """
+    What single tiles add to a convolution.
+
+    :param pictures: (U, C, t, t) pixels of tiles
+    :param weight: (W, C, kernel, kernel)
+    :param stride: divides t
+    :return: (U, S, W), without bias
+    """
+    kernel, tile = weight.shape[2], pictures.shape[2]
+    before = (kernel - 1) // stride * stride
+    after = (_ways_per_side(tile, kernel, stride) - 1) * stride + kernel - before - tile
+    alone = th.nn.functional.pad(pictures, (before, after, before, after))
+    return th.nn.functional.conv2d(alone, weight, stride=stride).flatten(2).transpose(1, 2)
+
+
+def used_codes(views: th.Tensor) -> UsedCodes:
+    """
+    Number the codes that occur.
+
+    :param views: (K, T) codes of any type on the CPU
+    """
+    array = views.long().numpy()
+    seen = np.zeros(int(array.max()) + 1 if array.size else 0, dtype=np.bool_)
+    _mark(array, seen)
+    codes = np.flatnonzero(seen)
+    number = np.zeros(len(seen), dtype=np.int64)
+    number[codes] = np.arange(len(codes))
+    return UsedCodes(th.from_numpy(codes), th.from_numpy(number[array]))
+
+
+def sum_tiles(views: th.Tensor, table: th.Tensor, places: Places) -> th.Tensor:
+    """
+    Add up what tiles add.
+
+    :param views: (K, T) int64 on the CPU, numbers of codes
+    :param table: (U, S, W)
+    :param places: of the layer
+    :return: (K, W) or (K, W, height, width), channels last in memory; differentiable by ``table`` any number of times
+    """
+    summed: th.Tensor = _Gathered.apply(table, views, places)
+    return summed
+
+
+class _Gathered(th.autograd.Function):
+    """(U, S, W) table -> (K, W, *size) sums. It is linear, and :class:`_Scattered` is its transpose."""
+
+    @staticmethod
+    def forward(ctx: Any, table: th.Tensor, views: th.Tensor, places: Places) -> th.Tensor:
+        ctx.views, ctx.places, ctx.n_codes, ctx.n_ways = views, places, *table.shape[:2]
+        # Not a permuted view: writing into one in place, as the next layers do, makes autograd copy.
+        sums = table.new_empty((len(views), table.shape[2], *places.size))
+        if places.size:
+            sums = th.empty_like(sums, memory_format=th.channels_last)
+        _gather(_flat(views), _flat(table), _flat(_places_last(sums)), *places[1:], views.shape[1], *table.shape[1:])
+        return sums
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[Any, ...]:
+        return _Scattered.apply(gradients[0], ctx.views, ctx.places, ctx.n_codes, ctx.n_ways), None, None
+
+
+class _Scattered(th.autograd.Function):
+    """(K, W, *size) -> (U, S, W): each place gives its numbers to all that it sees."""
+
+    @staticmethod
+    def forward(ctx: Any, sums: th.Tensor, views: th.Tensor, places: Places, n_codes: int, n_ways: int) -> th.Tensor:
+        ctx.views, ctx.places = views, places
+        table = sums.new_zeros((n_codes, n_ways, sums.shape[1]))
+        _scatter(_flat(views), _flat(_places_last(sums)), _flat(table), *places[1:], views.shape[1], *table.shape[1:])
+        return table
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[Any, ...]:
+        return _Gathered.apply(gradients[0], ctx.views, ctx.places), None, None, None, None
+
+
+def _places_last(sums: th.Tensor) -> th.Tensor:
+    """(K, W, *size) with W moved to the end, where it is in memory."""
+    return sums.movedim(1, -1)
+
+
+def _flat(tensor: th.Tensor) -> npt.NDArray[Any]:
+    return tensor.detach().contiguous().numpy().reshape(-1)
+
+
+# --- kernels ----------------------------------------------------------------------------------------------------------
+# Arrays are flat and indices unsigned: numba then leaves out looking for negative indices, and loops become vectors.
+
+
+@njit(cache=True, nogil=True)
+def _mark(views: npt.NDArray[Any], seen: npt.NDArray[np.bool_]) -> None:
+    for code in views.flat:
+        seen[code] = True
+
+
+@njit(cache=True, nogil=True)
+def _gather(
+    views: Ints, table: Floats, sums: Floats, first: Ints, tile: Ints, way: Ints, n_tiles: int, n_ways: int, width: int
+) -> None:
+    """Write every place's sum, two tiles at a time."""
+    u = np.uint64
+    size, to = u(width), u(0)
+    for view in range(views.size // n_tiles):
+        base = u(view) * u(n_tiles)
+        for place in range(first.size - 1):
+            j, end = u(first[u(place)]), u(first[u(place) + u(1)])
+            a = (u(views[base + u(tile[j])]) * u(n_ways) + u(way[j])) * size
+            if (end - j) & u(1):
+                for w in range(width):
+                    sums[to + u(w)] = table[a + u(w)]
+                j += u(1)
+            else:
+                b = (u(views[base + u(tile[j + u(1)])]) * u(n_ways) + u(way[j + u(1)])) * size
+                for w in range(width):
+                    sums[to + u(w)] = table[a + u(w)] + table[b + u(w)]
+                j += u(2)
+            while j < end:
+                a = (u(views[base + u(tile[j])]) * u(n_ways) + u(way[j])) * size
+                b = (u(views[base + u(tile[j + u(1)])]) * u(n_ways) + u(way[j + u(1)])) * size
+                for w in range(width):
+                    sums[to + u(w)] += table[a + u(w)] + table[b + u(w)]
+                j += u(2)
+            to += size
+
+
+@njit(cache=True, nogil=True)
+def _scatter(
+    views: Ints, sums: Floats, table: Floats, first: Ints, tile: Ints, way: Ints, n_tiles: int, n_ways: int, width: int
+) -> None:
+    """Add every place's numbers to the rows of the table that it took."""
+    u = np.uint64
+    size, source = u(width), u(0)
+    for view in range(views.size // n_tiles):
+        base = u(view) * u(n_tiles)
+        for place in range(first.size - 1):
+            for j in range(first[u(place)], first[u(place) + u(1)]):
+                to = (u(views[base + u(tile[u(j)])]) * u(n_ways) + u(way[u(j)])) * size
+                for w in range(width):
+                    table[to + u(w)] += sums[source + u(w)]
+            source += size

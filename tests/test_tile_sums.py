@@ -1,0 +1,107 @@
+"""First layers over tile codes by looking up: equal to the layers over pixels, and so are all gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from hecogrid_envs import make_vec_env
+from sb3_saf import LightEncoder, PaperCNN
+from sb3_saf.common.encoders import PixelInput
+from sb3_saf.common.networks import Tanh, mlp
+from sb3_saf.common.tile_sums import (
+    Places,
+    places_of_convolution,
+    places_of_linear,
+    sum_tiles,
+    table_of_convolution,
+    used_codes,
+)
+
+N_CODES = 11
+
+
+def _views(rows: int, columns: int, n_views: int = 5) -> th.Tensor:
+    return th.from_numpy(np.random.default_rng(0).integers(0, N_CODES, (n_views, rows * columns)))
+
+
+def _pixels(views: th.Tensor, tiles: th.Tensor, rows: int, columns: int) -> th.Tensor:
+    """(K, C, rows * t, columns * t) pictures of codes, put together tile by tile."""
+    of_tiles = tiles[views].unflatten(1, (rows, columns))
+    return th.cat([th.cat(list(row.unbind(1)), dim=3) for row in of_tiles.unbind(1)], dim=2)
+
+
+@pytest.mark.parametrize(
+    ("tile", "kernel", "stride"),
+    [(4, 4, 2), (4, 3, 2), (4, 2, 2), (4, 8, 4), (4, 4, 4), (4, 1, 4), (6, 5, 3), (2, 7, 2), (3, 3, 1), (4, 5, 1)],
+)
+def test_a_convolution_by_looking_up_is_the_convolution(tile: int, kernel: int, stride: int) -> None:
+    rows, columns = 4, 5
+    tiles = th.randn(N_CODES, 3, tile, tile, dtype=th.float64)
+    weight = th.randn(6, 3, kernel, kernel, dtype=th.float64)
+    views = _views(rows, columns)
+    used = used_codes(views)
+    places = places_of_convolution(rows, columns, tile, kernel, stride)
+    looked_up = sum_tiles(used.views, table_of_convolution(tiles[used.codes], weight, stride), places)
+    expected = nn.functional.conv2d(_pixels(views, tiles, rows, columns), weight, stride=stride)
+    assert looked_up.shape == expected.shape
+    th.testing.assert_close(looked_up, expected)
+
+
+def _some_places() -> list[Places]:
+    return [places_of_linear(6), places_of_convolution(2, 3, tile=4, kernel=4, stride=2)]
+
+
+@pytest.mark.parametrize("places", _some_places(), ids=["linear", "convolution"])
+def test_gradients_of_any_order(places: Places) -> None:
+    views = used_codes(_views(2, 3, n_views=3)).views
+    table = th.randn(int(views.max()) + 1, int(places.way.max()) + 1, 2, dtype=th.float64, requires_grad=True)
+    assert th.autograd.gradcheck(lambda x: sum_tiles(views, x, places), (table,))
+    # What is linear has no second derivative of its own: square it.
+    assert th.autograd.gradgradcheck(lambda x: sum_tiles(views, x, places) ** 2, (table,))
+
+
+def test_codes_that_occur() -> None:
+    used = used_codes(th.tensor([[7.0, 3.0], [3.0, 200.0]]))
+    assert used.codes.tolist() == [3, 7, 200]
+    assert used.views.tolist() == [[1, 0], [0, 2]]
+    assert used_codes(th.zeros((0, 4), dtype=th.uint8)).views.shape == (0, 4)
+
+
+@pytest.mark.parametrize("encoder_class", [LightEncoder, PaperCNN])
+@pytest.mark.parametrize("params", [{}, {"view_size": 5}, {"view_tile_size": 8}, {"view_tile_size": 5}], ids=str)
+def test_encoders_by_looking_up_and_by_pixels(
+    encoder_class: type[LightEncoder | PaperCNN], params: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = make_vec_env("KeyForTreasure", 1, seed=0, observation="tiles", **params).observation_space
+    assert isinstance(space, spaces.Box)
+    space.seed(1)
+    codes = th.tensor(np.stack([space.sample() for _ in range(20)]))
+    encoder = encoder_class(space)
+    results = []
+    for looks_up in (True, False):
+        monkeypatch.setattr(PixelInput, "looks_up", lambda self, observations, answer=looks_up: answer)
+        encoder.zero_grad()
+        features = encoder(codes)
+        features.square().sum().backward()
+        results.append([features.detach(), *(weight.grad for weight in encoder.parameters())])
+    for found, expected in zip(*results, strict=True):
+        th.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_tanh_is_tanh() -> None:
+    x = th.cat([th.linspace(-20, 20, 1001), th.tensor([0.0, -0.0, 1e-6, 1e30, -1e30])]).requires_grad_()
+    y = Tanh()(x)
+    assert (y - x.tanh()).abs().max() < 2.5e-7
+    gradient, expected = (th.autograd.grad(z.sum(), x, create_graph=True)[0] for z in (y, x.tanh()))
+    th.testing.assert_close(gradient, expected, rtol=0, atol=1e-6)
+    second, expected = (th.autograd.grad(z.sum(), x)[0] for z in (gradient, expected))
+    th.testing.assert_close(second, expected, rtol=0, atol=1e-6)
+
+
+def test_networks_take_the_fast_tanh_and_leave_other_activations() -> None:
+    assert type(mlp([2, 3, 1], nn.Tanh)[1]) is Tanh
+    assert type(mlp([2, 3, 1], nn.ReLU)[1]) is nn.ReLU
