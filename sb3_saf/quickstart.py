@@ -26,12 +26,13 @@ PPO_SETTINGS: dict[str, Any] = {
     "batch_size": 2_000,
     "n_epochs": 4,
     "learning_rate": 7e-4,
+    "gae_lambda": 0.9,
     "ent_coef": 0.01,
     "max_grad_norm": 9.0,
     "rollout_buffer_class": TeamRolloutBuffer,
     "policy_kwargs": {"features_extractor_class": LightEncoder},
 }
-N_GAMES = 64
+N_GAMES = 16
 #: Evaluation games are seeded apart from training's.
 EVALUATION_SEED = 10_000
 N_EPISODES = 64
@@ -60,7 +61,7 @@ def parse(arguments: list[str] | None = None) -> Options:
     parser.add_argument("--task", choices=TASK_NAMES, default="TeamSupport")
     parser.add_argument("--coordination", type=int, default=2, help="agents that one treasure needs")
     parser.add_argument("--heterogeneity", type=int, default=1, help="zones with different dynamics")
-    parser.add_argument("--game-steps", type=int, default=200_000, help="steps of the game, not of its agents")
+    parser.add_argument("--game-steps", type=int, default=100_000, help="steps of the game, not of its agents")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"))
     parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")

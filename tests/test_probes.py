@@ -189,7 +189,7 @@ def test_delayed_reward(name: str) -> None:
     policy = train(name, probe, n_updates=35)
     for time, discount in enumerate((0.729, 0.81, 0.9, 1.0)):
         expected = discount * probe.contexts()[:, :, 0]
-        np.testing.assert_allclose(values_of(policy, probe, time), expected, atol=0.08)
+        np.testing.assert_allclose(values_of(policy, probe, time), expected, atol=0.12)  # gamma 1 would be 0.27 off
 
 
 # --- actions ----------------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
@@ -74,7 +76,7 @@ def test_codes_that_occur() -> None:
 @pytest.mark.parametrize("encoder_class", [LightEncoder, PaperCNN])
 @pytest.mark.parametrize("params", [{}, {"view_size": 5}, {"view_tile_size": 8}, {"view_tile_size": 5}], ids=str)
 def test_encoders_by_looking_up_and_by_pixels(
-    encoder_class: type[LightEncoder | PaperCNN], params: dict[str, int], monkeypatch: pytest.MonkeyPatch
+    encoder_class: type[LightEncoder | PaperCNN], params: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = make_vec_env("KeyForTreasure", 1, seed=0, observation="tiles", **params).observation_space
     assert isinstance(space, spaces.Box)
