@@ -20,12 +20,6 @@ _OTHER_WAYS: Final = (
     'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
 )
 
-#: How long a display may take to answer.
-_DISPLAY_SECONDS: Final = 15.0
-_OTHER_WAYS: Final = (
-    'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
-)
-
 
 class HumanWindow:
     """
