@@ -44,12 +44,14 @@ class Baseline(NamedTuple):
     :param distribution: the package to install
     :param make: makes and resets it
     :param isolated: whether it needs an interpreter of its own
+    :param module: what has to be there to be imported, if not a module of the package's name
     """
 
     title: str
     distribution: str
     make: Callable[[], Stepper]
     isolated: bool = False
+    module: str | None = None
 
 
 class LastSeen:
@@ -229,7 +231,7 @@ def trash_pickup() -> Stepper:
 
 
 BASELINES: dict[str, Baseline] = {
-    "pursuit": Baseline("PettingZoo SISL pursuit, 10 pursuers, 16 x 16", "pettingzoo", pursuit),
+    "pursuit": Baseline("PettingZoo SISL pursuit, 10 pursuers, 16 x 16", "pettingzoo", pursuit, module="pygame"),
     "minigrid": Baseline("MiniGrid, 1 agent, rgb partial, 4 px", "minigrid", minigrid),
     "foraging": Baseline("LBF, 10 players, 30 x 30", "lbforaging", foraging),
     "pogema": Baseline("POGEMA, 10 agents, 30 x 30, 7 x 7 views", "pogema", pogema, isolated=True),

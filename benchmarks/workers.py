@@ -48,11 +48,9 @@ def is_installed(name: str) -> bool:
     :param name: key of ``BASELINES``
     """
     baseline = BASELINES[name]
-    return (
-        (interpreter(name).parents[1] / ".installed").exists()
-        if baseline.isolated
-        else find_spec(baseline.distribution) is not None
-    )
+    if baseline.isolated:
+        return (interpreter(name).parents[1] / ".installed").exists()
+    return find_spec(baseline.module or baseline.distribution) is not None
 
 
 class Worker:
