@@ -89,7 +89,7 @@ def test_baselines_that_are_not_installed_are_left_out(
 
 def test_rates_are_steps_over_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 0.0, 1.0, 2.0, 2.0])
-    monkeypatch.setattr(rates.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr("benchmarks.rates.time.perf_counter", lambda: next(clock))
     assert rates.rate(lambda: 10, seconds=2.0) == 10.0
 
 
