@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
@@ -25,8 +26,10 @@ def bytes_per_row(observation: str) -> tuple[float, float, float]:
     """
     env = make_team_env("TeamSupport", n_envs=N_GAMES, seed=0, observation=observation)
     rows = env.num_envs
-    ours = TeamRolloutBuffer(N_STEPS, env.observation_space, env.action_space, "cpu", n_envs=rows)
-    stock = DictRolloutBuffer(N_STEPS, env.observation_space, env.action_space, "cpu", n_envs=rows)
+    space = env.observation_space
+    assert isinstance(space, spaces.Dict)
+    ours = TeamRolloutBuffer(N_STEPS, space, env.action_space, "cpu", n_envs=rows)
+    stock = DictRolloutBuffer(N_STEPS, space, env.action_space, "cpu", n_envs=rows)
     env.close()
     views = sum(array.nbytes for array in ours.observations.values())
     # Untouched zeros: they are counted without taking memory.
