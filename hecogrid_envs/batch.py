@@ -12,13 +12,13 @@ from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS,
 from hecogrid_envs.core import announce_compilation
 from hecogrid_envs.core.generation import clear, draw_level
 from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
-from hecogrid_envs.core.sharing import PICTURES, RESET, STEP, TILES, Pictures
+from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Workspace
 from hecogrid_envs.core.types import Games, RuleBook
 from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, TASK_NAMES, HECOGridParams, TaskName, check_task
 from hecogrid_envs.seeding import fresh_seed, generator_word
 from hecogrid_envs.state import StateMapping, check_state
-from hecogrid_envs.threads import Shares
+from hecogrid_envs.threads import NOTHING, Shares
 from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
 
 U8 = npt.NDArray[np.uint8]
@@ -52,24 +52,29 @@ class GameBatch:
         self._book = _rule_book(self.task, params)
         self._games = _empty_games(self._book, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
+        self._begun = False
         n, v, pixels = params.n_agents, params.view_size, params.view_pixels
         tiles = params.observation == "tiles"
-        self._observe_task = TILES if tiles else PICTURES
+        self._view_task = TILES if tiles else PICTURES
         self._view_shape = (n, v, v) if tiles else (n, pixels, pixels, 3)
+        self._actions = np.zeros((self.n_games, n), dtype=np.uint8)
+        self._fresh = np.zeros(self.n_games, dtype=bool)
         self._codes = np.zeros((self.n_games, n, v, v), dtype=np.uint8)
         self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(_SLACK, dtype=np.uint8)])
         self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
         self._shares = self._new_shares()
 
     def _new_shares(self) -> Shares:
-        pictures = Pictures(
+        work = Workspace(
+            actions=self._actions.reshape(-1),
+            fresh=self._fresh.view(np.uint8),
             codes=self._codes.reshape(-1),
             facing=self._games.direction.reshape(-1),
             atlas=self._atlas,
             turn_bytes=self._turn_bytes,
             tile=self.params.view_tile_size,
         )
-        return Shares(self._games, self._book, pictures, self.n_threads)
+        return Shares(self._games, self._book, work, self.n_threads)
 
     def __getstate__(self) -> dict[str, Any]:
         # Threads and compiled code stay with the process; a copy makes its own.
@@ -91,7 +96,8 @@ class GameBatch:
             raise ValueError(f"which must have shape ({self.n_games},), one per game, got {chosen.shape}")
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
-        self._shares.play(RESET, chosen.astype(np.uint8))
+        self._fresh[...] = chosen
+        self._shares.play(RESET)
 
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:
@@ -103,14 +109,12 @@ class GameBatch:
 
     def step(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         """
-        Play one game step everywhere.
+        Play one game step everywhere; games whose time is up stay where they are until :meth:`reset`.
 
         :param actions: (E, N) integers from 0 to 6
         """
-        chosen = np.ascontiguousarray(actions, dtype=np.uint8)
-        if chosen.shape != self._games.x.shape:
-            raise ValueError(f"actions must have shape {self._games.x.shape}, (games, agents), got {chosen.shape}")
-        self._shares.play(STEP, chosen.reshape(-1))
+        self._take(actions)
+        self._shares.play(STEP)
 
     def observe(self, out: U8 | None = None) -> U8:
         """
@@ -119,13 +123,55 @@ class GameBatch:
         :param out: contiguous array to write to; a new one by default
         :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
         """
-        shape = (self.n_games, *self._view_shape)
-        if out is None:
-            out = np.empty(shape, dtype=np.uint8)
-        elif out.shape != shape or out.dtype != np.uint8 or not out.flags.c_contiguous:
-            raise ValueError(f"out must be a contiguous uint8 array of shape {shape}, got {out.dtype} {out.shape}")
-        self._shares.play(self._observe_task, out.reshape(-1))
+        out = self._array_for_views("out", out)
+        self._shares.play(self._view_task, out.reshape(-1))
         return out
+
+    def advance(
+        self, actions: npt.NDArray[np.integer[Any]], out: U8 | None = None, last: U8 | None = None
+    ) -> tuple[U8, npt.NDArray[np.bool_]]:
+        """
+        Play one game step everywhere, give games that are over a new level, and observe: :meth:`step`,
+        ``reset(truncated)`` and :meth:`observe` in one compiled call, which threads share once.
+
+        :attr:`rewards` are those of the step, also where a new episode has begun.
+
+        :param actions: (E, N) integers from 0 to 6
+        :param out: contiguous array to write views to; a new one by default
+        :param last: contiguous array of the same shape, to which the last views of games that are over are written, at
+            their place; the rest of it stays as it is. By default they are not made
+        :return: views as of :meth:`observe`, and (E,) whether the step was the last of an episode
+        """
+        self._take(actions)
+        out = self._array_for_views("out", out)
+        last_views = NOTHING if last is None else self._array_for_views("last", last).reshape(-1)
+        self._shares.play(STEP | RESTART | self._view_task, out.reshape(-1), last_views)
+        return out, self._fresh.copy()
+
+    def _take(self, actions: npt.NDArray[np.integer[Any]]) -> None:
+        """Check and keep the actions of a step."""
+        actions = np.asarray(actions)
+        if actions.shape != self._actions.shape:
+            raise ValueError(f"actions must have shape {self._actions.shape}, (games, agents), got {actions.shape}")
+        if not self._begun:
+            self._check_begun()
+        self._actions[...] = actions
+
+    def _check_begun(self) -> None:
+        if not self._seeded.all():
+            game = int(np.flatnonzero(~self._seeded)[0])
+            raise ValueError(f"game {game} has not begun: call reset() before a step")
+        self._begun = True
+
+    def _array_for_views(self, name: str, given: U8 | None) -> U8:
+        shape = (self.n_games, *self._view_shape)
+        if given is None:
+            return np.empty(shape, dtype=np.uint8)
+        if given.shape != shape or given.dtype != np.uint8 or not given.flags.c_contiguous:
+            raise ValueError(
+                f"{name} must be a contiguous uint8 array of shape {shape}, got {given.dtype} {given.shape}"
+            )
+        return given
 
     def observe_game(self, game: int) -> U8:
         """
@@ -133,8 +179,8 @@ class GameBatch:
 
         :return: as :meth:`observe` without its first axis
         """
-        self._shares.play_game(TILES, self._codes.reshape(-1), game)
-        if self._observe_task == TILES:
+        self._shares.play_game(TILES, game, self._codes.reshape(-1))
+        if self._view_task == TILES:
             return self._codes[game].copy()
         out = np.empty(self._view_shape, dtype=np.uint8)
         self._shares.draw(self._codes[game].reshape(-1), self._games.direction[game], out.reshape(-1))
@@ -195,6 +241,7 @@ class GameBatch:
         """
         state = check_state(mapping, self.params)
         games, width = self._games, self.params.grid_size
+        self._seed(game, None)
         clear(games, self._book, game)
         terrain = np.zeros((width, width), dtype=np.uint8)
         terrain[state["walls"]] = Terrain.WALL
@@ -236,6 +283,7 @@ class GameBatch:
                 )
         for name, array in own.items():
             array[...] = snapshot[name]
+        self._begun = False  # looked up at the next step
 
     def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:
         """
@@ -243,7 +291,7 @@ class GameBatch:
 
         :return: (N, W, H)
         """
-        self._shares.play_game(TILES, self._codes.reshape(-1), game)
+        self._shares.play_game(TILES, game, self._codes.reshape(-1))
         state = self.get_state(game)
         return seen_cells(
             self._codes[game] != INVISIBLE,

@@ -10,13 +10,13 @@ from hecogrid_envs.core.types import U8, Games, RuleBook
 
 
 @hot
-def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int) -> None:
+def step_games(games: Games, book: RuleBook, actions: U8, first: int, end: int) -> None:
     """
-    Play one step of games ``first`` to ``last - 1``.
+    Play one step of games ``first`` to ``end - 1``.
 
     :param actions: (E * N,) action integers, 0 to 6
     """
-    for e in range(first, last):
+    for e in range(first, end):
         if book.random_order:
             _shuffle_order(games, book, e)
         games.paid[e] = 0
@@ -28,15 +28,23 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int)
 
 
 @kernel
-def reset_games(games: Games, book: RuleBook, which: U8, first: int, last: int) -> None:
+def reset_games(games: Games, book: RuleBook, which: U8, first: int, end: int) -> None:
     """
     Give new levels to the games that ``which`` marks.
 
     :param which: (E,) 0 or 1
     """
-    for e in range(first, last):
+    for e in range(first, end):
         if which[e]:
             new_level(games, book, e)
+
+
+@kernel
+def restart_game(games: Games, book: RuleBook, e: int) -> None:
+    """Give a game that is over a new level; what its last step paid is still to be read."""
+    paid = games.paid[e]
+    new_level(games, book, e)
+    games.paid[e] = paid
 
 
 @inlined
