@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain, TreasureState
+from hecogrid_envs.arrays import SLACK, aligned, empty_games, rule_book
+from hecogrid_envs.constants import Terrain, TreasureState
 from hecogrid_envs.core import announce_compilation
 from hecogrid_envs.core.generation import clear, draw_level
-from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
+from hecogrid_envs.core.occupancy import arrive
 from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Workspace
-from hecogrid_envs.core.types import Games, RuleBook
 from hecogrid_envs.fields_of_view import seen_cells
-from hecogrid_envs.params import MAX_CODED_TILE_SIZE, TASK_NAMES, HECOGridParams, TaskName, check_task
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName, check_task
 from hecogrid_envs.seeding import fresh_seed, generator_word
 from hecogrid_envs.state import StateMapping, check_state
 from hecogrid_envs.threads import NOTHING, Shares
-from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
+from hecogrid_envs.tiles import INVISIBLE, turned_atlases
 
 U8 = npt.NDArray[np.uint8]
-
-#: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
-_SLACK: Final = 64
-
-#: Views of so many columns are lit by a table.
-_TABLED_COLUMNS: Final = 8
 
 
 class GameBatch:
@@ -49,18 +43,18 @@ class GameBatch:
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)
         atlases = turned_atlases(self.task, params.rules, params.view_tile_size)
-        self._book = _rule_book(self.task, params)
-        self._games = _empty_games(self._book, self.n_games)
+        self._book = rule_book(self.task, params)
+        self._games = empty_games(self._book, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
         self._begun = False
         n, v, pixels = params.n_agents, params.view_size, params.view_pixels
         tiles = params.observation == "tiles"
         self._view_task = TILES if tiles else PICTURES
         self._view_shape = (n, v, v) if tiles else (n, pixels, pixels, 3)
-        self._actions = np.zeros((self.n_games, n), dtype=np.uint8)
-        self._fresh = np.zeros(self.n_games, dtype=bool)
-        self._codes = np.zeros((self.n_games, n, v, v), dtype=np.uint8)
-        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(_SLACK, dtype=np.uint8)])
+        self._actions = aligned((self.n_games, n), np.uint8)
+        self._fresh = aligned(self.n_games, np.bool_)
+        self._codes = aligned((self.n_games, n, v, v), np.uint8)
+        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)])
         self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
         self._shares = self._new_shares()
 
@@ -306,94 +300,3 @@ def _positive(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
-
-
-def _rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
-    view, offset = params.view_size, params.view_offset
-    pad = max(view - 1 - offset, offset, view // 2)
-    stride = params.grid_size + 2 * pad
-    zone_of_column = params.zone_of_column()
-    n_zones = int(zone_of_column.max()) + 1
-    released = params.rules == "released"
-    spread = [sum(0xFF << (8 * i) for i in range(8) if bits >> i & 1) for bits in range(256)]
-    book = RuleBook(
-        task=TASK_NAMES.index(task),
-        released=released,
-        random_order=params.agent_order == "random",
-        n_agents=params.n_agents,
-        width=params.grid_size,
-        coordination=params.coordination,
-        support_radius=params.support_radius,
-        n_treasures=params.n_treasures,
-        n_clutter=params.n_clutter,
-        n_keys=params.n_keys if task == "KeyForTreasure" else 0,
-        max_cycles=params.max_cycles,
-        view_size=view,
-        view_offset=offset,
-        stride=stride,
-        pad=pad,
-        plane_bytes=stride * stride + _SLACK,
-        bits_bytes=(stride * stride + 7) // 8 + _SLACK,
-        zone_of_column=zone_of_column.astype(np.int32),
-        command_of=params.command_of(),
-        zone_colour=(np.arange(n_zones) % len(ZONE_COLOURS)).astype(np.uint8),
-        key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
-        first_colour=BLUE_INDEX,
-        blank_planes=np.zeros(0, dtype=np.uint8),
-        blank_bits=np.zeros(0, dtype=np.uint8),
-        spread=np.array(spread, dtype=np.uint64),
-        swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
-    )
-    return _with_blank_map(book)
-
-
-def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
-    """The table that :class:`~hecogrid_envs.core.types.RuleBook` calls ``swept``."""
-    cells, own = 1 << size, size // 2
-    clear, seen = np.divmod(np.arange(cells * cells), cells)
-    following = np.zeros_like(seen)
-    for column, towards in [(i, i + 1) for i in range(own, size)] + [(i, i - 1) for i in range(own + 1, 0, -1)]:
-        lights = (seen & clear) >> column & 1
-        seen |= lights << towards
-        following |= lights << column | lights << towards
-    return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
-
-
-def _with_blank_map(book: RuleBook) -> RuleBook:
-    """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
-    planes = np.full((4, book.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
-    book = book._replace(blank_bits=np.zeros(4 * book.bits_bytes, dtype=np.uint8))
-    bits = _empty_games(book, 1)._replace(wall_bits=book.blank_bits)
-    for i in range(book.width):
-        for x, y in ((i, 0), (i, book.width - 1), (0, i), (book.width - 1, i)):
-            set_wall_bits(bits, book, 0, x, y)
-            for facing in range(4):
-                planes[facing, plane_offset(book, facing, x, y)] = FIRST_TERRAIN + Terrain.WALL
-    return book._replace(blank_planes=planes.reshape(-1))
-
-
-def _empty_games(book: RuleBook, n_games: int) -> Games:
-    agents, cells = (n_games, book.n_agents), (n_games, book.width * book.width)
-    order = np.tile(np.arange(book.n_agents, dtype=np.int32), (n_games, 1))
-    return Games(
-        rng=np.zeros(n_games, dtype=np.uint64),
-        terrain=np.zeros(cells, dtype=np.uint8),
-        head=np.full(cells, -1, dtype=np.int16),
-        tail=np.full(cells, -1, dtype=np.int16),
-        crowd=np.zeros(cells, dtype=np.int16),
-        after=np.full(agents, -1, dtype=np.int16),
-        before=np.full(agents, -1, dtype=np.int16),
-        x=np.ones(agents, dtype=np.int32),
-        y=np.ones(agents, dtype=np.int32),
-        direction=np.zeros(agents, dtype=np.uint8),
-        has_key=np.zeros(agents, dtype=np.uint8),
-        colour=np.zeros(agents, dtype=np.uint8),
-        order=order,
-        sight=np.zeros(n_games * book.n_agents * book.view_size, dtype=np.uint64),
-        sight_known=np.zeros(agents, dtype=np.uint8),
-        planes=np.zeros(n_games * 4 * book.plane_bytes, dtype=np.uint8),
-        wall_bits=np.zeros(n_games * 4 * book.bits_bytes, dtype=np.uint8),
-        steps=np.zeros(n_games, dtype=np.int32),
-        collected=np.zeros(n_games, dtype=np.int32),
-        paid=np.zeros(n_games, dtype=np.int32),
-    )

@@ -27,6 +27,17 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, end: int) 
         games.steps[e] += 1
 
 
+@hot
+def mark_games_over(games: Games, book: RuleBook, over: U8, first: int, end: int) -> None:
+    """
+    Find games whose time is up.
+
+    :param over: (E,) 1 to write for them, 0 for others
+    """
+    for e in range(first, end):
+        over[e] = games.steps[e] >= book.max_cycles
+
+
 @kernel
 def reset_games(games: Games, book: RuleBook, which: U8, first: int, end: int) -> None:
     """

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared
-from hecogrid_envs.core.batch_step import reset_games, restart_game, step_games
+from hecogrid_envs.core.batch_step import mark_games_over, reset_games, restart_game, step_games
 from hecogrid_envs.core.jit import hot, kernel
 from hecogrid_envs.core.types import U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures, observe_tiles
@@ -69,8 +69,8 @@ def play_share(
     if task & STEP:
         step_games(games, book, work.actions, first, end)
     if task & RESTART:
+        mark_games_over(games, book, work.fresh, first, end)
         for e in range(first, end):
-            work.fresh[e] = games.steps[e] >= book.max_cycles
             if work.fresh[e]:
                 if len(last_views):
                     _observe(games, book, work, task, last_views, e, e + 1)
