@@ -103,7 +103,7 @@ class GameBatch:
 
     def step(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         """
-        Play one game step everywhere; games whose time is up stay where they are until :meth:`reset`.
+        Play one game step everywhere; games that are over play on until :meth:`reset`.
 
         :param actions: (E, N) integers from 0 to 6
         """
@@ -135,6 +135,7 @@ class GameBatch:
         :param last: contiguous array of the same shape, to which the last views of games that are over are written, at
             their place; the rest of it stays as it is. By default they are not made
         :return: views as of :meth:`observe`, and (E,) whether the step was the last of an episode
+        :raises ValueError: for actions or arrays that do not fit, or a game that has not begun
         """
         self._take(actions)
         out = self._array_for_views("out", out)

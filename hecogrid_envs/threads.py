@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from hecogrid_envs.arrays import aligned
 from hecogrid_envs.core.jit import entry_point
 from hecogrid_envs.core.sharing import (
     DESK_PART,
@@ -56,7 +57,7 @@ class Helpers:
         self.process = os.getpid()
         self._arguments = arguments
         self._own = own
-        self._desk = np.zeros(DESK_PART * (1 + len(shares)), dtype=np.int64)
+        self._desk = aligned(DESK_PART * (1 + len(shares)), np.int64)
         self._bells = [threading.Semaphore(0) for _ in shares]
         #: Arrays of the task on the desk, which stay where they are until it is done.
         self._posted: tuple[U8, U8] | None = None

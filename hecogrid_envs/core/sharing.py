@@ -21,7 +21,7 @@ TILES: Final = 8
 PICTURES: Final = 16
 _LEAVE: Final = 32
 
-#: Numbers of the desk, over which the calling thread and its helpers talk.
+#: Numbers of the desk, over which the calling thread and its helpers talk; arrays are an address and a length.
 _TICKET: Final = 0
 _TASK: Final = 1
 _VIEWS: Final = 2
