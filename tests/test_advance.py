@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,11 @@ def batch_of(n_threads: int = 1, **params: Any) -> GameBatch:
 @pytest.mark.parametrize("rules", ["paper", "released"])
 @pytest.mark.parametrize("observation", ["rgb", "tiles"])
 def test_one_call_does_what_three_do(observation: str, rules: str, n_threads: int) -> None:
-    params = {"observation": observation, "rules": rules, "coordination": 1}
+    params: dict[str, Any] = {"observation": observation, "rules": rules, "coordination": 1}
     apart, at_once = batch_of(1, **params), batch_of(n_threads, **params)
     out, last = apart.observe(), np.full_like(apart.observe(), 77)
-    n_over, paid = [], 0.0
+    n_over: list[int] = []
+    paid = 0.0
     for actions in np.random.default_rng(0).choice(7, size=(40, N_GAMES, 5), p=[0.1, 0.1, 0.4, 0.3, 0.1, 0, 0]):
         apart.step(actions)
         before, rewards, ended = apart.observe(), apart.rewards, apart.truncated
@@ -75,7 +77,8 @@ def test_games_that_have_not_begun_do_not_step() -> None:
     batch = GameBatch("TeamSupport", HECOGridParams(**SMALL), 2)
     nobody_began = batch.snapshot()
     batch.reset(np.array([True, False]))
-    for step in (batch.step, batch.advance):
+    steps: list[Callable[..., object]] = [batch.step, batch.advance]
+    for step in steps:
         with pytest.raises(ValueError, match=r"game 1 has not begun: call reset\(\) before a step"):
             step(np.zeros((2, 5), dtype=np.uint8))
     batch.reset()
@@ -104,7 +107,8 @@ def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) 
     venv.reset()
     for env, seed in zip(twins, game_seeds(4, 3), strict=True):
         env.reset(seed=seed)
-    rng, ends = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    ends: list[tuple[int, int]] = []
     for step in range(30):
         if step == 4:
             venv.games[1].reset(seed=9)
