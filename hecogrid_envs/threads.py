@@ -86,6 +86,7 @@ class Helpers:
         :param task: see :func:`~hecogrid_envs.core.sharing.play_share`, as the arrays
         """
         if self._posted is not None:  # an interrupt came between the last task and its end
+            self._ring()
             self._wait_on()
         self._posted = views, last_views
         if self._post(self._desk, task, views, last_views):
