@@ -9,6 +9,7 @@ JOBS ?= 2
 VENV = .venv
 RUN = $(VENV)/bin/python -m
 INSTALLED = $(VENV)/.installed
+BASELINES = $(VENV)/.baselines
 
 .PHONY: help install train test bench docs notebooks check format-check lint types format clean distclean
 
@@ -30,7 +31,7 @@ check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, noteboo
 	@$(MAKE) --no-print-directory notebooks
 	@$(MAKE) --no-print-directory test
 
-bench: $(INSTALLED) ## measure speed, side by side; writes benchmarks/results.md
+bench: $(INSTALLED) $(BASELINES) ## measure speed beside other gridworlds; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
 
 docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors, and check their links
@@ -70,6 +71,14 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV)
 	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
 	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,notebooks,dev]'
+	@touch $@
+
+# What cannot be installed is left out of the benchmarks, which say so.
+$(BASELINES): $(INSTALLED) benchmarks/install_baselines.py
+	@echo "== install other gridworlds into $(VENV)"
+	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[bench]' || \
+	    echo "The extra [bench] could not be installed." >&2
+	@$(RUN) benchmarks.install_baselines
 	@touch $@
 
 clean: ## remove caches and what was built

@@ -1,45 +1,40 @@
 """
-Speed of the HECOGrid environments on one core, beside a memory copy and, where installed, other gridworlds.
+Speed of the HECOGrid environments on one core, beside a memory copy and the gridworlds of others that are installed;
+seconds to the first step; memory of a rollout.
 
-``python -m benchmarks.environments`` prints a table and writes it to ``benchmarks/results.md``. Medians and spread
+``python -m benchmarks.environments`` prints tables and writes them to ``benchmarks/results.md``. Medians and spread
 over rounds in which all rows take turns, so that a machine whose speed drifts does so for all of them. 128 games of 10
-agents on a 30 x 30 grid, 100 treasures, random actions, resets included, unless a row says otherwise.
+agents on a 30 x 30 grid, 100 treasures, random actions, resets included, unless a row says otherwise;
+:mod:`benchmarks.baselines` says with what the others are made.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import platform
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 import sb3_saf
+from benchmarks.baselines import BASELINES
+from benchmarks.first_call import first_call_table
+from benchmarks.rates import Rate, Work, one_line, random_actions, rate, table, take_turns
+from benchmarks.rollout_memory import memory_table
+from benchmarks.workers import Worker
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds, make_vec_env, parallel_env
 
 N_GAMES = 128
 ROUNDS = 7
 SECONDS = 0.3
 RESULTS = Path(__file__).parent / "results.md"
-
-#: Does some work and says how many agent-steps it was.
-Work = Callable[[], int]
-
-
-class Row(NamedTuple):
-    """One line of the table: agent-steps per second of every round."""
-
-    name: str
-    rates: list[float]
-
-    @property
-    def median(self) -> float:
-        """Median over rounds."""
-        return float(np.median(self.rates))
+COPY = "copy"
 
 
 def batch_work(task: str, observation: str, n_threads: int = 1, n_games: int = N_GAMES, **params: Any) -> Work:
@@ -48,7 +43,7 @@ def batch_work(task: str, observation: str, n_threads: int = 1, n_games: int = N
     batch = GameBatch(task, all_params, n_games, n_threads)
     batch.reset(seeds=game_seeds(0, n_games))
     out = batch.observe()
-    actions = _actions((64, n_games, all_params.n_agents))
+    actions = random_actions((64, n_games, all_params.n_agents))
 
     def work() -> int:
         batch.advance(next(actions), out)
@@ -60,7 +55,7 @@ def batch_work(task: str, observation: str, n_threads: int = 1, n_games: int = N
 def vec_env_work(venv: Any) -> Work:
     """Step an SB3 VecEnv."""
     venv.reset()
-    actions = _actions((64, venv.num_envs))
+    actions = random_actions((64, venv.num_envs))
 
     def work() -> int:
         venv.step(next(actions))
@@ -73,7 +68,7 @@ def parallel_env_work() -> Work:
     """One PettingZoo game with its dicts."""
     env = parallel_env("TeamSupport")
     env.reset(seed=0)
-    actions = iter(_actions((64, 10)))
+    actions = iter(random_actions((64, 10)))
 
     def work() -> int:
         if not env.agents:
@@ -96,54 +91,8 @@ def copy_work() -> Work:
     return work
 
 
-def pursuit_work() -> Work:
-    """PettingZoo's SISL pursuit, 10 pursuers."""
-    import pettingzoo
-
-    env: Any = pettingzoo.make("parallel", "sisl/pursuit_v5", n_pursuers=10)
-    env.reset(seed=0)
-    actions = _actions((64, 10), n_actions=5)
-
-    def work() -> int:
-        if not env.agents:
-            env.reset()
-        n_agents = len(env.agents)
-        env.step(dict(zip(env.agents, next(actions).tolist()[:n_agents], strict=True)))
-        return n_agents
-
-    return work
-
-
-def minigrid_work() -> Work:
-    """MiniGrid, one agent, rgb partial view with tiles of 4 pixels."""
-    import gymnasium
-    from minigrid.wrappers import RGBImgPartialObsWrapper
-
-    env = RGBImgPartialObsWrapper(gymnasium.make("MiniGrid-FourRooms-v0"), tile_size=4)
-    env.reset(seed=0)
-    actions = _actions((4096,))
-
-    def work() -> int:
-        _, _, terminated, truncated, _ = env.step(int(next(actions)))
-        if terminated or truncated:
-            env.reset()
-        return 1
-
-    return work
-
-
-def _actions(shape: tuple[int, ...], n_actions: int = 7) -> Iterator[Any]:
-    table = np.random.default_rng(0).integers(0, n_actions, size=shape)
-
-    def forever() -> Iterator[Any]:
-        while True:
-            yield from table
-
-    return forever()
-
-
 def programs() -> dict[str, Callable[[], Work]]:
-    """Rows of the table by name; what is not installed is left out when it is made."""
+    """What is ours, and the copy."""
 
     def team_env() -> Any:
         return sb3_saf.make_team_env("TeamSupport", n_envs=N_GAMES, seed=0)
@@ -152,8 +101,8 @@ def programs() -> dict[str, Callable[[], Work]]:
     rows: dict[str, Callable[[], Work]] = {}
     for observation in ("tiles", "rgb"):
         for task in TASK_NAMES:
-            rows[f"batch, {observation}, {task}"] = lambda t=task, o=observation: batch_work(t, o)  # type: ignore[misc]
-    rows |= {
+            rows[f"batch, {observation}, {task}"] = partial(batch_work, task, observation)
+    return rows | {
         "batch, tiles, TeamSupport, two threads": lambda: batch_work("TeamSupport", "tiles", n_threads=2),
         "batch, rgb, TeamSupport, two threads": lambda: batch_work("TeamSupport", "rgb", n_threads=2),
         "batch, tiles, TeamSupport, 1 game, N = 1000, 300 x 300": lambda: batch_work(
@@ -163,60 +112,77 @@ def programs() -> dict[str, Callable[[], Work]]:
         "VecEnv.step, tiles, joint view and monitor": lambda: vec_env_work(team_env()),
         "parallel_env, rgb": parallel_env_work,
         "SuperSuit, 8 games, rgb": lambda: vec_env_work(make_vec_env("TeamSupport", 8, seed=0, backend="supersuit")),
-        "copy of the bytes of rgb views": copy_work,
-        "PettingZoo SISL pursuit, 10 pursuers": pursuit_work,
-        "MiniGrid, rgb partial, 4 px": minigrid_work,
+        f"{COPY} of the bytes of rgb views": copy_work,
     }
-    return rows
 
 
-def measure(seconds: float, rounds: int) -> list[Row]:
-    """Let all rows take turns."""
-    works: dict[str, Work] = {}
-    for name, make in programs().items():
+def start_workers(stack: contextlib.ExitStack) -> dict[str, Worker]:
+    """
+    Start the baselines that are installed, and say which are not.
+
+    :param stack: ends them
+    :return: by their row's title
+    """
+    workers: dict[str, Worker] = {}
+    for name, baseline in BASELINES.items():
         try:
-            works[name] = make()
-        except ImportError as error:
-            print(f"left out: {name} ({error})")
-    for work in works.values():
-        _rate(work, seconds)
-    rates: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(rounds):
-        for name, work in works.items():
-            rates[name].append(_rate(work, seconds))
-    return [Row(name, row) for name, row in rates.items()]
+            worker = stack.enter_context(Worker(name))
+        except (ImportError, RuntimeError) as error:
+            print(f"left out: {baseline.title} ({one_line(error)})", flush=True)
+            continue
+        workers[baseline.title] = worker
+    return workers
 
 
-def _rate(work: Work, seconds: float) -> float:
-    start, done = time.perf_counter(), 0
-    while time.perf_counter() - start < seconds:
-        done += work()
-    return done / (time.perf_counter() - start)
+def speed_table(seconds: float, rounds: int) -> str:
+    """
+    Let all rows take turns.
+
+    :param seconds: per row and round
+    :return: Markdown
+    """
+    with contextlib.ExitStack() as stack:
+        rates: dict[str, Rate] = {name: partial(rate, make()) for name, make in programs().items()}
+        workers = start_workers(stack)
+        rates |= {title: worker.rate for title, worker in workers.items()}
+        found = table(take_turns(rates, seconds, rounds), COPY)
+    versions = {BASELINES[worker.name].distribution: worker.version for worker in workers.values()}
+    return f"{found}\n\nOthers: {', '.join(f'{name} {number}' for name, number in versions.items()) or 'none'}."
 
 
-def table(rows: list[Row]) -> str:
-    """Markdown, every row also as a ratio to the copy of the same run."""
-    copy = next(row.median for row in rows if row.name.startswith("copy"))
-    lines = ["| what | agent-steps/s | lowest - highest | ratio to the copy |", "| --- | --- | --- | --- |"]
-    for row in rows:
-        low, high = min(row.rates), max(row.rates)
-        lines.append(f"| {row.name} | {row.median:,.0f} | {low:,.0f} - {high:,.0f} | {row.median / copy:.4f} |")
-    return "\n".join(lines)
+def machine() -> str:
+    """Processor and versions."""
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numba", "numpy", "torch", "stable-baselines3"))
+    hardware = f"{processor()}, {os.cpu_count()} cores, {platform.machine()}, {platform.system()}"
+    return f"Python {platform.python_version()}, {versions}; {hardware}"
+
+
+def processor() -> str:
+    """Its name, where Linux tells it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown processor"
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=SECONDS, help="per row and round")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--starts", type=int, default=3, help="cold starts, each compiles the kernels")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
-    text = table(measure(options.seconds, options.rounds))
-    versions = ", ".join(f"{name} {version(name)}" for name in ("numba", "numpy", "stable-baselines3", "pettingzoo"))
-    machine = f"Python {platform.python_version()}, {versions}; {platform.machine()}, {platform.system()}"
+    sections = {
+        "Environments": speed_table(options.seconds, options.rounds),
+        "First step": first_call_table(options.starts),
+        "Memory of a rollout, bytes per agent-step": memory_table(),
+    }
+    text = "\n\n".join(f"## {title}\n\n{section}" for title, section in sections.items())
+    head = f"`python -m benchmarks.environments`: medians of {options.rounds} rounds, of {options.starts} starts."
     print(text)
-    head = f"`python -m benchmarks.environments`: medians of {options.rounds} rounds. {machine}."
-    options.output.write_text(f"# Environments\n\n{head}\n\n{text}\n")
+    options.output.write_text(f"# Results\n\n{head} {machine()}.\n\n{text}\n")
 
 
 if __name__ == "__main__":

@@ -136,9 +136,7 @@ def training(algo: str, minutes: float, folder: Path) -> Soak:
         settings.make_env(0, evaluation=True, n_envs=16), n_eval_episodes=16, eval_freq=20_000, verbose=0
     )
     model, memory = settings.make_model(env, 0), MemoryCallback(minutes)
-    sb3_saf.resumable_learn(
-        model, settings.total_timesteps, folder / "checkpoints", [evaluation, memory], every_game_steps=20_000
-    )
+    sb3_saf.resumable_learn(model, 10**12, folder / "checkpoints", [evaluation, memory], every_game_steps=20_000)
     seconds = time.perf_counter() - memory.began
     return Soak(f"training {algo} at small", memory.steps, memory.memory, seconds)
 

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import warnings
 from types import ModuleType, TracebackType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 Picture = npt.NDArray[np.uint8]
+
+#: How long a display may take to answer.
+_DISPLAY_SECONDS: Final = 15.0
+_OTHER_WAYS: Final = (
+    'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
+)
 
 
 class HumanWindow:
@@ -51,7 +59,7 @@ class HumanWindow:
 
         :param picture: (height, width, 3)
         :raises ImportError: if pygame is missing
-        :raises RuntimeError: if there is no display
+        :raises RuntimeError: if there is no display, or none that answers
         """
         if self.closed_by_user:
             return
@@ -124,12 +132,31 @@ def _start_display(pygame: ModuleType) -> None:
 
     Where there is no screen, SDL quietly takes a driver that shows nothing; only who asked for it shall get it.
     """
-    help_text = 'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
+    _wait_for_display()
     try:
         pygame.display.init()
     except pygame.error as error:
-        raise RuntimeError(f"no window can be opened ({error}); {help_text}") from error
+        raise RuntimeError(f"no window can be opened ({error}); {_OTHER_WAYS}") from error
     driver = pygame.display.get_driver()
     if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
         pygame.display.quit()
-        raise RuntimeError(f"no window can be opened (there is no display); {help_text}")
+        raise RuntimeError(f"no window can be opened (there is no display); {_OTHER_WAYS}")
+
+
+def _wait_for_display() -> None:
+    """
+    Let another process open the display first: one that hangs, as behind a connection that broke, would hang this
+    process where not even Ctrl-C reaches it.
+    """
+    name = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY")
+    if not name or not sys.platform.startswith("linux") or "SDL_VIDEODRIVER" in os.environ:
+        return
+    program = "import pygame; pygame.display.init()"
+    try:
+        # What else may be wrong shows in this process, with its own message.
+        subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=_DISPLAY_SECONDS, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(
+            f"no window can be opened (the display {name!r} has not answered for {_DISPLAY_SECONDS:.0f} s; is the "
+            f"connection to it broken?); {_OTHER_WAYS}"
+        ) from error

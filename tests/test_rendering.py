@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -490,3 +491,17 @@ def test_no_display_for_real(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.delenv("SDL_VIDEODRIVER")
     with pytest.raises(RuntimeError, match="no window can be opened"):
         HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="displays of other systems are not servers")
+def test_a_display_that_hangs(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An X server that takes connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        name = f"127.0.0.1:{server.getsockname()[1] - 6000}"
+        monkeypatch.delenv("SDL_VIDEODRIVER")
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        monkeypatch.setenv("DISPLAY", name)
+        monkeypatch.setattr("hecogrid_envs.window._DISPLAY_SECONDS", 2.0)
+        message = rf"the display '{name}' has not answered for 2 s; is the connection to it broken\?\); draw pictures"
+        with pytest.raises(RuntimeError, match=message):
+            HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))

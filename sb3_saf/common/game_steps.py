@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import sys
 import time
-from typing import Any, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_saf.common.teams import find_n_agents
-
-AlgorithmClass = TypeVar("AlgorithmClass", bound=type[BaseAlgorithm])
+from sb3_saf.common.wrapping import AlgorithmClass, do_before
 
 GAME_STEPS_TAG = "time/game_steps"
 GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"
-
-_MARK = "_records_game_steps"
 
 
 def game_steps(model: BaseAlgorithm) -> int | None:
@@ -58,20 +53,12 @@ def log_game_steps(algorithm_class: AlgorithmClass) -> AlgorithmClass:
     :param algorithm_class: for instance PPO; its base classes are left alone
     :return: the same class
     """
-    original = algorithm_class.dump_logs
-    if getattr(original, _MARK, False):
-        return algorithm_class
+    return do_before(algorithm_class, "dump_logs", _record_game_steps)
 
-    @functools.wraps(original)
-    def dump_logs(self: BaseAlgorithm, *args: Any, **kwargs: Any) -> None:
-        steps = game_steps(self)
-        if steps is not None:
-            self.logger.record(GAME_STEPS_TAG, steps)
-        per_second = game_steps_per_second(self)
-        if per_second is not None:
-            self.logger.record(GAME_STEPS_PER_SECOND_TAG, round(per_second, 1))
-        original(self, *args, **kwargs)
 
-    setattr(dump_logs, _MARK, True)
-    setattr(algorithm_class, "dump_logs", dump_logs)  # noqa: B010 (mypy refuses the plain assignment)
-    return algorithm_class
+def _record_game_steps(model: BaseAlgorithm) -> None:
+    steps, per_second = game_steps(model), game_steps_per_second(model)
+    if steps is not None:
+        model.logger.record(GAME_STEPS_TAG, steps)
+    if per_second is not None:
+        model.logger.record(GAME_STEPS_PER_SECOND_TAG, round(per_second, 1))

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
-from typing import Any, Final, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from sb3_saf.common.row_policy import TeamRowsPolicy
 from sb3_saf.common.teams import TEAM_KEY, TEAM_KEYS
-
-AlgorithmClass = TypeVar("AlgorithmClass", bound=type[BaseAlgorithm])
-
-_MARK: Final = "_warns_of_stock_policies"
+from sb3_saf.common.wrapping import AlgorithmClass, do_before
 
 
 def warn_of_stock_policies(algorithm_class: AlgorithmClass) -> AlgorithmClass:
@@ -28,21 +23,10 @@ def warn_of_stock_policies(algorithm_class: AlgorithmClass) -> AlgorithmClass:
     :param algorithm_class: for instance PPO; its base classes are left alone
     :return: the same class
     """
-    original = algorithm_class.learn
-    if getattr(original, _MARK, False):
-        return algorithm_class
-
-    @functools.wraps(original)
-    def learn(self: BaseAlgorithm, *args: Any, **kwargs: Any) -> Any:
-        _warn(self)
-        return original(self, *args, **kwargs)
-
-    setattr(learn, _MARK, True)
-    setattr(algorithm_class, "learn", learn)  # noqa: B010 (mypy refuses the plain assignment)
-    return algorithm_class
+    return do_before(algorithm_class, "learn", _warn_of_stock_policy)
 
 
-def _warn(model: BaseAlgorithm) -> None:
+def _warn_of_stock_policy(model: BaseAlgorithm) -> None:
     if not _reads_whole_rows(model):
         return
     own = sorted(name for name, policy in model.policy_aliases.items() if issubclass(policy, TeamRowsPolicy))

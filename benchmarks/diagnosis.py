@@ -1,0 +1,80 @@
+"""
+Why do methods differ? Looks into the trained teams of an experiment's folder. ``python -m benchmarks.diagnosis FOLDER``
+
+For every finished cell it plays episodes with the trained team and asks the critic, the knowledge source and the pool
+(``sb3_saf.inspect_team``): how well values tell returns, whether messages matter, whether the pool chooses at all; and
+what the most likely actions would earn. Means over seeds; one row per method and level.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+
+import sb3_saf
+from sb3_saf.zoo.settings import load_settings
+
+
+class Cell(NamedTuple):
+    """One trained team."""
+
+    task: str
+    level: str
+    method: str
+    seed: int
+    folder: Path
+
+
+def cells(folder: Path, setting: str = "*") -> Iterator[Cell]:
+    """Finished cells of an experiment's folder; ``setting`` such as TeamSupport-c2-h1."""
+    for model in sorted(folder.glob(f"cells/{setting}/*/*/model.zip")):
+        setting, method, seed = model.parts[-4:-1]
+        task, _, level = setting.partition("-")
+        yield Cell(task, level, method, int(seed.removeprefix("seed-").removeprefix("seed")), model.parent)
+
+
+def look(cell: Cell, n_episodes: int) -> dict[str, float]:
+    """Numbers by name."""
+    level = dict(zip(("coordination", "heterogeneity"), (int(part[1:]) for part in cell.level.split("-")), strict=True))
+    settings = load_settings(cell.method, f"{cell.task}-v0", "small", level)
+    env = settings.make_env(cell.seed, evaluation=True, n_envs=16)
+    model = settings.make_model(env, cell.seed, device="cpu")
+    sb3_saf.load_weights(model, cell.folder / "model.zip")
+    scalars: dict[str, Any] = dict(sb3_saf.inspect_team(model, env, n_episodes).scalars)
+    greedy = sb3_saf.evaluate_team(model, env, n_eval_episodes=n_episodes, deterministic=True)
+    return {name: float(value) for name, value in scalars.items() if value is not None} | {"greedy": greedy.mean}
+
+
+def main() -> None:
+    """Print a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--only", default="*", metavar="SETTING", help="such as TeamSupport-c2-h1; a pattern")
+    parser.add_argument("--episodes", type=int, default=32)
+    parser.add_argument("--json", type=Path, help="keep everything here")
+    options = parser.parse_args()
+    th.set_num_threads(1)
+    found: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
+    for cell in cells(options.folder, options.only):
+        found[cell[:3]].append(look(cell, options.episodes))
+    means = {
+        key: {name: float(np.mean([one[name] for one in looks if name in one])) for name in looks[0]}
+        for key, looks in found.items()
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps({" ".join(key): value for key, value in means.items()}, indent=1))
+    names = sorted({name for value in means.values() for name in value})
+    print("| task | level | method | " + " | ".join(names) + " |\n|" + " --- |" * (3 + len(names)))
+    for key, value in means.items():
+        print("| " + " | ".join([*key, *(f"{value[name]:.2f}" if name in value else "" for name in names)]) + " |")
+
+
+if __name__ == "__main__":
+    main()
