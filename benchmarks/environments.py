@@ -46,10 +46,7 @@ def batch_work(task: str, observation: str, n_threads: int = 1, n_games: int = N
     actions = random_actions((64, n_games, all_params.n_agents))
 
     def work() -> int:
-        batch.step(next(actions))
-        if batch.truncated.any():
-            batch.reset(batch.truncated)
-        batch.observe(out)
+        batch.advance(next(actions), out)
         return n_games * all_params.n_agents
 
     return work

@@ -98,9 +98,10 @@ def _works() -> Iterator[tuple[str, Callable[[], object]]]:
 def _play_step(
     batch: GameBatch, actions: Iterator[npt.NDArray[np.uint8]], out: npt.NDArray[np.uint8] | None = None
 ) -> None:
-    batch.step(next(actions))
-    if out is not None:
-        batch.observe(out)
+    if out is None:
+        batch.step(next(actions))
+    else:
+        batch.advance(next(actions), out)
 
 
 def _play() -> None:

@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain, TreasureState
+from hecogrid_envs.arrays import SLACK, aligned, empty_games, rule_book
+from hecogrid_envs.constants import Terrain, TreasureState
 from hecogrid_envs.core import announce_compilation
 from hecogrid_envs.core.generation import clear, draw_level
-from hecogrid_envs.core.occupancy import arrive, plane_offset, set_wall_bits
-from hecogrid_envs.core.sharing import PICTURES, RESET, STEP, TILES, Pictures
-from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.core.occupancy import arrive
+from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Workspace
 from hecogrid_envs.fields_of_view import seen_cells
-from hecogrid_envs.params import MAX_CODED_TILE_SIZE, TASK_NAMES, HECOGridParams, TaskName, check_task
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName, check_task
 from hecogrid_envs.seeding import fresh_seed, generator_word
 from hecogrid_envs.state import StateMapping, check_state
-from hecogrid_envs.threads import Shares
-from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
+from hecogrid_envs.threads import NOTHING, Shares
+from hecogrid_envs.tiles import INVISIBLE, turned_atlases
 
 U8 = npt.NDArray[np.uint8]
-
-#: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
-_SLACK: Final = 64
-
-#: Views of so many columns are lit by a table.
-_TABLED_COLUMNS: Final = 8
 
 
 class GameBatch:
@@ -49,27 +43,32 @@ class GameBatch:
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)
         atlases = turned_atlases(self.task, params.rules, params.view_tile_size)
-        self._book = _rule_book(self.task, params)
-        self._games = _empty_games(self._book, self.n_games)
+        self._book = rule_book(self.task, params)
+        self._games = empty_games(self._book, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
+        self._begun = False
         n, v, pixels = params.n_agents, params.view_size, params.view_pixels
         tiles = params.observation == "tiles"
-        self._observe_task = TILES if tiles else PICTURES
+        self._view_task = TILES if tiles else PICTURES
         self._view_shape = (n, v, v) if tiles else (n, pixels, pixels, 3)
-        self._codes = np.zeros((self.n_games, n, v, v), dtype=np.uint8)
-        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(_SLACK, dtype=np.uint8)])
+        self._actions = aligned((self.n_games, n), np.uint8)
+        self._fresh = aligned(self.n_games, np.bool_)
+        self._codes = aligned((self.n_games, n, v, v), np.uint8)
+        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)])
         self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
         self._shares = self._new_shares()
 
     def _new_shares(self) -> Shares:
-        pictures = Pictures(
+        work = Workspace(
+            actions=self._actions.reshape(-1),
+            fresh=self._fresh.view(np.uint8),
             codes=self._codes.reshape(-1),
             facing=self._games.direction.reshape(-1),
             atlas=self._atlas,
             turn_bytes=self._turn_bytes,
             tile=self.params.view_tile_size,
         )
-        return Shares(self._games, self._book, pictures, self.n_threads)
+        return Shares(self._games, self._book, work, self.n_threads)
 
     def __getstate__(self) -> dict[str, Any]:
         # Threads and compiled code stay with the process; a copy makes its own.
@@ -91,7 +90,8 @@ class GameBatch:
             raise ValueError(f"which must have shape ({self.n_games},), one per game, got {chosen.shape}")
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
-        self._shares.play(RESET, chosen.astype(np.uint8))
+        self._fresh[...] = chosen
+        self._shares.play(RESET)
 
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:
@@ -103,14 +103,12 @@ class GameBatch:
 
     def step(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         """
-        Play one game step everywhere.
+        Play one game step everywhere; games that are over play on until :meth:`reset`.
 
         :param actions: (E, N) integers from 0 to 6
         """
-        chosen = np.ascontiguousarray(actions, dtype=np.uint8)
-        if chosen.shape != self._games.x.shape:
-            raise ValueError(f"actions must have shape {self._games.x.shape}, (games, agents), got {chosen.shape}")
-        self._shares.play(STEP, chosen.reshape(-1))
+        self._take(actions)
+        self._shares.play(STEP)
 
     def observe(self, out: U8 | None = None) -> U8:
         """
@@ -119,13 +117,56 @@ class GameBatch:
         :param out: contiguous array to write to; a new one by default
         :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
         """
-        shape = (self.n_games, *self._view_shape)
-        if out is None:
-            out = np.empty(shape, dtype=np.uint8)
-        elif out.shape != shape or out.dtype != np.uint8 or not out.flags.c_contiguous:
-            raise ValueError(f"out must be a contiguous uint8 array of shape {shape}, got {out.dtype} {out.shape}")
-        self._shares.play(self._observe_task, out.reshape(-1))
+        out = self._array_for_views("out", out)
+        self._shares.play(self._view_task, out.reshape(-1))
         return out
+
+    def advance(
+        self, actions: npt.NDArray[np.integer[Any]], out: U8 | None = None, last: U8 | None = None
+    ) -> tuple[U8, npt.NDArray[np.bool_]]:
+        """
+        Play one game step everywhere, give games that are over a new level, and observe: :meth:`step`,
+        ``reset(truncated)`` and :meth:`observe` in one compiled call, which threads share once.
+
+        :attr:`rewards` are those of the step, also where a new episode has begun.
+
+        :param actions: (E, N) integers from 0 to 6
+        :param out: contiguous array to write views to; a new one by default
+        :param last: contiguous array of the same shape, to which the last views of games that are over are written, at
+            their place; the rest of it stays as it is. By default they are not made
+        :return: views as of :meth:`observe`, and (E,) whether the step was the last of an episode
+        :raises ValueError: for actions or arrays that do not fit, or a game that has not begun
+        """
+        self._take(actions)
+        out = self._array_for_views("out", out)
+        last_views = NOTHING if last is None else self._array_for_views("last", last).reshape(-1)
+        self._shares.play(STEP | RESTART | self._view_task, out.reshape(-1), last_views)
+        return out, self._fresh.copy()
+
+    def _take(self, actions: npt.NDArray[np.integer[Any]]) -> None:
+        """Check and keep the actions of a step."""
+        actions = np.asarray(actions)
+        if actions.shape != self._actions.shape:
+            raise ValueError(f"actions must have shape {self._actions.shape}, (games, agents), got {actions.shape}")
+        if not self._begun:
+            self._check_begun()
+        self._actions[...] = actions
+
+    def _check_begun(self) -> None:
+        if not self._seeded.all():
+            game = int(np.flatnonzero(~self._seeded)[0])
+            raise ValueError(f"game {game} has not begun: call reset() before a step")
+        self._begun = True
+
+    def _array_for_views(self, name: str, given: U8 | None) -> U8:
+        shape = (self.n_games, *self._view_shape)
+        if given is None:
+            return np.empty(shape, dtype=np.uint8)
+        if given.shape != shape or given.dtype != np.uint8 or not given.flags.c_contiguous:
+            raise ValueError(
+                f"{name} must be a contiguous uint8 array of shape {shape}, got {given.dtype} {given.shape}"
+            )
+        return given
 
     def observe_game(self, game: int) -> U8:
         """
@@ -133,8 +174,8 @@ class GameBatch:
 
         :return: as :meth:`observe` without its first axis
         """
-        self._shares.play_game(TILES, self._codes.reshape(-1), game)
-        if self._observe_task == TILES:
+        self._shares.play_game(TILES, game, self._codes.reshape(-1))
+        if self._view_task == TILES:
             return self._codes[game].copy()
         out = np.empty(self._view_shape, dtype=np.uint8)
         self._shares.draw(self._codes[game].reshape(-1), self._games.direction[game], out.reshape(-1))
@@ -195,6 +236,7 @@ class GameBatch:
         """
         state = check_state(mapping, self.params)
         games, width = self._games, self.params.grid_size
+        self._seed(game, None)
         clear(games, self._book, game)
         terrain = np.zeros((width, width), dtype=np.uint8)
         terrain[state["walls"]] = Terrain.WALL
@@ -236,6 +278,7 @@ class GameBatch:
                 )
         for name, array in own.items():
             array[...] = snapshot[name]
+        self._begun = False  # looked up at the next step
 
     def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:
         """
@@ -243,7 +286,7 @@ class GameBatch:
 
         :return: (N, W, H)
         """
-        self._shares.play_game(TILES, self._codes.reshape(-1), game)
+        self._shares.play_game(TILES, game, self._codes.reshape(-1))
         state = self.get_state(game)
         return seen_cells(
             self._codes[game] != INVISIBLE,
@@ -258,94 +301,3 @@ def _positive(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
-
-
-def _rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
-    view, offset = params.view_size, params.view_offset
-    pad = max(view - 1 - offset, offset, view // 2)
-    stride = params.grid_size + 2 * pad
-    zone_of_column = params.zone_of_column()
-    n_zones = int(zone_of_column.max()) + 1
-    released = params.rules == "released"
-    spread = [sum(0xFF << (8 * i) for i in range(8) if bits >> i & 1) for bits in range(256)]
-    book = RuleBook(
-        task=TASK_NAMES.index(task),
-        released=released,
-        random_order=params.agent_order == "random",
-        n_agents=params.n_agents,
-        width=params.grid_size,
-        coordination=params.coordination,
-        support_radius=params.support_radius,
-        n_treasures=params.n_treasures,
-        n_clutter=params.n_clutter,
-        n_keys=params.n_keys if task == "KeyForTreasure" else 0,
-        max_cycles=params.max_cycles,
-        view_size=view,
-        view_offset=offset,
-        stride=stride,
-        pad=pad,
-        plane_bytes=stride * stride + _SLACK,
-        bits_bytes=(stride * stride + 7) // 8 + _SLACK,
-        zone_of_column=zone_of_column.astype(np.int32),
-        command_of=params.command_of(),
-        zone_colour=(np.arange(n_zones) % len(ZONE_COLOURS)).astype(np.uint8),
-        key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
-        first_colour=BLUE_INDEX,
-        blank_planes=np.zeros(0, dtype=np.uint8),
-        blank_bits=np.zeros(0, dtype=np.uint8),
-        spread=np.array(spread, dtype=np.uint64),
-        swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
-    )
-    return _with_blank_map(book)
-
-
-def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
-    """The table that :class:`~hecogrid_envs.core.types.RuleBook` calls ``swept``."""
-    cells, own = 1 << size, size // 2
-    clear, seen = np.divmod(np.arange(cells * cells), cells)
-    following = np.zeros_like(seen)
-    for column, towards in [(i, i + 1) for i in range(own, size)] + [(i, i - 1) for i in range(own + 1, 0, -1)]:
-        lights = (seen & clear) >> column & 1
-        seen |= lights << towards
-        following |= lights << column | lights << towards
-    return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
-
-
-def _with_blank_map(book: RuleBook) -> RuleBook:
-    """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
-    planes = np.full((4, book.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
-    book = book._replace(blank_bits=np.zeros(4 * book.bits_bytes, dtype=np.uint8))
-    bits = _empty_games(book, 1)._replace(wall_bits=book.blank_bits)
-    for i in range(book.width):
-        for x, y in ((i, 0), (i, book.width - 1), (0, i), (book.width - 1, i)):
-            set_wall_bits(bits, book, 0, x, y)
-            for facing in range(4):
-                planes[facing, plane_offset(book, facing, x, y)] = FIRST_TERRAIN + Terrain.WALL
-    return book._replace(blank_planes=planes.reshape(-1))
-
-
-def _empty_games(book: RuleBook, n_games: int) -> Games:
-    agents, cells = (n_games, book.n_agents), (n_games, book.width * book.width)
-    order = np.tile(np.arange(book.n_agents, dtype=np.int32), (n_games, 1))
-    return Games(
-        rng=np.zeros(n_games, dtype=np.uint64),
-        terrain=np.zeros(cells, dtype=np.uint8),
-        head=np.full(cells, -1, dtype=np.int16),
-        tail=np.full(cells, -1, dtype=np.int16),
-        crowd=np.zeros(cells, dtype=np.int16),
-        after=np.full(agents, -1, dtype=np.int16),
-        before=np.full(agents, -1, dtype=np.int16),
-        x=np.ones(agents, dtype=np.int32),
-        y=np.ones(agents, dtype=np.int32),
-        direction=np.zeros(agents, dtype=np.uint8),
-        has_key=np.zeros(agents, dtype=np.uint8),
-        colour=np.zeros(agents, dtype=np.uint8),
-        order=order,
-        sight=np.zeros(n_games * book.n_agents * book.view_size, dtype=np.uint64),
-        sight_known=np.zeros(agents, dtype=np.uint8),
-        planes=np.zeros(n_games * 4 * book.plane_bytes, dtype=np.uint8),
-        wall_bits=np.zeros(n_games * 4 * book.bits_bytes, dtype=np.uint8),
-        steps=np.zeros(n_games, dtype=np.int32),
-        collected=np.zeros(n_games, dtype=np.int32),
-        paid=np.zeros(n_games, dtype=np.int32),
-    )

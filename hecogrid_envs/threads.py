@@ -12,12 +12,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from hecogrid_envs.arrays import aligned
 from hecogrid_envs.core.jit import entry_point
 from hecogrid_envs.core.sharing import (
     DESK_PART,
-    STEP,
-    Pictures,
+    Workspace,
     is_asleep,
+    lead,
     play_share,
     post,
     post_leave,
@@ -33,6 +34,9 @@ _POLLS_OF_HELPERS: Final = 1_000_000
 #: Looks at the desk before the calling thread offers its processor to others.
 _POLLS_OF_CALLER: Final = 10_000
 
+#: In place of arrays that a task does not have.
+NOTHING: Final[U8] = np.zeros(0, dtype=np.uint8)
+
 
 class Helpers:
     """
@@ -41,43 +45,57 @@ class Helpers:
     Awake, they begin without a lock or a call into Python. A pool of Python threads made two threads slower than one:
     a step is over in some tens of microseconds (``python -m benchmarks.environments`` measures one and two).
 
-    :param arguments: games, book and pictures of a batch
-    :param shares: the first game and one beyond the last, of each helper
+    :param arguments: games, book and workspace of a batch
+    :param own: the first game and one beyond the last, of the calling thread
+    :param shares: the same of each helper
     """
 
-    def __init__(self, arguments: tuple[Games, RuleBook, Pictures], shares: list[tuple[int, int]]):
+    def __init__(
+        self, arguments: tuple[Games, RuleBook, Workspace], own: tuple[int, int], shares: list[tuple[int, int]]
+    ):
         #: Threads do not survive a fork.
         self.process = os.getpid()
-        self._desk = np.zeros(DESK_PART * (1 + len(shares)), dtype=np.int64)
+        self._arguments = arguments
+        self._own = own
+        self._desk = aligned(DESK_PART * (1 + len(shares)), np.int64)
         self._bells = [threading.Semaphore(0) for _ in shares]
-        self._array: npt.NDArray[Any] = self._desk
-        self._post = entry_point(post, self._desk, 0, 0, 0)
-        self._asleep = entry_point(is_asleep, self._desk, 0)
+        #: Arrays of the task on the desk, which stay where they are until it is done.
+        self._posted: tuple[U8, U8] | None = None
+        self._post = entry_point(post, self._desk, 0, NOTHING, NOTHING)
+        self._lead = entry_point(lead, *arguments, self._desk, 0, 0, NOTHING, NOTHING, 0, 0)
         self._wait = entry_point(wait_for_helpers, self._desk, 0)
+        self._asleep = entry_point(is_asleep, self._desk, 0)
         compiled = entry_point(serve, *arguments, self._desk, 0, 0, 0, 0)
         self.threads = [
             threading.Thread(
                 target=_serve,
-                args=(compiled, (*arguments, self._desk, helper, first, last, _POLLS_OF_HELPERS), bell),
+                args=(compiled, (*arguments, self._desk, helper, first, end, _POLLS_OF_HELPERS), bell),
                 name=f"hecogrid-{helper}",
                 daemon=True,
             )
-            for helper, ((first, last), bell) in enumerate(zip(shares, self._bells, strict=True), 1)
+            for helper, ((first, end), bell) in enumerate(zip(shares, self._bells, strict=True), 1)
         ]
         for thread in self.threads:
             thread.start()
         weakref.finalize(self, _send_away, self._desk, self._bells)
 
-    def post(self, task: int, array: U8) -> None:
+    def play(self, task: int, views: U8, last_views: U8) -> None:
         """
-        Give the helpers their shares.
+        Do one task together.
 
-        :param task: see :func:`~hecogrid_envs.core.sharing.play_share`
-        :param array: of the task
+        :param task: see :func:`~hecogrid_envs.core.sharing.play_share`, as the arrays
         """
-        self.wait()  # an interrupt may have come between the last task and its end
-        self._array = array  # stays where it is until the next task
-        self._post(self._desk, task, array.ctypes.data, array.size)
+        if self._posted is not None:  # an interrupt came between the last task and its end
+            self._ring()
+            self._wait_on()
+        self._posted = views, last_views
+        if self._post(self._desk, task, views, last_views):
+            self._ring()
+        if not self._lead(*self._arguments, self._desk, _POLLS_OF_CALLER, task, views, last_views, *self._own):
+            self._wait_on()
+        self._posted = None
+
+    def _ring(self) -> None:
         for helper, bell in enumerate(self._bells, 1):
             if self.is_asleep(helper):
                 bell.release()
@@ -90,8 +108,7 @@ class Helpers:
         """
         return bool(self._asleep(self._desk, helper))
 
-    def wait(self) -> None:
-        """Wait for the end of the last task."""
+    def _wait_on(self) -> None:
         while not self._wait(self._desk, _POLLS_OF_CALLER):
             time.sleep(0)
 
@@ -113,43 +130,42 @@ class Shares:
 
     :param games: E games
     :param book: their rules
-    :param pictures: what drawing needs
+    :param work: their workspace
     :param n_threads: threads, the calling one included
     """
 
-    def __init__(self, games: Games, book: RuleBook, pictures: Pictures, n_threads: int):
-        self._arguments = (games, book, pictures)
+    def __init__(self, games: Games, book: RuleBook, work: Workspace, n_threads: int):
+        self._arguments = (games, book, work)
         n_games = len(games.rng)
         edges = np.linspace(0, n_games, min(n_threads, n_games) + 1).astype(int).tolist()
         *self._others, self._own = pairwise(edges)
         self._helpers: Helpers | None = None
-        self._play = entry_point(play_share, *self._arguments, STEP, pictures.codes, 0, 0)
+        self._play = entry_point(play_share, *self._arguments, 0, NOTHING, NOTHING, 0, 0)
 
-    def play(self, task: int, array: U8) -> None:
+    def play(self, task: int, views: U8 = NOTHING, last_views: U8 = NOTHING) -> None:
         """
         Do one task for all games.
 
         :param task: see :func:`~hecogrid_envs.core.sharing.play_share`
-        :param array: contiguous, of the task
+        :param views: contiguous, of the task
+        :param last_views: as well
         """
         if not self._others:
-            self._play(*self._arguments, task, array, *self._own)
+            self._play(*self._arguments, task, views, last_views, *self._own)
             return
         if self._helpers is None or self._helpers.process != os.getpid():
-            self._helpers = Helpers(self._arguments, self._others)
-        self._helpers.post(task, array)
-        self._play(*self._arguments, task, array, *self._own)
-        self._helpers.wait()
+            self._helpers = Helpers(self._arguments, self._own, self._others)
+        self._helpers.play(task, views, last_views)
 
-    def play_game(self, task: int, array: U8, game: int) -> None:
+    def play_game(self, task: int, game: int, views: U8) -> None:
         """
         Do one task for one game.
 
         :param task: see :func:`~hecogrid_envs.core.sharing.play_share`
-        :param array: of the task, for all games
         :param game: index
+        :param views: of the task, for all games
         """
-        self._play(*self._arguments, task, array, game, game + 1)
+        self._play(*self._arguments, task, views, NOTHING, game, game + 1)
 
     def draw(self, codes: U8, facing: U8, out: U8) -> None:
         """
@@ -159,6 +175,6 @@ class Shares:
         :param facing: (B,) directions of the viewers
         :param out: (B * V t * V t * 3,) pixels to write
         """
-        _, book, pictures = self._arguments
-        atlas = (pictures.atlas, pictures.turn_bytes, book.view_size, pictures.tile)
+        _, book, work = self._arguments
+        atlas = (work.atlas, work.turn_bytes, book.view_size, work.tile)
         draw_pictures(codes, facing, *atlas, out, 0, len(facing))

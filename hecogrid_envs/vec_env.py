@@ -51,6 +51,8 @@ class NativeVecEnv(VecEnv):
         #: Seeds of the games as they were last chosen, by which evaluation is told from training.
         self.seeded_with: tuple[int | None, ...] = (None,) * batch.n_games
         own_space = observation_space(batch.task, batch.params)
+        #: Where the batch leaves the last views of episodes, (E, N, *observation shape).
+        self._last: U8 = np.empty((self.n_games, self.n_agents, *own_space.shape), dtype=np.uint8)
         super().__init__(self.n_games * self.n_agents, own_space, spaces.Discrete(N_ACTIONS))
         if seed is not None:
             self.seed(seed)
@@ -116,20 +118,17 @@ class NativeVecEnv(VecEnv):
         :return: observations (B, *observation shape), rewards (B,) float32, dones (B,) bool, infos
         """
         assert self._actions is not None
-        self.batch.step(self._actions.reshape(self.n_games, self.n_agents))
+        actions = self._actions.reshape(self.n_games, self.n_agents)
         self._actions = None
+        views, over = self.batch.advance(actions, last=self._last)
         rewards = np.repeat(self.batch.rewards.astype(np.float32), self.n_agents)
-        over = self.batch.truncated
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        observations = self._rows(self.batch.observe())
         dones = np.repeat(over, self.n_agents)
-        if over.any():
-            for row in np.flatnonzero(dones):
-                infos[row] = {"TimeLimit.truncated": True, "terminal_observation": observations[row].copy()}
-                self.reset_infos[row] = {}
-            self.batch.reset(over)
-            observations = self._rows(self.batch.observe())
-        return observations, rewards, dones, infos
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        last = self._rows(self._last)
+        for row in np.flatnonzero(dones):
+            infos[row] = {"TimeLimit.truncated": True, "terminal_observation": last[row].copy()}
+            self.reset_infos[row] = {}
+        return self._rows(views), rewards, dones, infos
 
     def checkpoint_state(self) -> dict[str, Any]:
         """

@@ -10,13 +10,13 @@ from hecogrid_envs.core.types import U8, Games, RuleBook
 
 
 @hot
-def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int) -> None:
+def step_games(games: Games, book: RuleBook, actions: U8, first: int, end: int) -> None:
     """
-    Play one step of games ``first`` to ``last - 1``.
+    Play one step of games ``first`` to ``end - 1``.
 
     :param actions: (E * N,) action integers, 0 to 6
     """
-    for e in range(first, last):
+    for e in range(first, end):
         if book.random_order:
             _shuffle_order(games, book, e)
         games.paid[e] = 0
@@ -27,16 +27,35 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, last: int)
         games.steps[e] += 1
 
 
+@hot
+def mark_games_over(games: Games, book: RuleBook, over: U8, first: int, end: int) -> None:
+    """
+    Find games whose time is up.
+
+    :param over: (E,) 1 to write for them, 0 for others
+    """
+    for e in range(first, end):
+        over[e] = games.steps[e] >= book.max_cycles
+
+
 @kernel
-def reset_games(games: Games, book: RuleBook, which: U8, first: int, last: int) -> None:
+def reset_games(games: Games, book: RuleBook, which: U8, first: int, end: int) -> None:
     """
     Give new levels to the games that ``which`` marks.
 
     :param which: (E,) 0 or 1
     """
-    for e in range(first, last):
+    for e in range(first, end):
         if which[e]:
             new_level(games, book, e)
+
+
+@kernel
+def restart_game(games: Games, book: RuleBook, e: int) -> None:
+    """Give a game that is over a new level; what its last step paid is still to be read."""
+    paid = games.paid[e]
+    new_level(games, book, e)
+    games.paid[e] = paid
 
 
 @inlined

@@ -8,33 +8,36 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared
-from hecogrid_envs.core.batch_step import reset_games, step_games
+from hecogrid_envs.core.batch_step import mark_games_over, reset_games, restart_game, step_games
 from hecogrid_envs.core.jit import hot, kernel
 from hecogrid_envs.core.types import U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures, observe_tiles
 
-#: What a share can be.
-STEP: Final = 0
-TILES: Final = 1
-PICTURES: Final = 2
-RESET: Final = 3
-_LEAVE: Final = 4
+#: What a share can be: any sum of these, done in this order.
+STEP: Final = 1
+RESTART: Final = 2
+RESET: Final = 4
+TILES: Final = 8
+PICTURES: Final = 16
+_LEAVE: Final = 32
 
-#: Numbers of the desk, over which the calling thread and its helpers talk.
+#: Numbers of the desk, over which the calling thread and its helpers talk; arrays are an address and a length.
 _TICKET: Final = 0
 _TASK: Final = 1
-_ADDRESS: Final = 2
-_BYTES: Final = 3
+_VIEWS: Final = 2
+_LAST: Final = 4
 #: Numbers from one helper's part of the desk to the next: two cache lines, so that writing does not disturb others.
 DESK_PART: Final = 16
 _DONE: Final = 0
 _ASLEEP: Final = 1
 
 
-class Pictures(NamedTuple):
+class Workspace(NamedTuple):
     """
-    What drawing needs beside the games. E games, N agents, V = view size, t = tile size.
+    What a batch keeps beside its games. E games, N agents, V = view size, t = tile size.
 
+    :param actions: (E * N,) what agents do in the next step, 0 to 6
+    :param fresh: (E,) 1 for games that ``RESET`` is to give a new level, or to which ``RESTART`` gave one, 0 for others
     :param codes: (E * N * V * V,) where views in tile codes are kept on the way to pixels
     :param facing: (E * N,) directions of the agents, the games' own
     :param atlas: see :func:`~hecogrid_envs.core.view.draw_pictures`
@@ -42,6 +45,8 @@ class Pictures(NamedTuple):
     :param tile: t
     """
 
+    actions: U8
+    fresh: U8
     codes: U8
     facing: U8
     atlas: U8
@@ -50,52 +55,90 @@ class Pictures(NamedTuple):
 
 
 @kernel
-def play_share(games: Games, book: RuleBook, pictures: Pictures, task: int, array: U8, first: int, last: int) -> None:
+def play_share(
+    games: Games, book: RuleBook, work: Workspace, task: int, views: U8, last_views: U8, first: int, end: int
+) -> None:
     """
-    Do one task for games ``first`` to ``last - 1``.
+    Do one task for games ``first`` to ``end - 1``.
 
-    :param task: ``STEP``, ``TILES``, ``PICTURES`` or ``RESET``
-    :param array: (E * N,) actions, (E * N * V * V,) codes to write, (E * N * V t * V t * 3,) pixels to write, or (E,) 1
-        for games to reset and 0 for others
+    :param task: a sum of ``STEP``, ``RESTART`` (a new level for games that are over) or ``RESET`` (for those that
+        ``work.fresh`` marks), and ``TILES`` or ``PICTURES``
+    :param views: (E * N * V * V,) codes or (E * N * V t * V t * 3,) pixels to write; empty if the task has no views
+    :param last_views: as ``views``, for the last views of games that are over, written nowhere else; empty for none
     """
-    if task == STEP:
-        step_games(games, book, array, first, last)
-    elif task == TILES:
-        observe_tiles(games, book, array, first, last)
-    elif task == RESET:
-        reset_games(games, book, array, first, last)
-    else:
-        codes, n = pictures.codes, book.n_agents
-        observe_tiles(games, book, codes, first, last)
-        draw_pictures(
-            codes,
-            pictures.facing,
-            pictures.atlas,
-            pictures.turn_bytes,
-            book.view_size,
-            pictures.tile,
-            array,
-            first * n,
-            last * n,
-        )
+    if task & STEP:
+        step_games(games, book, work.actions, first, end)
+    if task & RESTART:
+        mark_games_over(games, book, work.fresh, first, end)
+        for e in range(first, end):
+            if work.fresh[e]:
+                if len(last_views):
+                    _observe(games, book, work, task, last_views, e, e + 1)
+                restart_game(games, book, e)
+    elif task & RESET:
+        reset_games(games, book, work.fresh, first, end)
+    _observe(games, book, work, task, views, first, end)
+
+
+@kernel
+def _observe(games: Games, book: RuleBook, work: Workspace, task: int, out: U8, first: int, end: int) -> None:
+    """Write views as ``TILES`` or ``PICTURES`` in ``task`` say."""
+    if task & TILES:
+        observe_tiles(games, book, out, first, end)
+    elif task & PICTURES:
+        observe_tiles(games, book, work.codes, first, end)
+        atlas = (work.atlas, work.turn_bytes, book.view_size, work.tile)
+        draw_pictures(work.codes, work.facing, *atlas, out, first * book.n_agents, end * book.n_agents)
+
+
+@kernel
+def lead(
+    games: Games,
+    book: RuleBook,
+    work: Workspace,
+    desk: npt.NDArray[np.int64],
+    polls: int,
+    task: int,
+    views: U8,
+    last_views: U8,
+    first: int,
+    end: int,
+) -> bool:
+    """
+    Do the calling thread's share of a task, then wait for the helpers.
+
+    :param polls: looks at the desk before giving up
+    :return: whether all is done; else :func:`wait_for_helpers` waits on
+    """
+    play_share(games, book, work, task, views, last_views, first, end)
+    return wait_for_helpers(desk, polls)
 
 
 @hot
-def post(desk: npt.NDArray[np.int64], task: int, address: int, n_bytes: int) -> None:
+def post(desk: npt.NDArray[np.int64], task: int, views: U8, last_views: U8) -> bool:
     """
     Put a task on the desk; helpers that are awake begin at once.
 
     :param desk: (DESK_PART * (1 + helpers),)
-    :param address: of the task's array
+    :param views: of the task; stays where it is until the task is done
+    :param last_views: of the task, as well
+    :return: whether a helper must be woken
     """
-    desk[_TASK], desk[_ADDRESS], desk[_BYTES] = task, address, n_bytes
+    desk[_TASK] = task
+    desk[_VIEWS], desk[_VIEWS + 1] = views.ctypes.data, len(views)
+    desk[_LAST], desk[_LAST + 1] = last_views.ctypes.data, len(last_views)
     store_shared(desk, _TICKET, desk[_TICKET] + 1)
+    sleeps = False
+    for helper in range(1, len(desk) // DESK_PART):
+        sleeps |= is_asleep(desk, helper)
+    return sleeps
 
 
 @hot
 def post_leave(desk: npt.NDArray[np.int64]) -> None:
     """Send the helpers away."""
-    post(desk, _LEAVE, 0, 0)
+    desk[_TASK] = _LEAVE
+    store_shared(desk, _TICKET, desk[_TICKET] + 1)
 
 
 @hot
@@ -129,11 +172,11 @@ def wait_for_helpers(desk: npt.NDArray[np.int64], polls: int) -> bool:
 def serve(
     games: Games,
     book: RuleBook,
-    pictures: Pictures,
+    work: Workspace,
     desk: npt.NDArray[np.int64],
     helper: int,
     first: int,
-    last: int,
+    end: int,
     polls: int,
 ) -> bool:
     """
@@ -159,7 +202,8 @@ def serve(
             continue
         if desk[_TASK] == _LEAVE:
             return True
-        array = bytes_at(desk[_ADDRESS], desk[_BYTES])
-        play_share(games, book, pictures, desk[_TASK], array, first, last)
+        views = bytes_at(desk[_VIEWS], desk[_VIEWS + 1])
+        last_views = bytes_at(desk[_LAST], desk[_LAST + 1])
+        play_share(games, book, work, desk[_TASK], views, last_views, first, end)
         store_shared(desk, done, ticket)
         idle = 0

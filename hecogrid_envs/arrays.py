@@ -1,0 +1,145 @@
+"""The arrays of a batch at its start: the rule book, and games that have not begun."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain
+from hecogrid_envs.core.occupancy import plane_offset, set_wall_bits
+from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.params import TASK_NAMES, HECOGridParams, TaskName
+from hecogrid_envs.tiles import FIRST_TERRAIN
+
+#: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
+SLACK: Final = 64
+
+#: Views of so many columns are lit by a table.
+_TABLED_COLUMNS: Final = 8
+
+#: Bytes that processors hand to each other at once.
+_CACHE_LINE: Final = 64
+
+
+def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) -> npt.NDArray[Any]:
+    """
+    Make an array that shares no cache line with another.
+
+    Of games that divide evenly, no two threads then write to one line either, which would go to and fro between them.
+
+    :param shape: of the array
+    :param dtype: of the array
+    :param value: in all places
+    """
+    n_bytes = math.prod((shape,) if isinstance(shape, int) else shape) * np.dtype(dtype).itemsize
+    memory = np.empty(n_bytes + 2 * _CACHE_LINE, dtype=np.uint8)
+    start = -memory.ctypes.data % _CACHE_LINE
+    array = memory[start : start + n_bytes].view(dtype).reshape(shape)
+    array[...] = value
+    return array
+
+
+def rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
+    """
+    What all games of a batch share.
+
+    :param task: of all games
+    :param params: of all games
+    """
+    view, offset = params.view_size, params.view_offset
+    pad = max(view - 1 - offset, offset, view // 2)
+    stride = params.grid_size + 2 * pad
+    zone_of_column = params.zone_of_column()
+    n_zones = int(zone_of_column.max()) + 1
+    released = params.rules == "released"
+    spread = [sum(0xFF << (8 * i) for i in range(8) if bits >> i & 1) for bits in range(256)]
+    book = RuleBook(
+        task=TASK_NAMES.index(task),
+        released=released,
+        random_order=params.agent_order == "random",
+        n_agents=params.n_agents,
+        width=params.grid_size,
+        coordination=params.coordination,
+        support_radius=params.support_radius,
+        n_treasures=params.n_treasures,
+        n_clutter=params.n_clutter,
+        n_keys=params.n_keys if task == "KeyForTreasure" else 0,
+        max_cycles=params.max_cycles,
+        view_size=view,
+        view_offset=offset,
+        stride=stride,
+        pad=pad,
+        plane_bytes=stride * stride + SLACK,
+        bits_bytes=(stride * stride + 7) // 8 + SLACK,
+        zone_of_column=zone_of_column.astype(np.int32),
+        command_of=params.command_of(),
+        zone_colour=(np.arange(n_zones) % len(ZONE_COLOURS)).astype(np.uint8),
+        key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
+        first_colour=BLUE_INDEX,
+        blank_planes=np.zeros(0, dtype=np.uint8),
+        blank_bits=np.zeros(0, dtype=np.uint8),
+        spread=np.array(spread, dtype=np.uint64),
+        swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
+    )
+    return _with_blank_map(book)
+
+
+def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
+    """The table that :class:`~hecogrid_envs.core.types.RuleBook` calls ``swept``."""
+    cells, own = 1 << size, size // 2
+    clear, seen = np.divmod(np.arange(cells * cells), cells)
+    following = np.zeros_like(seen)
+    for column, towards in [(i, i + 1) for i in range(own, size)] + [(i, i - 1) for i in range(own + 1, 0, -1)]:
+        lights = (seen & clear) >> column & 1
+        seen |= lights << towards
+        following |= lights << column | lights << towards
+    return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
+
+
+def _with_blank_map(book: RuleBook) -> RuleBook:
+    """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
+    planes = np.full((4, book.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
+    book = book._replace(blank_bits=np.zeros(4 * book.bits_bytes, dtype=np.uint8))
+    bits = empty_games(book, 1)._replace(wall_bits=book.blank_bits)
+    for i in range(book.width):
+        for x, y in ((i, 0), (i, book.width - 1), (0, i), (book.width - 1, i)):
+            set_wall_bits(bits, book, 0, x, y)
+            for facing in range(4):
+                planes[facing, plane_offset(book, facing, x, y)] = FIRST_TERRAIN + Terrain.WALL
+    return book._replace(blank_planes=planes.reshape(-1))
+
+
+def empty_games(book: RuleBook, n_games: int) -> Games:
+    """
+    Games that have not begun.
+
+    :param n_games: E
+    """
+    agents, cells = (n_games, book.n_agents), (n_games, book.width * book.width)
+    games = Games(
+        rng=aligned(n_games, np.uint64),
+        terrain=aligned(cells, np.uint8),
+        head=aligned(cells, np.int16, -1),
+        tail=aligned(cells, np.int16, -1),
+        crowd=aligned(cells, np.int16),
+        after=aligned(agents, np.int16, -1),
+        before=aligned(agents, np.int16, -1),
+        x=aligned(agents, np.int32, 1),
+        y=aligned(agents, np.int32, 1),
+        direction=aligned(agents, np.uint8),
+        has_key=aligned(agents, np.uint8),
+        colour=aligned(agents, np.uint8),
+        order=aligned(agents, np.int32),
+        sight=aligned(n_games * book.n_agents * book.view_size, np.uint64),
+        sight_known=aligned(agents, np.uint8),
+        planes=aligned(n_games * 4 * book.plane_bytes, np.uint8),
+        wall_bits=aligned(n_games * 4 * book.bits_bytes, np.uint8),
+        steps=aligned(n_games, np.int32),
+        collected=aligned(n_games, np.int32),
+        paid=aligned(n_games, np.int32),
+    )
+    games.order[...] = np.arange(book.n_agents)
+    return games
