@@ -125,7 +125,7 @@ def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) 
                 now = list(env.reset()[0].values())
             assert dones[rows].tolist() == list(result.truncations.values())
             np.testing.assert_array_equal(observations[rows], now)
-            np.testing.assert_array_equal(rewards[rows], np.float32(list(result.rewards.values())))
+            np.testing.assert_array_equal(rewards[rows], np.array(list(result.rewards.values()), dtype=np.float32))
     assert ends == [(8, 0), (8, 2), (12, 1), (17, 0), (17, 2), (21, 1), (26, 0), (26, 2)]
 
 
