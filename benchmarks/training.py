@@ -6,7 +6,8 @@ One round of the paper's settings on one core: a rollout (one step of every game
 minibatch. SAF does everything that training does: games, joint view, knowledge source, pool, advantages, Adam. The
 bare loop knows pictures and nothing else: it encodes every row once in the rollout and once per epoch, sends a
 gradient back through the CNN, and steps Adam; in one piece, as one minibatch asks for, and in chunks of 640 rows, which
-fit the cache. Both are given the same number of rows.
+fit the cache. Both are given the same number of rows. ``--peak`` prints instead how much memory one rollout and one
+epoch of the paper's 128 games take at most.
 
 SAF is measured on views of an untrained policy, of which many are equal, and on random views, which all differ.
 Processor time instead of wall-clock, so that other programs disturb little.
@@ -15,6 +16,7 @@ Processor time instead of wall-clock, so that other programs disturb little.
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -111,6 +113,13 @@ def bare_work(n_games: int, chunk: int | None) -> Callable[[], int]:
     return work
 
 
+def print_peak() -> None:
+    """Most memory of this process after a rollout and an epoch of the paper's size; epochs do not add up."""
+    for name, random_views in (("untrained policy's views", False), ("all views differ", True)):
+        saf_work(make_saf(128, random_views, n_epochs=1))()
+        print(f"{name}: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GiB")
+
+
 def rate(work: Callable[[], int]) -> float:
     """Agent-steps per second of processor time."""
     start = time.process_time()
@@ -123,8 +132,12 @@ def main() -> None:
     parser.add_argument("--games", type=int, default=16, help="the paper has 128")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--skip-bare", action="store_true", help="measure SAF alone, without ratios")
+    parser.add_argument("--peak", action="store_true", help="memory instead of speed")
     options = parser.parse_args()
     th.set_num_threads(1)
+    if options.peak:
+        print_peak()
+        return
     n = options.games
     programs: dict[str, Callable[[], int]] = {
         "SAF, untrained policy's views": saf_work(make_saf(n, random_views=False, learning_rate=0.0)),
