@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from hecogrid_envs.arrays import SLACK, aligned, empty_games, rule_book
 from hecogrid_envs.constants import Terrain, TreasureState
-from hecogrid_envs.core import announce_compilation
 from hecogrid_envs.core.generation import clear, draw_level
 from hecogrid_envs.core.occupancy import arrive
 from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Workspace
@@ -38,7 +37,6 @@ class GameBatch:
     def __init__(self, task: str, params: HECOGridParams, n_games: int = 1, n_threads: int = 1):
         self.task: TaskName = check_task(task)
         params.check_fits(self.task)
-        announce_compilation()
         self.params = params
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)

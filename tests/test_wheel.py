@@ -93,7 +93,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def take_over_compiled_kernels(folder: Path) -> None:
     """Spare compiling anew what the checkout has compiled; numba takes it where the source is the same."""
     for path in (path for package in PACKAGES for path in (ROOT / package).rglob("__pycache__/*")):
-        if path.suffix in (".nbi", ".nbc", ".sha256"):
+        if path.suffix in (".nbi", ".nbc"):
             copy = folder / path.relative_to(ROOT)
             copy.parent.mkdir(exist_ok=True)
             shutil.copy(path, copy)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from hecogrid_envs.core.generation import new_level
-from hecogrid_envs.core.jit import hot, inlined, kernel
+from hecogrid_envs.core.jit import hot, inlined
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.rules import act
-from hecogrid_envs.core.types import U8, Games, RuleBook
+from hecogrid_envs.core.types import U8, Games, RuleBook, whole
 
 
 @hot
@@ -21,7 +20,7 @@ def step_games(games: Games, book: RuleBook, actions: U8, first: int, end: int) 
             _shuffle_order(games, book, e)
         games.paid[e] = 0
         for turn in range(book.n_agents):
-            agent = games.order[e, turn]
+            agent = whole(games.order[e, turn])
             act(games, book, e, agent, actions[e * book.n_agents + agent])
         games.collected[e] += games.paid[e]
         games.steps[e] += 1
@@ -36,26 +35,6 @@ def mark_games_over(games: Games, book: RuleBook, over: U8, first: int, end: int
     """
     for e in range(first, end):
         over[e] = games.steps[e] >= book.max_cycles
-
-
-@kernel
-def reset_games(games: Games, book: RuleBook, which: U8, first: int, end: int) -> None:
-    """
-    Give new levels to the games that ``which`` marks.
-
-    :param which: (E,) 0 or 1
-    """
-    for e in range(first, end):
-        if which[e]:
-            new_level(games, book, e)
-
-
-@kernel
-def restart_game(games: Games, book: RuleBook, e: int) -> None:
-    """Give a game that is over a new level; what its last step paid is still to be read."""
-    paid = games.paid[e]
-    new_level(games, book, e)
-    games.paid[e] = paid
 
 
 @inlined

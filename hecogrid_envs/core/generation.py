@@ -32,16 +32,18 @@ def new_level(games: Games, book: RuleBook, e: int) -> None:
 def clear(games: Games, book: RuleBook, e: int) -> None:
     """Empty map inside the outer wall, counters at zero."""
     width = book.width
-    games.terrain[e, :] = _EMPTY
+    for cell in range(width * width):
+        games.terrain[e, cell] = _EMPTY
+        games.head[e, cell] = -1
+        games.tail[e, cell] = -1
+        games.crowd[e, cell] = 0
     for i in range(width):
         games.terrain[e, i] = _WALL
         games.terrain[e, (width - 1) * width + i] = _WALL
         games.terrain[e, i * width] = _WALL
         games.terrain[e, i * width + width - 1] = _WALL
-    games.head[e, :] = -1
-    games.tail[e, :] = -1
-    games.crowd[e, :] = 0
-    games.has_key[e, :] = 0
+    for agent in range(book.n_agents):
+        games.has_key[e, agent] = 0
     games.steps[e] = 0
     games.collected[e] = 0
     games.paid[e] = 0
@@ -83,10 +85,12 @@ def _place_agent(games: Games, book: RuleBook, e: int, agent: int) -> None:
 def draw_level(games: Games, book: RuleBook, e: int) -> None:
     """Derive everything that views need from terrain and agents, at the start of an episode."""
     planes, bits = e * 4 * book.plane_bytes, e * 4 * book.bits_bytes
-    games.planes[planes : planes + 4 * book.plane_bytes] = book.blank_planes
-    games.wall_bits[bits : bits + 4 * book.bits_bytes] = book.blank_bits
-    games.sight_known[e, :] = 0
+    for i in range(4 * book.plane_bytes):
+        games.planes[planes + i] = book.blank_planes[i]
+    for i in range(4 * book.bits_bytes):
+        games.wall_bits[bits + i] = book.blank_bits[i]
     for agent in range(book.n_agents):
+        games.sight_known[e, agent] = 0
         games.colour[e, agent] = book.first_colour if book.released else present_colour(games, book, e, agent)
     for y in range(1, book.width - 1):
         for x in range(1, book.width - 1):

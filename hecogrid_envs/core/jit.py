@@ -1,19 +1,46 @@
-"""How kernels are compiled."""
+"""
+How kernels are compiled, and kept on disk.
+
+Numba takes compiled code for fresh as long as the file of its function is as it was. These kernels are compiled into
+one another across files, so here they are fresh only as long as all of these files are.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from numba import njit, typeof
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def _fingerprint() -> str:
+    digest = hashlib.sha256()
+    for source in sorted([*_PACKAGE.glob("core/*.py"), _PACKAGE / "constants.py", _PACKAGE / "tiles.py"]):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+_FINGERPRINT = _fingerprint()
+
+
+def _compiled(function: Function, **options: bool) -> Function:
+    compiled: Any = njit(cache=True, nogil=True, **options)(function)  # type: ignore[call-overload]
+    compiled._cache._cache_file._source_stamp = _FINGERPRINT
+    result: Function = compiled
+    return result
+
 
 def kernel(function: Function) -> Function:
     """Compile a function that may slice and allocate: what happens once per episode."""
-    compiled: Function = njit(cache=True, nogil=True)(function)  # type: ignore[assignment]
-    return compiled
+    return _compiled(function)
 
 
 def hot(function: Function) -> Function:
@@ -23,14 +50,12 @@ def hot(function: Function) -> Function:
     Without the runtime of reference counts, whose atomic increments around every array access cost more than the rules
     do; such functions cannot slice or allocate.
     """
-    compiled: Function = njit(cache=True, nogil=True, _nrt=False)(function)  # type: ignore[call-overload]
-    return compiled
+    return _compiled(function, _nrt=False)
 
 
 def inlined(function: Function) -> Function:
     """Compile a part of a hot loop into it: a call would pass every array of a batch on the stack."""
-    compiled: Function = njit(cache=True, nogil=True, _nrt=False, forceinline=True)(function)  # type: ignore[call-overload]
-    return compiled
+    return _compiled(function, _nrt=False, forceinline=True)
 
 
 def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
@@ -38,9 +63,26 @@ def entry_point(function: Callable[..., Any], *arguments: Any) -> Callable[..., 
     Find the machine code for some arguments, to be called without numba's dispatcher.
 
     At each call that looks at the type of every array of a batch, some 45, which takes longer than stepping ten games.
+    Says so on standard error, once, if there is something to compile first.
 
     :param function: a kernel
     :param arguments: of the types that it will be called with; others must not follow
     """
-    compiled: Callable[..., Any] = function.compile(tuple(map(typeof, arguments)))  # type: ignore[attr-defined]
+    signature = tuple(map(typeof, arguments))
+    if not _is_known(function, signature):
+        _announce_compilation()
+    compiled: Callable[..., Any] = function.compile(signature)  # type: ignore[attr-defined]
     return compiled
+
+
+def _is_known(function: Any, signature: tuple[Any, ...]) -> bool:
+    """Whether the code for a signature is in memory or on disk."""
+    if signature in function.overloads:
+        return True
+    kept = function._cache
+    return kept._index_key(signature, function.targetctx.codegen()) in kept._cache_file._load_index()
+
+
+@cache
+def _announce_compilation() -> None:
+    print("hecogrid_envs: compiling the kernels, once on this machine (some seconds)", file=sys.stderr, flush=True)

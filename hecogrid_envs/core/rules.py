@@ -6,7 +6,7 @@ from hecogrid_envs.constants import Command, Terrain
 from hecogrid_envs.core.generation import present_colour
 from hecogrid_envs.core.jit import inlined
 from hecogrid_envs.core.occupancy import arrive, count_around, leave, redraw_cell
-from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.core.types import Games, RuleBook, whole
 
 _EMPTY = int(Terrain.EMPTY)
 _WALL = int(Terrain.WALL)
@@ -44,7 +44,7 @@ def act(games: Games, book: RuleBook, e: int, agent: int, action: int) -> None:
         _drop(games, book, e, agent)
     if not book.released:
         games.colour[e, agent] = present_colour(games, book, e, agent)
-    redraw_cell(games, book, e, games.x[e, agent], games.y[e, agent])
+    redraw_cell(games, book, e, whole(games.x[e, agent]), whole(games.y[e, agent]))
 
 
 @inlined
@@ -53,7 +53,7 @@ def _front(games: Games, e: int, agent: int) -> tuple[int, int]:
     direction = games.direction[e, agent]
     dx = (direction == 0) - (direction == 2)
     dy = (direction == 1) - (direction == 3)
-    return games.x[e, agent] + dx, games.y[e, agent] + dy
+    return whole(games.x[e, agent]) + dx, whole(games.y[e, agent]) + dy
 
 
 @inlined
@@ -63,7 +63,7 @@ def _forward(games: Games, book: RuleBook, e: int, agent: int) -> None:
     ground = games.terrain[e, front]
     if ground in (_WALL, _KEY):
         return
-    x, y = games.x[e, agent], games.y[e, agent]
+    x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
     leave(games, e, agent, y * book.width + x)
     redraw_cell(games, book, e, x, y)
     games.x[e, agent] = front_x
@@ -76,7 +76,7 @@ def _forward(games: Games, book: RuleBook, e: int, agent: int) -> None:
 
 @inlined
 def _pick_up(games: Games, book: RuleBook, e: int, agent: int) -> None:
-    x, y = games.x[e, agent], games.y[e, agent]
+    x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
     if games.terrain[e, y * book.width + x] == _TREASURE:
         _try_to_collect(games, book, e, agent, x, y)
     front_x, front_y = _front(games, e, agent)
@@ -103,13 +103,14 @@ def _try_to_collect(games: Games, book: RuleBook, e: int, agent: int, old_x: int
     """Collect the treasure under an agent if the task's condition holds; (old_x, old_y) is where its action began."""
     if book.task == _KEY_FOR_TREASURE and not games.has_key[e, agent]:
         return
-    cell = games.y[e, agent] * book.width + games.x[e, agent]
+    x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
+    cell = y * book.width + x
     if book.task == _TEAM_TOGETHER or (book.task == _KEY_FOR_TREASURE and not book.released):
         helpers = games.crowd[e, cell]
     elif book.released:
         helpers = _supporters_before(games, book, e, agent, old_x, old_y)
     else:
-        helpers = count_around(games, book, e, games.x[e, agent], games.y[e, agent])
+        helpers = count_around(games, book, e, x, y)
     if helpers >= book.coordination:
         games.terrain[e, cell] = _COLLECTED
         games.paid[e] += 1

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared
-from hecogrid_envs.core.batch_step import mark_games_over, reset_games, restart_game, step_games
+from hecogrid_envs.core.batch_step import mark_games_over, step_games
+from hecogrid_envs.core.generation import new_level
 from hecogrid_envs.core.jit import hot, kernel
 from hecogrid_envs.core.types import U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures, observe_tiles
@@ -70,13 +71,16 @@ def play_share(
         step_games(games, book, work.actions, first, end)
     if task & RESTART:
         mark_games_over(games, book, work.fresh, first, end)
+    if task & (RESTART | RESET):
         for e in range(first, end):
-            if work.fresh[e]:
-                if len(last_views):
-                    _observe(games, book, work, task, last_views, e, e + 1)
-                restart_game(games, book, e)
-    elif task & RESET:
-        reset_games(games, book, work.fresh, first, end)
+            if not work.fresh[e]:
+                continue
+            if len(last_views):
+                _observe(games, book, work, task, last_views, e, e + 1)
+            paid = games.paid[e]
+            new_level(games, book, e)
+            if task & RESTART:
+                games.paid[e] = paid  # by the last step; still to be read
     _observe(games, book, work, task, views, first, end)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,9 @@ U16 = npt.NDArray[np.uint16]
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]
 U64 = npt.NDArray[np.uint64]
+
+#: Any whole number as the integer of kernels' loops; each other type of an argument would compile the kernel once more.
+whole: Callable[[Any], int] = np.int64  # type: ignore[assignment]
 
 
 class RuleBook(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 
 from hecogrid_envs.core.jit import hot, inlined
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
-from hecogrid_envs.core.types import U8, Games, RuleBook
+from hecogrid_envs.core.types import U8, Games, RuleBook, whole
 from hecogrid_envs.core.words import copy_16, load_word, store_word
 
 _ONE = np.uint64(1)
@@ -18,7 +18,8 @@ _CHUNK_BYTES = 16
 @inlined
 def view_corner(games: Games, book: RuleBook, e: int, agent: int) -> int:
     """Offset of the top left cell of an agent's view in the plane turned for it."""
-    here = plane_offset(book, games.direction[e, agent], games.x[e, agent], games.y[e, agent])
+    facing, x, y = whole(games.direction[e, agent]), whole(games.x[e, agent]), whole(games.y[e, agent])
+    here = plane_offset(book, facing, x, y)
     return here - (book.view_size - 1 - book.view_offset) * book.stride - book.view_size // 2
 
 
