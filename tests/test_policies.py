@@ -390,6 +390,34 @@ def test_any_features_extractor_gets_the_own_space_and_what_sb3_prepares() -> No
         policy.extract_features(obs, raw.features_extractor)
 
 
+@pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW])
+def test_adam_steps_all_weights_at_once_unless_told_otherwise(optimizer_class: type[th.optim.Optimizer]) -> None:
+    kwargs: dict[str, Any] = {
+        "optimizer_class": optimizer_class,
+        "optimizer_kwargs": {"eps": 1.0},
+    }  # tiny gradients, tiny steps
+    fused = make_policy(IPPOPolicy, **kwargs)
+    kwargs["optimizer_kwargs"] = {"eps": 1.0, "foreach": False}
+    one_by_one = make_policy(IPPOPolicy, **kwargs)
+    assert fused.optimizer.defaults["fused"] is True
+    assert not one_by_one.optimizer.defaults["fused"]
+    one_by_one.load_state_dict(fused.state_dict())
+    before = {name: value.clone() for name, value in fused.state_dict().items()}
+    for policy in (fused, one_by_one):
+        _, log_prob, _ = policy.evaluate_actions(team_rows(VECTOR), th.zeros(12).long())
+        log_prob.sum().backward()
+        policy.optimizer.step()
+    after = one_by_one.state_dict()
+    assert any(not th.equal(value, before[name]) for name, value in after.items())
+    th.testing.assert_close(dict(fused.state_dict()), dict(after), rtol=0, atol=1e-6)
+
+
+def test_other_optimizers_get_what_they_were_given() -> None:
+    policy = make_policy(IPPOPolicy, optimizer_class=th.optim.SGD, optimizer_kwargs={"momentum": 0.5})
+    assert policy.optimizer.defaults["momentum"] == 0.5
+    assert not policy.optimizer.defaults["fused"]
+
+
 def test_net_arch_for_actor_and_critic() -> None:
     policy = make_policy(IPPOPolicy, net_arch={"pi": [5], "vf": [6, 7]})
     sizes = [tuple(p.shape) for name, p in policy.named_parameters() if name.endswith("weight") and "head" in name]

@@ -1,0 +1,46 @@
+"""The diagnosis of trained teams reads the folder of an experiment."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import diagnosis
+from sb3_saf.zoo.settings import load_settings
+
+
+def save_team(folder: Path, method: str, seed: int) -> None:
+    settings = load_settings(method, "TeamSupport-v0", "small", {"coordination": 2, "heterogeneity": 3})
+    model = settings.make_model(settings.make_env(seed), seed, device="cpu")
+    cell = folder / "cells" / "TeamSupport-c2-h3" / method / f"seed-{seed}"
+    cell.mkdir(parents=True)
+    model.save(cell / "model.zip")
+
+
+def test_it_looks_into_every_trained_team(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for method, seed in (("saf", 0), ("saf", 1), ("ippo", 0)):
+        save_team(tmp_path, method, seed)
+    assert [cell[:4] for cell in diagnosis.cells(tmp_path)] == [
+        ("TeamSupport", "c2-h3", "ippo", 0),
+        ("TeamSupport", "c2-h3", "saf", 0),
+        ("TeamSupport", "c2-h3", "saf", 1),
+    ]
+    assert not list(diagnosis.cells(tmp_path, "TeamTogether-*"))
+    kept = tmp_path / "numbers.json"
+    monkeypatch.setattr(sys, "argv", ["diagnosis", str(tmp_path), "--episodes", "2", "--json", str(kept)])
+    diagnosis.main()
+    numbers = json.loads(kept.read_text())
+    ippo, saf = numbers["TeamSupport c2-h3 ippo"], numbers["TeamSupport c2-h3 saf"]
+    assert saf["knowledge_source/read_entropy"] > 0.9  # untrained: nothing is chosen
+    assert 0 <= saf["pool/zone_dependence"] < 0.1
+    assert not any(name.startswith(("pool", "message")) for name in ippo)
+    assert 0 <= ippo["greedy"] <= 25
+    header, _, first, second = capsys.readouterr().out.strip().splitlines()
+    assert header.startswith("| task | level | method | critic/bias |")
+    assert first.startswith("| TeamSupport | c2-h3 | ippo |")
+    assert second.count("|") == header.count("|")
