@@ -10,43 +10,43 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import torch as th
 
 import sb3_saf
-from sb3_saf.zoo.settings import load_settings
+from hecogrid_envs.params import check_task
+from sb3_saf.experiments.cells import Cell
+from sb3_saf.experiments.definitions import Level
+from sb3_saf.experiments.results import Results
+
+_SETTING: Final = re.compile(r"(?P<task>\w+)-c(?P<c>\d+)-h(?P<h>\d+)(-n(?P<n>\d+))?")
 
 
-class Cell(NamedTuple):
-    """One trained team."""
-
-    task: str
-    level: str
-    method: str
-    seed: int
-    folder: Path
-
-
-def cells(folder: Path, setting: str = "*") -> Iterator[Cell]:
-    """Finished cells of an experiment's folder; ``setting`` such as TeamSupport-c2-h1."""
-    for model in sorted(folder.glob(f"cells/{setting}/*/*/model.zip")):
-        setting, method, seed = model.parts[-4:-1]
-        task, _, level = setting.partition("-")
-        yield Cell(task, level, method, int(seed.removeprefix("seed-").removeprefix("seed")), model.parent)
+def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
+    """Trained teams of an experiment's folder; ``setting`` such as TeamSupport-c2-h1."""
+    for model in sorted(results.folder.glob(f"cells/{setting}/*/*/model.zip")):
+        folder, method, seed = model.parts[-4:-1]
+        found = _SETTING.fullmatch(folder)
+        if found is None:
+            raise ValueError(f"expected a folder such as TeamSupport-c2-h1, got {folder}")
+        level, n_agents = Level(int(found["c"]), int(found["h"])), int(found["n"]) if found["n"] else None
+        yield Cell(method, check_task(found["task"]), level, int(seed.removeprefix("seed-")), (), n_agents)
 
 
-def look(cell: Cell, n_episodes: int) -> dict[str, float]:
+def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
     """Numbers by name."""
-    level = dict(zip(("coordination", "heterogeneity"), (int(part[1:]) for part in cell.level.split("-")), strict=True))
-    settings = load_settings(cell.method, f"{cell.task}-v0", "small", level)
+    protocol = results.protocol()
+    assert protocol is not None
+    settings = protocol.settings(cell)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=16)
     model = settings.make_model(env, cell.seed, device="cpu")
-    sb3_saf.load_weights(model, cell.folder / "model.zip")
+    sb3_saf.load_weights(model, results.cell_folder(cell) / "model.zip")
     scalars: dict[str, Any] = dict(sb3_saf.inspect_team(model, env, n_episodes).scalars)
     greedy = sb3_saf.evaluate_team(model, env, n_eval_episodes=n_episodes, deterministic=True)
     return {name: float(value) for name, value in scalars.items() if value is not None} | {"greedy": greedy.mean}
@@ -62,8 +62,9 @@ def main() -> None:
     options = parser.parse_args()
     th.set_num_threads(1)
     found: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
-    for cell in cells(options.folder, options.only):
-        found[cell[:3]].append(look(cell, options.episodes))
+    results = Results(options.folder)
+    for cell in cells(results, options.only):
+        found[cell.task, cell.level.slug, cell.method].append(look(cell, results, options.episodes))
     means = {
         key: {name: float(np.mean([one[name] for one in looks if name in one])) for name in looks[0]}
         for key, looks in found.items()

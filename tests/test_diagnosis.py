@@ -9,11 +9,17 @@ from pathlib import Path
 import pytest
 
 from benchmarks import diagnosis
+from sb3_saf.experiments.cells import Protocol
+from sb3_saf.experiments.results import Results
 from sb3_saf.zoo.settings import load_settings
+
+#: A network of another shape than the zoo's: the diagnosis must read what was trained from the folder.
+OVERRIDES = {"policy_kwargs": {"features_extractor_class": "LightEncoder", "net_arch": [32]}}
 
 
 def save_team(folder: Path, method: str, seed: int) -> None:
-    settings = load_settings(method, "TeamSupport-v0", "small", {"coordination": 2, "heterogeneity": 3})
+    level = {"coordination": 2, "heterogeneity": 3}
+    settings = load_settings(method, "TeamSupport-v0", "small", overrides={**OVERRIDES, "env_kwargs": level})
     model = settings.make_model(settings.make_env(seed), seed, device="cpu")
     cell = folder / "cells" / "TeamSupport-c2-h3" / method / f"seed-{seed}"
     cell.mkdir(parents=True)
@@ -25,12 +31,14 @@ def test_it_looks_into_every_trained_team(
 ) -> None:
     for method, seed in (("saf", 0), ("saf", 1), ("ippo", 0)):
         save_team(tmp_path, method, seed)
-    assert [cell[:4] for cell in diagnosis.cells(tmp_path)] == [
-        ("TeamSupport", "c2-h3", "ippo", 0),
-        ("TeamSupport", "c2-h3", "saf", 0),
-        ("TeamSupport", "c2-h3", "saf", 1),
+    results = Results(tmp_path)
+    results.agree(Protocol("small", OVERRIDES))
+    assert [str(cell) for cell in diagnosis.cells(results)] == [
+        "ippo TeamSupport c=2, h=3 seed 0",
+        "saf TeamSupport c=2, h=3 seed 0",
+        "saf TeamSupport c=2, h=3 seed 1",
     ]
-    assert not list(diagnosis.cells(tmp_path, "TeamTogether-*"))
+    assert not list(diagnosis.cells(results, "TeamTogether-*"))
     kept = tmp_path / "numbers.json"
     monkeypatch.setattr(sys, "argv", ["diagnosis", str(tmp_path), "--episodes", "2", "--json", str(kept)])
     diagnosis.main()

@@ -144,6 +144,25 @@ def test_light_encoder_embeds_each_tile_by_one_shared_layer() -> None:
         LightEncoder(PICTURE, tile_size=5)
 
 
+def test_one_hot_codes_tell_tiles_apart_that_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    space = CodeSpace()
+    space.atlas = space.atlas.copy()
+    space.atlas[1] = space.atlas[2]
+    views = th.zeros(2, *space.shape, dtype=th.uint8)
+    views[0, 0, 0], views[1, 0, 0] = 1, 2
+    plain, one_hot = LightEncoder(space), LightEncoder(space, one_hot_codes=True)
+    assert th.equal(*plain(views))
+    first, second = looked_up = one_hot(views)
+    assert (first - second).abs().max() > 0.01
+    monkeypatch.setattr(PixelInput, "looks_up", lambda *_: False)
+    th.testing.assert_close(one_hot(views), looked_up, rtol=0, atol=1e-5)
+
+
+def test_one_hot_codes_need_codes() -> None:
+    with pytest.raises(ValueError, match=r"one_hot_codes=True needs tile codes, .* got pictures \(3, 12, 12\); leave"):
+        LightEncoder(PICTURE, one_hot_codes=True)
+
+
 @pytest.mark.parametrize(
     "space",
     [

@@ -39,6 +39,8 @@ _PAPERS_PIXELS: Final = 64 * 64
 #: More pixels, or more weights, than anybody wants to train on without being asked.
 _MANY_PIXELS: Final = 128 * 128
 _MANY_WEIGHTS: Final = 10_000_000
+#: A one-hot code is as long as the pixels of a tile, roughly.
+_ONE_HOT_SCALE: Final = 2.0
 
 
 def is_tile_space(space: spaces.Space[Any]) -> bool:
@@ -222,12 +224,21 @@ class LightEncoder(BaseFeaturesExtractor):
 
     Tile codes are embedded once per code and looked up. In pictures, tiles are cut out first.
 
+    Tiles that look nearly alike have nearly the same embedding, as if they were nearly the same thing. With zones that
+    is in the way: an agent in orange means other actions than one in red. ``one_hot_codes`` tells them apart, but then
+    what was learned of one tile helps less with its likes (measured: ``results/README.md``).
+
     :param observation_space: pictures (either layout) or tile codes
     :param features_dim: size of the features
     :param tile_size: t, pixels per tile of pictures; tile codes bring their own
     :param embedding_dim: size of a tile's embedding
     :param hidden: size of the hidden layer
+    :param one_hot_codes: whether the embedding reads a tile's code beside its pixels. Needs tile codes, and the weights
+        do not fit pictures
+    :raises ValueError: for pictures that are not made of whole tiles, or with ``one_hot_codes``
     """
+
+    tile_inputs: th.Tensor
 
     def __init__(
         self,
@@ -236,6 +247,7 @@ class LightEncoder(BaseFeaturesExtractor):
         tile_size: int = 4,
         embedding_dim: int = 16,
         hidden: int = 128,
+        one_hot_codes: bool = False,
     ):
         super().__init__(observation_space, features_dim)
         self.pixels = PixelInput(observation_space)
@@ -248,7 +260,16 @@ class LightEncoder(BaseFeaturesExtractor):
                 'pass features_extractor_kwargs={"tile_size": ...}'
             )
         n_tiles = height * width // self.tile_size**2
-        self.embed = Linear(self.tile_size**2 * channels, embedding_dim, gain=HIDDEN_GAIN)
+        n_inputs = self.tile_size**2 * channels
+        if self.pixels.layout == "codes":
+            self.register_buffer("tile_inputs", self._inputs_of_codes(one_hot_codes), persistent=False)
+            n_inputs = self.tile_inputs.shape[1]
+        elif one_hot_codes:
+            raise ValueError(
+                'one_hot_codes=True needs tile codes, as make_team_env(..., observation="tiles") gives them (a Box of '
+                f"whole numbers with an atlas), got pictures {observation_space.shape}; leave it False"
+            )
+        self.embed = Linear(n_inputs, embedding_dim, gain=HIDDEN_GAIN)
         self.net = mlp([n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
         self._places = places_of_linear(n_tiles)
 
@@ -258,7 +279,7 @@ class LightEncoder(BaseFeaturesExtractor):
             looked_up: th.Tensor = self.net[1:](self._first_layer(observations))
             return looked_up
         if self.pixels.layout == "codes":
-            by_code = self.embed(self.pixels.atlas.flatten(1))
+            by_code = self.embed(self.tile_inputs)
             tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
         else:
             tiles = self.embed(self._cut(self.pixels(observations)))
@@ -270,11 +291,16 @@ class LightEncoder(BaseFeaturesExtractor):
         first = self.net[0]
         assert isinstance(first, nn.Linear)
         used = used_codes(codes.flatten(1))
-        embedded = self.embed(self.pixels.atlas[used.codes].flatten(1))
+        embedded = self.embed(self.tile_inputs[used.codes])
         # Weights are (hidden, T * e): what a code adds at each of the T places, (U, T, hidden).
         by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
         table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
         return sum_tiles(used.views, table, self._places).add_(first.bias)
+
+    def _inputs_of_codes(self, one_hot: bool) -> th.Tensor:
+        """(n_codes, inputs) what the embedding reads of every tile."""
+        pixels = self.pixels.atlas.flatten(1)
+        return th.cat([pixels, _ONE_HOT_SCALE * th.eye(len(pixels))], dim=1) if one_hot else pixels
 
     def _cut(self, pictures: th.Tensor) -> th.Tensor:
         """(K, tiles, t * t * C) pixels of each tile, in the order of an atlas: (K, C, H, W)."""
