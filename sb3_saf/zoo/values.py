@@ -108,7 +108,7 @@ _KINDS: Final = (
     Kind(lambda hint: hint is float, _number, "a number"),
     Kind(lambda hint: get_origin(hint) is AbstractCallable, _schedule, "a schedule such as 'lin_7e-4'"),
     Kind(lambda hint: hint is str, _instance(str), "a string"),
-    Kind(lambda hint: get_origin(hint) in (dict, Mapping), _instance(dict), "a mapping"),
+    Kind(lambda hint: get_origin(hint) in (dict, Mapping), _instance(dict), "a mapping, written {key: value}"),
     Kind(lambda hint: get_origin(hint) is list, _instance(list), "a list"),
     Kind(lambda hint: get_origin(hint) is tuple, _as_tuple, "a list"),
 )
