@@ -2,8 +2,9 @@
 Why do methods differ? Looks into the trained teams of an experiment's folder. ``python -m benchmarks.diagnosis FOLDER``
 
 For every finished cell it plays episodes with the trained team and asks the critic, the knowledge source and the pool
-(``sb3_saf.inspect_team``): how well values tell returns, whether messages matter, whether the pool chooses at all; and
-what the most likely actions would earn. Means over seeds; one row per method and level.
+(``sb3_saf.inspect_team``): how well values tell returns, whether messages matter, whether the pool chooses at all; how
+many actions are wasted in which zone; and what the most likely actions would earn. Means over seeds; one row per method
+and level.
 """
 
 from __future__ import annotations
@@ -17,13 +18,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_saf
+from hecogrid_envs.constants import Command
 from hecogrid_envs.params import check_task
 from sb3_saf.experiments.cells import Cell
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.results import Results
+from sb3_saf.inspection.doors import zones_by_attribute
 
 _SETTING: Final = re.compile(r"(?P<task>\w+)-c(?P<c>\d+)-h(?P<h>\d+)(-n(?P<n>\d+))?")
 
@@ -48,8 +53,33 @@ def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
     model = settings.make_model(env, cell.seed, device="cpu")
     sb3_saf.load_weights(model, results.cell_folder(cell) / "model.zip")
     scalars: dict[str, Any] = dict(sb3_saf.inspect_team(model, env, n_episodes).scalars)
+    scalars |= useless_commands(*commands_and_zones(model, env))
     greedy = sb3_saf.evaluate_team(model, env, n_eval_episodes=n_episodes, deterministic=True)
     return {name: float(value) for name, value in scalars.items() if value is not None} | {"greedy": greedy.mean}
+
+
+def commands_and_zones(model: BaseAlgorithm, env: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Commands that agents drew in one episode of every game, and the zones they were in; (steps, rows) each."""
+    params = env.unwrapped.batch.params
+    obs, commands, zones = env.reset(), [], []
+    for _ in range(params.max_cycles):
+        actions, _ = model.predict(obs, deterministic=False)
+        zones.append(zones_by_attribute(env))
+        commands.append(params.command_of()[zones[-1], actions])
+        obs, *_ = env.step(actions)
+    return np.stack(commands), np.stack(zones)
+
+
+def useless_commands(commands: npt.NDArray[np.uint8], zones: npt.NDArray[np.integer[Any]]) -> dict[str, float]:
+    """
+    How many actions are wasted: without keys, as in TeamSupport and TeamTogether, three commands do nothing at all.
+
+    :param commands: of agents in game steps
+    :param zones: where they were
+    :return: share of all commands, by zone
+    """
+    useless = np.isin(commands, [Command.DROP, Command.TOGGLE, Command.DONE])
+    return {f"useless/zone_{zone}": float(useless[zones == zone].mean()) for zone in np.unique(zones)}
 
 
 def main() -> None:

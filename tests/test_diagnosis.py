@@ -6,9 +6,11 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks import diagnosis
+from hecogrid_envs.constants import Command
 from sb3_saf.experiments.cells import Protocol
 from sb3_saf.experiments.results import Results
 from sb3_saf.zoo.settings import load_settings
@@ -48,7 +50,15 @@ def test_it_looks_into_every_trained_team(
     assert 0 <= saf["pool/zone_dependence"] < 0.1
     assert not any(name.startswith(("pool", "message")) for name in ippo)
     assert 0 <= ippo["greedy"] <= 25
+    for zone in range(3):  # untrained: three of seven commands do nothing
+        assert 0.3 < ippo[f"useless/zone_{zone}"] < 0.55
     header, _, first, second = capsys.readouterr().out.strip().splitlines()
     assert header.startswith("| task | level | method | critic/bias |")
     assert first.startswith("| TeamSupport | c2-h3 | ippo |")
     assert second.count("|") == header.count("|")
+
+
+def test_useless_commands_are_counted_by_zone() -> None:
+    commands = np.array([Command.FORWARD, Command.TOGGLE, Command.DONE, Command.DROP, Command.PICKUP], dtype=np.uint8)
+    counted = diagnosis.useless_commands(commands, np.array([0, 0, 2, 2, 2]))
+    assert counted == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(2 / 3)}
