@@ -85,4 +85,4 @@ def _is_known(function: Any, signature: tuple[Any, ...]) -> bool:
 
 @cache
 def _announce_compilation() -> None:
-    print("hecogrid_envs: compiling the kernels, once on this machine (some seconds)", file=sys.stderr, flush=True)
+    print("hecogrid_envs: compiling the kernels, once on this machine (about 20 seconds)", file=sys.stderr, flush=True)
