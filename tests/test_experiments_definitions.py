@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from hecogrid_envs.params import TASK_NAMES
 from sb3_saf.experiments.cells import Cell, Choice, Grid, Protocol, Shard, expand, merge
 from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Level, View, find_experiment
 
@@ -85,7 +84,7 @@ def test_paper_size_is_the_papers() -> None:
 def test_qplex_has_five_agents_at_every_size() -> None:
     cells = [
         Cell("qplex", task, level, 0, (level,), find_experiment("qplex").n_agents)
-        for task in TASK_NAMES
+        for task in find_experiment("qplex").tasks
         for level in [Level(1, 1)]
     ]
     assert find_experiment("qplex").methods == ("qplex", "qplex-pool")
@@ -106,7 +105,9 @@ def test_levels_that_do_not_fit_are_named_with_the_reason() -> None:
     three_agents = replace(PAPER, overrides={"env_kwargs": {"n_agents": 2}})
     grid = grid_of("coordination", three_agents)
     assert {cell.level.coordination for cell in grid.cells} == {1, 2}
-    assert [(left.task, left.test) for left in grid.left_out] == [(task, (3, 1)) for task in TASK_NAMES]
+    assert [(left.task, left.test) for left in grid.left_out] == [
+        (task, (3, 1)) for task in find_experiment("coordination").tasks
+    ]
     assert str(grid.left_out[0]) == (
         "TeamTogether: training at c=3, h=1 is left out: coordination must be an integer from 1 to 2 "
         "(1 <= coordination <= n_agents), got 3"
