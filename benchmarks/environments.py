@@ -24,32 +24,20 @@ import numpy as np
 
 import sb3_saf
 from benchmarks.baselines import BASELINES
+from benchmarks.batches import N_GAMES, batch_work
 from benchmarks.first_call import first_call_table
 from benchmarks.rates import Rate, Work, one_line, random_actions, rate, table, take_turns
 from benchmarks.rollout_memory import memory_table
+from benchmarks.two_threads import threads_table
 from benchmarks.workers import Worker
-from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds, make_vec_env, parallel_env
+from hecogrid_envs import TASK_NAMES, make_vec_env, parallel_env
 
-N_GAMES = 128
 ROUNDS = 7
 SECONDS = 0.3
 RESULTS = Path(__file__).parent / "results.md"
 COPY = "copy"
-
-
-def batch_work(task: str, observation: str, n_threads: int = 1, n_games: int = N_GAMES, **params: Any) -> Work:
-    """Step and observe a batch, games resetting at their time limit."""
-    all_params = HECOGridParams.from_kwargs({"observation": observation, **params})
-    batch = GameBatch(task, all_params, n_games, n_threads)
-    batch.reset(seeds=game_seeds(0, n_games))
-    out = batch.observe()
-    actions = random_actions((64, n_games, all_params.n_agents))
-
-    def work() -> int:
-        batch.advance(next(actions), out)
-        return n_games * all_params.n_agents
-
-    return work
+SECOND_PROCESSOR = """128 games on two threads, beside two processes with 64 games each, which share nothing: what the
+machine's second processor was worth while this ran. Medians and quartiles of ratios within a round."""
 
 
 def vec_env_work(venv: Any) -> Work:
@@ -176,6 +164,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     sections = {
         "Environments": speed_table(options.seconds, options.rounds),
+        "A second processor": SECOND_PROCESSOR + "\n\n" + threads_table(),
         "First step": first_call_table(options.starts),
         "Memory of a rollout, bytes per agent-step": memory_table(),
     }

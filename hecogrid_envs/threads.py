@@ -6,16 +6,20 @@ import os
 import threading
 import time
 import weakref
+from functools import partial
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from hecogrid_envs.arrays import aligned
 from hecogrid_envs.core.jit import entry_point
 from hecogrid_envs.core.sharing import (
     DESK_PART,
+    END,
+    FIRST,
+    NEXT,
+    PIECES,
     Workspace,
     is_asleep,
     lead,
@@ -23,9 +27,8 @@ from hecogrid_envs.core.sharing import (
     post,
     post_leave,
     serve,
-    wait_for_helpers,
 )
-from hecogrid_envs.core.types import U8, Games, RuleBook
+from hecogrid_envs.core.types import I64, U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures
 
 #: Looks at the desk before a helper goes to sleep, about half a millisecond: tight loops find it awake, and while a
@@ -40,40 +43,37 @@ NOTHING: Final[U8] = np.zeros(0, dtype=np.uint8)
 
 class Helpers:
     """
-    Threads that do their shares of every task that is posted.
+    Threads that help with every task that is posted.
 
     Awake, they begin without a lock or a call into Python. A pool of Python threads made two threads slower than one:
     a step is over in some tens of microseconds (``python -m benchmarks.environments`` measures one and two).
 
     :param arguments: games, book and workspace of a batch
-    :param own: the first game and one beyond the last, of the calling thread
-    :param shares: the same of each helper
+    :param shares: the first game and one beyond the last that each helper begins with; the last is the calling thread's
     """
 
-    def __init__(
-        self, arguments: tuple[Games, RuleBook, Workspace], own: tuple[int, int], shares: list[tuple[int, int]]
-    ):
+    def __init__(self, arguments: tuple[Games, RuleBook, Workspace], shares: list[tuple[int, int]]):
         #: Threads do not survive a fork.
         self.process = os.getpid()
-        self._arguments = arguments
-        self._own = own
         self._desk = aligned(DESK_PART * (1 + len(shares)), np.int64)
-        self._bells = [threading.Semaphore(0) for _ in shares]
+        for part, (first, end) in zip(self._desk.reshape(-1, DESK_PART)[1:], shares, strict=True):
+            part[FIRST], part[END], part[NEXT] = first, end, PIECES
+        self._bells = [threading.Semaphore(0) for _ in shares[1:]]
         #: Arrays of the task on the desk, which stay where they are until it is done.
         self._posted: tuple[U8, U8] | None = None
         self._post = entry_point(post, self._desk, 0, NOTHING, NOTHING)
-        self._lead = entry_point(lead, *arguments, self._desk, 0, 0, NOTHING, NOTHING, 0, 0)
-        self._wait = entry_point(wait_for_helpers, self._desk, 0)
+        lead_on = entry_point(lead, *arguments, self._desk, 0)
+        self._lead = partial(lead_on, *arguments, self._desk, _POLLS_OF_CALLER)
         self._asleep = entry_point(is_asleep, self._desk, 0)
-        compiled = entry_point(serve, *arguments, self._desk, 0, 0, 0, 0)
+        compiled = entry_point(serve, *arguments, self._desk, 0, 0)
         self.threads = [
             threading.Thread(
                 target=_serve,
-                args=(compiled, (*arguments, self._desk, helper, first, end, _POLLS_OF_HELPERS), bell),
+                args=(compiled, (*arguments, self._desk, helper, _POLLS_OF_HELPERS), bell),
                 name=f"hecogrid-{helper}",
                 daemon=True,
             )
-            for helper, ((first, end), bell) in enumerate(zip(shares, self._bells, strict=True), 1)
+            for helper, bell in enumerate(self._bells, 1)
         ]
         for thread in self.threads:
             thread.start()
@@ -86,13 +86,15 @@ class Helpers:
         :param task: see :func:`~hecogrid_envs.core.sharing.play_share`, as the arrays
         """
         if self._posted is not None:  # an interrupt came between the last task and its end
-            self._ring()
-            self._wait_on()
+            self._finish()
         self._posted = views, last_views
         if self._post(self._desk, task, views, last_views):
             self._ring()
-        if not self._lead(*self._arguments, self._desk, _POLLS_OF_CALLER, task, views, last_views, *self._own):
-            self._wait_on()
+        self._finish()
+
+    def _finish(self) -> None:
+        while not self._lead():
+            time.sleep(0)
         self._posted = None
 
     def _ring(self) -> None:
@@ -108,17 +110,13 @@ class Helpers:
         """
         return bool(self._asleep(self._desk, helper))
 
-    def _wait_on(self) -> None:
-        while not self._wait(self._desk, _POLLS_OF_CALLER):
-            time.sleep(0)
-
 
 def _serve(compiled: Any, arguments: tuple[Any, ...], bell: threading.Semaphore) -> None:
     while not compiled(*arguments):
         bell.acquire()
 
 
-def _send_away(desk: npt.NDArray[np.int64], bells: list[threading.Semaphore]) -> None:
+def _send_away(desk: I64, bells: list[threading.Semaphore]) -> None:
     post_leave(desk)
     for bell in bells:
         bell.release()
@@ -138,7 +136,7 @@ class Shares:
         self._arguments = (games, book, work)
         n_games = len(games.rng)
         edges = np.linspace(0, n_games, min(n_threads, n_games) + 1).astype(int).tolist()
-        *self._others, self._own = pairwise(edges)
+        self._shares = list(pairwise(edges))
         self._helpers: Helpers | None = None
         self._play = entry_point(play_share, *self._arguments, 0, NOTHING, NOTHING, 0, 0)
 
@@ -150,11 +148,11 @@ class Shares:
         :param views: contiguous, of the task
         :param last_views: as well
         """
-        if not self._others:
-            self._play(*self._arguments, task, views, last_views, *self._own)
+        if len(self._shares) == 1:
+            self._play(*self._arguments, task, views, last_views, *self._shares[0])
             return
         if self._helpers is None or self._helpers.process != os.getpid():
-            self._helpers = Helpers(self._arguments, self._own, self._others)
+            self._helpers = Helpers(self._arguments, self._shares)
         self._helpers.play(task, views, last_views)
 
     def play_game(self, task: int, game: int, views: U8) -> None:

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 
 from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs.arrays import aligned
+from hecogrid_envs.core.sharing import DESK_PART, END, FIRST, NEXT, STEP, lead, post
+from hecogrid_envs.threads import NOTHING
 
 PARAMS = HECOGridParams(n_agents=5, grid_size=12, n_treasures=30, observation="tiles")
 
@@ -49,6 +52,34 @@ def test_helpers_fall_asleep_and_are_woken() -> None:
         helpers = shared._shares._helpers
         assert helpers is not None
         wait_until(lambda helpers=helpers: all(map(helpers.is_asleep, (1, 2))))  # type: ignore[misc]
+
+
+def test_nobody_waits_for_a_helper_that_does_not_come() -> None:
+    alone, batch = batch_of(1), batch_of(1)
+    actions = np.random.default_rng(0).integers(0, 7, size=(6, 5))
+    alone.step(actions)
+    arguments = batch._shares._arguments
+    arguments[2].actions[...] = actions.reshape(-1)
+    desk = aligned(4 * DESK_PART, np.int64)
+    for part, (first, end) in zip(desk.reshape(4, -1)[1:], [(0, 2), (2, 4), (4, 6)], strict=True):
+        part[FIRST], part[END] = first, end
+    post(desk, STEP, NOTHING, NOTHING)
+    assert lead(*arguments, desk, 1)
+    np.testing.assert_array_equal(alone.observe(), batch.observe())
+    # What somebody else has taken is waited for.
+    post(desk, STEP, NOTHING, NOTHING)
+    desk[DESK_PART + NEXT] += 1
+    assert not lead(*arguments, desk, 1_000)
+
+
+@pytest.mark.parametrize(("n_threads", "n_games"), [(2, 3), (2, 40), (3, 17), (5, 5)])
+def test_whoever_plays_a_game_it_is_the_same(n_threads: int, n_games: int) -> None:
+    alone, shared = batch_of(1, n_games), batch_of(n_threads, n_games)
+    for row in np.random.default_rng(0).integers(0, 7, size=(400, n_games, 5)):
+        ours, over = shared.advance(row)
+        theirs, also_over = alone.advance(row)
+        assert (ours == theirs).all() and (over == also_over).all()
+    np.testing.assert_array_equal(shared.collected, alone.collected)
 
 
 def test_helpers_leave_with_their_batch() -> None:

@@ -45,6 +45,16 @@ def _store(_typing: Any, array: Any, index: Any, _value: Any) -> Any:
     return types.boolean(array, types.int64, types.int64), codegen
 
 
+def _take(_typing: Any, array: Any, index: Any, _amount: Any) -> Any:
+    """``take_shared(array, index, amount)``: add to an int64, in one go; what it was before."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = _element(context, builder, signature.args[0], args[0], args[1])
+        return builder.atomic_rmw("add", pointer, args[2], _ORDERING)
+
+    return types.int64(array, types.int64, types.int64), codegen
+
+
 def _bytes(_typing: Any, _address: Any, _n_bytes: Any) -> Any:
     """``bytes_at(address, n_bytes)``: memory that somebody else keeps, as (n_bytes,) uint8."""
     array_type = types.Array(types.uint8, 1, "C")
@@ -61,4 +71,5 @@ def _bytes(_typing: Any, _address: Any, _n_bytes: Any) -> Any:
 
 load_shared: Callable[[npt.NDArray[np.int64], int], int] = intrinsic(_load)  # type: ignore[assignment]
 store_shared: Callable[[npt.NDArray[np.int64], int, int], bool] = intrinsic(_store)  # type: ignore[assignment]
+take_shared: Callable[[npt.NDArray[np.int64], int, int], int] = intrinsic(_take)  # type: ignore[assignment]
 bytes_at: Callable[[int, int], npt.NDArray[np.uint8]] = intrinsic(_bytes)  # type: ignore[assignment]

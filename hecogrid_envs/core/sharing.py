@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared
+from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared, take_shared
 from hecogrid_envs.core.batch_step import mark_games_over, step_games
 from hecogrid_envs.core.generation import new_level
 from hecogrid_envs.core.jit import hot, kernel
-from hecogrid_envs.core.types import U8, Games, RuleBook
+from hecogrid_envs.core.types import I64, U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures, observe_tiles
 
 #: What a share can be: any sum of these, done in this order.
@@ -27,10 +24,19 @@ _TICKET: Final = 0
 _TASK: Final = 1
 _VIEWS: Final = 2
 _LAST: Final = 4
-#: Numbers from one helper's part of the desk to the next: two cache lines, so that writing does not disturb others.
+#: Games that are done.
+_FINISHED: Final = 8
+#: Numbers from one part of the desk to the next. Half a part is a cache line, so that writing does not disturb others.
 DESK_PART: Final = 16
-_DONE: Final = 0
-_ASLEEP: Final = 1
+#: Numbers of a thread's part: the next piece of its share that nobody has taken yet, then what stays as it is.
+NEXT: Final = 0
+FIRST: Final = 8
+END: Final = 9
+_ASLEEP: Final = 10
+#: Sixteenths of a share at which it is cut into pieces: as much as a thread does that is slowed down to 70 %, then
+#: little by little, since the last piece to be done is waited for.
+_CUTS: Final = (0, 11, 13, 15, 16)
+PIECES: Final = len(_CUTS) - 1
 
 
 class Workspace(NamedTuple):
@@ -96,34 +102,58 @@ def _observe(games: Games, book: RuleBook, work: Workspace, task: int, out: U8, 
 
 
 @kernel
-def lead(
-    games: Games,
-    book: RuleBook,
-    work: Workspace,
-    desk: npt.NDArray[np.int64],
-    polls: int,
-    task: int,
-    views: U8,
-    last_views: U8,
-    first: int,
-    end: int,
-) -> bool:
+def lead(games: Games, book: RuleBook, work: Workspace, desk: I64, polls: int) -> bool:
     """
-    Do the calling thread's share of a task, then wait for the helpers.
+    Take games of the task on the desk until none is left, the last share first, then wait for those that helpers took.
 
     :param polls: looks at the desk before giving up
-    :return: whether all is done; else :func:`wait_for_helpers` waits on
+    :return: whether all is done; else call again
     """
-    play_share(games, book, work, task, views, last_views, first, end)
-    return wait_for_helpers(desk, polls)
+    _take_games(games, book, work, desk, len(desk) // DESK_PART - 1)
+    n_games = desk[len(desk) - DESK_PART + END]
+    while load_shared(desk, _FINISHED) != n_games:
+        polls -= 1
+        if polls < 0:
+            return False
+    return True
+
+
+@kernel
+def _take_games(games: Games, book: RuleBook, work: Workspace, desk: I64, own: int) -> None:
+    """
+    Play games of the task on the desk, first those of one's own share, then what others have not come to.
+
+    A processor that is slower for a while, or busy with something else, does less then, and nobody waits for a helper
+    that is not awake yet. Shares keep most games in the cache of the processor that played them before.
+
+    :param own: part of the desk, from 1 on
+    """
+    n_shares, played = len(desk) // DESK_PART - 1, 0
+    for turn in range(n_shares):
+        part = (1 + (own - 1 + turn) % n_shares) * DESK_PART
+        start = desk[part + FIRST]
+        n_games = desk[part + END] - start
+        while load_shared(desk, part + NEXT) < PIECES:
+            piece = take_shared(desk, part + NEXT, 1)
+            if piece >= PIECES:
+                break
+            first = start + n_games * _CUTS[piece] // 16
+            last = start + n_games * _CUTS[piece + 1] // 16
+            # Read only now: as long as a piece is taken and not done, no other task comes to the desk.
+            views = bytes_at(desk[_VIEWS], desk[_VIEWS + 1])
+            last_views = bytes_at(desk[_LAST], desk[_LAST + 1])
+            play_share(games, book, work, desk[_TASK], views, last_views, first, last)
+            played += last - first
+    if played:
+        take_shared(desk, _FINISHED, played)
 
 
 @hot
-def post(desk: npt.NDArray[np.int64], task: int, views: U8, last_views: U8) -> bool:
+def post(desk: I64, task: int, views: U8, last_views: U8) -> bool:
     """
     Put a task on the desk; helpers that are awake begin at once.
 
-    :param desk: (DESK_PART * (1 + helpers),)
+    :param desk: (DESK_PART * (1 + shares),)
     :param views: of the task; stays where it is until the task is done
     :param last_views: of the task, as well
     :return: whether a helper must be woken
@@ -131,22 +161,27 @@ def post(desk: npt.NDArray[np.int64], task: int, views: U8, last_views: U8) -> b
     desk[_TASK] = task
     desk[_VIEWS], desk[_VIEWS + 1] = views.ctypes.data, len(views)
     desk[_LAST], desk[_LAST + 1] = last_views.ctypes.data, len(last_views)
+    store_shared(desk, _FINISHED, 0)
+    n_shares = len(desk) // DESK_PART - 1
+    for share in range(1, n_shares + 1):
+        # A helper that still looks for games of the last task may take of this one from here on.
+        store_shared(desk, share * DESK_PART + NEXT, 0)
     store_shared(desk, _TICKET, desk[_TICKET] + 1)
     sleeps = False
-    for helper in range(1, len(desk) // DESK_PART):
+    for helper in range(1, n_shares):
         sleeps |= is_asleep(desk, helper)
     return sleeps
 
 
 @hot
-def post_leave(desk: npt.NDArray[np.int64]) -> None:
+def post_leave(desk: I64) -> None:
     """Send the helpers away."""
     desk[_TASK] = _LEAVE
     store_shared(desk, _TICKET, desk[_TICKET] + 1)
 
 
 @hot
-def is_asleep(desk: npt.NDArray[np.int64], helper: int) -> bool:
+def is_asleep(desk: I64, helper: int) -> bool:
     """
     Whether a helper waits for its bell.
 
@@ -155,46 +190,21 @@ def is_asleep(desk: npt.NDArray[np.int64], helper: int) -> bool:
     return load_shared(desk, helper * DESK_PART + _ASLEEP) != 0
 
 
-@hot
-def wait_for_helpers(desk: npt.NDArray[np.int64], polls: int) -> bool:
-    """
-    Wait until all helpers are done with the task on the desk.
-
-    :param polls: looks at the desk before giving up
-    :return: whether they are
-    """
-    helper, n_parts, ticket = 1, len(desk) // DESK_PART, desk[_TICKET]
-    for _ in range(polls):
-        while helper < n_parts and load_shared(desk, helper * DESK_PART + _DONE) == ticket:
-            helper += 1
-        if helper == n_parts:
-            return True
-    return False
-
-
 @kernel
-def serve(
-    games: Games,
-    book: RuleBook,
-    work: Workspace,
-    desk: npt.NDArray[np.int64],
-    helper: int,
-    first: int,
-    end: int,
-    polls: int,
-) -> bool:
+def serve(games: Games, book: RuleBook, work: Workspace, desk: I64, helper: int, polls: int) -> bool:
     """
-    Do a helper's share of whatever comes, until nothing has come for a while.
+    Help with whatever comes, until nothing has come for a while.
 
+    :param helper: whose share comes first, from 1 on
     :param polls: looks at the desk before going to sleep
     :return: whether the helper has been sent away; else it is to wait for its bell and come back
     """
-    done, asleep = helper * DESK_PART + _DONE, helper * DESK_PART + _ASLEEP
+    asleep = helper * DESK_PART + _ASLEEP
     store_shared(desk, asleep, 0)
-    idle = 0
+    idle, seen = 0, -1
     while True:
         ticket = load_shared(desk, _TICKET)
-        if ticket == desk[done]:
+        if ticket == seen:
             idle += 1
             if idle < polls:
                 continue
@@ -206,8 +216,6 @@ def serve(
             continue
         if desk[_TASK] == _LEAVE:
             return True
-        views = bytes_at(desk[_VIEWS], desk[_VIEWS + 1])
-        last_views = bytes_at(desk[_LAST], desk[_LAST + 1])
-        play_share(games, book, work, desk[_TASK], views, last_views, first, end)
-        store_shared(desk, done, ticket)
+        _take_games(games, book, work, desk, helper)
+        seen = ticket
         idle = 0
