@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain
-from hecogrid_envs.core.occupancy import plane_offset, set_wall_bits
+from hecogrid_envs.core.occupancy import plane_offset
 from hecogrid_envs.core.types import Games, RuleBook
 from hecogrid_envs.params import TASK_NAMES, HECOGridParams, TaskName
 from hecogrid_envs.tiles import FIRST_TERRAIN
@@ -102,14 +102,15 @@ def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
 def _with_blank_map(book: RuleBook) -> RuleBook:
     """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
     planes = np.full((4, book.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
-    book = book._replace(blank_bits=np.zeros(4 * book.bits_bytes, dtype=np.uint8))
-    bits = empty_games(book, 1)._replace(wall_bits=book.blank_bits)
-    for i in range(book.width):
-        for x, y in ((i, 0), (i, book.width - 1), (0, i), (book.width - 1, i)):
-            set_wall_bits(bits, book, 0, x, y)
-            for facing in range(4):
-                planes[facing, plane_offset(book, facing, x, y)] = FIRST_TERRAIN + Terrain.WALL
-    return book._replace(blank_planes=planes.reshape(-1))
+    bits = np.zeros((4, book.bits_bytes), dtype=np.uint8)
+    outer = np.ones((book.width, book.width), dtype=bool)
+    outer[1:-1, 1:-1] = False
+    x, y = np.nonzero(outer)
+    for facing in range(4):
+        cells = plane_offset.py_func(book, facing, x, y)  # type: ignore[attr-defined]
+        planes[facing, cells] = FIRST_TERRAIN + Terrain.WALL
+        np.bitwise_or.at(bits[facing], cells >> 3, np.uint8(1) << (cells & 7).astype(np.uint8))
+    return book._replace(blank_planes=planes.reshape(-1), blank_bits=bits.reshape(-1))
 
 
 def empty_games(book: RuleBook, n_games: int) -> Games:

@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from hecogrid_envs.arrays import SLACK, aligned, empty_games, rule_book
 from hecogrid_envs.constants import Terrain, TreasureState
-from hecogrid_envs.core.generation import clear, draw_level
-from hecogrid_envs.core.occupancy import arrive
+from hecogrid_envs.core.generation import begin
 from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Workspace
 from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName, check_task
@@ -235,7 +234,6 @@ class GameBatch:
         state = check_state(mapping, self.params)
         games, width = self._games, self.params.grid_size
         self._seed(game, None)
-        clear(games, self._book, game)
         terrain = np.zeros((width, width), dtype=np.uint8)
         terrain[state["walls"]] = Terrain.WALL
         terrain[state["treasures"] == TreasureState.AVAILABLE] = Terrain.TREASURE
@@ -245,9 +243,7 @@ class GameBatch:
         games.x[game], games.y[game] = state["agent_pos"].T
         games.direction[game] = state["agent_dir"]
         games.has_key[game] = state["agent_has_key"]
-        for agent in range(self.params.n_agents):
-            arrive(games, game, agent, int(games.y[game, agent] * width + games.x[game, agent]))
-        draw_level(games, self._book, game)
+        begin(games, self._book, game)
 
     def snapshot(self) -> dict[str, npt.NDArray[Any]]:
         """

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hecogrid_envs.core import jit
+from hecogrid_envs.core.occupancy import plane_offset
 from hecogrid_envs.core.sharing import is_asleep
 
 _ARGUMENTS = (np.zeros(32, dtype=np.int64), 1)
@@ -23,7 +24,7 @@ def fresh_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[],
 
     def make() -> Any:
         jit._announce_compilation.cache_clear()
-        return jit.hot(is_asleep.py_func)  # type: ignore[attr-defined]
+        return jit.hot_entry(is_asleep.py_func)  # type: ignore[attr-defined]
 
     return make
 
@@ -64,3 +65,8 @@ def test_the_fingerprint_reads_every_file_of_the_kernels(monkeypatch: pytest.Mon
     jit._fingerprint()
     core = {path.name for path in Path(jit.__file__).parent.glob("*.py")}
     assert core | {"constants.py", "tiles.py"} == set(read)
+
+
+def test_what_only_kernels_call_says_so() -> None:
+    with pytest.raises(TypeError, match="plane_offset is compiled for kernels only: mark it as an entry to call it"):
+        plane_offset(None, 0, 1, 1)  # type: ignore[arg-type]

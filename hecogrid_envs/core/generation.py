@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hecogrid_envs.constants import Terrain
-from hecogrid_envs.core.jit import inlined, kernel
+from hecogrid_envs.core.jit import inlined, kernel, kernel_entry
 from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.types import Games, RuleBook
@@ -19,24 +19,36 @@ _KEY = int(Terrain.KEY)
 @kernel
 def new_level(games: Games, book: RuleBook, e: int) -> None:
     """Reset game ``e`` to a random level."""
-    clear(games, book, e)
+    _clear(games, book, e)
     _place_objects(games, book, e)
     for agent in range(book.n_agents):
         _place_agent(games, book, e, agent)
         if not book.released:
             games.direction[e, agent] = below(games.rng, e, 4)
-    draw_level(games, book, e)
+    begin(games, book, e)
 
 
-@kernel
-def clear(games: Games, book: RuleBook, e: int) -> None:
-    """Empty map inside the outer wall, counters at zero."""
-    width = book.width
-    for cell in range(width * width):
-        games.terrain[e, cell] = _EMPTY
+@kernel_entry
+def begin(games: Games, book: RuleBook, e: int) -> None:
+    """Begin an episode with the terrain, positions, directions and keys of game ``e``: all else follows from them."""
+    games.steps[e] = 0
+    games.collected[e] = 0
+    games.paid[e] = 0
+    for cell in range(book.width * book.width):
         games.head[e, cell] = -1
         games.tail[e, cell] = -1
         games.crowd[e, cell] = 0
+    for agent in range(book.n_agents):
+        arrive(games, e, agent, games.y[e, agent] * book.width + games.x[e, agent])
+    _draw_level(games, book, e)
+
+
+@kernel
+def _clear(games: Games, book: RuleBook, e: int) -> None:
+    """Empty map inside the outer wall, no keys in hands."""
+    width = book.width
+    for cell in range(width * width):
+        games.terrain[e, cell] = _EMPTY
     for i in range(width):
         games.terrain[e, i] = _WALL
         games.terrain[e, (width - 1) * width + i] = _WALL
@@ -44,9 +56,6 @@ def clear(games: Games, book: RuleBook, e: int) -> None:
         games.terrain[e, i * width + width - 1] = _WALL
     for agent in range(book.n_agents):
         games.has_key[e, agent] = 0
-    games.steps[e] = 0
-    games.collected[e] = 0
-    games.paid[e] = 0
 
 
 @kernel
@@ -78,11 +87,10 @@ def _place_agent(games: Games, book: RuleBook, e: int, agent: int) -> None:
             break
     games.x[e, agent] = x
     games.y[e, agent] = y
-    arrive(games, e, agent, y * book.width + x)
 
 
 @kernel
-def draw_level(games: Games, book: RuleBook, e: int) -> None:
+def _draw_level(games: Games, book: RuleBook, e: int) -> None:
     """Derive everything that views need from terrain and agents, at the start of an episode."""
     planes, bits = e * 4 * book.plane_bytes, e * 4 * book.bits_bytes
     for i in range(4 * book.plane_bytes):

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 from hecogrid_envs.core.atomic import bytes_at, load_shared, store_shared, take_shared
 from hecogrid_envs.core.batch_step import mark_games_over, step_games
 from hecogrid_envs.core.generation import new_level
-from hecogrid_envs.core.jit import hot, kernel
+from hecogrid_envs.core.jit import hot_entry, kernel, kernel_entry
 from hecogrid_envs.core.types import I64, U8, Games, RuleBook
 from hecogrid_envs.core.view import draw_pictures, observe_tiles
 
@@ -61,7 +61,7 @@ class Workspace(NamedTuple):
     tile: int
 
 
-@kernel
+@kernel_entry
 def play_share(
     games: Games, book: RuleBook, work: Workspace, task: int, views: U8, last_views: U8, first: int, end: int
 ) -> None:
@@ -101,7 +101,7 @@ def _observe(games: Games, book: RuleBook, work: Workspace, task: int, out: U8, 
         draw_pictures(work.codes, work.facing, *atlas, out, first * book.n_agents, end * book.n_agents)
 
 
-@kernel
+@kernel_entry
 def lead(games: Games, book: RuleBook, work: Workspace, desk: I64, polls: int) -> bool:
     """
     Take games of the task on the desk until none is left, the last share first, then wait for those that helpers took.
@@ -148,7 +148,7 @@ def _take_games(games: Games, book: RuleBook, work: Workspace, desk: I64, own: i
         take_shared(desk, _FINISHED, played)
 
 
-@hot
+@hot_entry
 def post(desk: I64, task: int, views: U8, last_views: U8) -> bool:
     """
     Put a task on the desk; helpers that are awake begin at once.
@@ -173,14 +173,14 @@ def post(desk: I64, task: int, views: U8, last_views: U8) -> bool:
     return sleeps
 
 
-@hot
+@hot_entry
 def post_leave(desk: I64) -> None:
     """Send the helpers away."""
     desk[_TASK] = _LEAVE
     store_shared(desk, _TICKET, desk[_TICKET] + 1)
 
 
-@hot
+@hot_entry
 def is_asleep(desk: I64, helper: int) -> bool:
     """
     Whether a helper waits for its bell.
@@ -190,7 +190,7 @@ def is_asleep(desk: I64, helper: int) -> bool:
     return load_shared(desk, helper * DESK_PART + _ASLEEP) != 0
 
 
-@kernel
+@kernel_entry
 def serve(games: Games, book: RuleBook, work: Workspace, desk: I64, helper: int, polls: int) -> bool:
     """
     Help with whatever comes, until nothing has come for a while.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hecogrid_envs.core.jit import hot, inlined
+from hecogrid_envs.core.jit import hot, hot_entry, inlined
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
 from hecogrid_envs.core.types import U8, Games, RuleBook, whole
 from hecogrid_envs.core.words import copy_16, load_word, store_word
@@ -127,7 +127,7 @@ def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) 
             out[start + own] = agent_code(ground, games.colour[e, agent], 3)
 
 
-@hot
+@hot_entry
 def draw_pictures(
     codes: U8, facing: U8, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
 ) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from scipy.special import stdtrit
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -89,6 +88,8 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
     if len(sample) == 1:
         return Interval(-math.inf, math.inf)
     mean = float(sample.mean())
+    from scipy.special import stdtrit  # here, since it takes a tenth of a second that few need
+
     t = float(stdtrit(len(sample) - 1, (1 + confidence) / 2))
     margin = t * float(sample.std(ddof=1)) / math.sqrt(len(sample))
     return Interval(mean - margin, mean + margin)
