@@ -35,6 +35,13 @@ env = sb3_saf.make_team_env("TeamSupport", n_envs=128, seed=0)
 env.reset(); env.step(numpy.zeros(env.num_envs, dtype=int))
 print(imported)
 """,
+    "the libraries alone: SB3 with torch, an empty function of numba": """
+import time; start = time.perf_counter()
+import numba, stable_baselines3
+imported = time.perf_counter() - start
+numba.njit(lambda: 0)()
+print(imported)
+""",
 }
 
 
