@@ -18,7 +18,7 @@ from sb3_saf.common.tile_sums import (
     Places,
     places_of_convolution,
     places_of_linear,
-    sum_tiles,
+    rectified_sums,
     table_of_convolution,
     used_codes,
 )
@@ -47,8 +47,10 @@ def test_a_convolution_by_looking_up_is_the_convolution(tile: int, kernel: int, 
     views = _views(rows, columns)
     used = used_codes(views)
     places = places_of_convolution(rows, columns, tile, kernel, stride)
-    looked_up = sum_tiles(used.views, table_of_convolution(tiles[used.codes], weight, stride), places)
-    expected = nn.functional.conv2d(_pixels(views, tiles, rows, columns), weight, stride=stride)
+    bias = th.randn(6, dtype=th.float64)
+    looked_up = rectified_sums(used.views, table_of_convolution(tiles[used.codes], weight, stride), bias, places)
+    expected = nn.functional.conv2d(_pixels(views, tiles, rows, columns), weight, bias, stride=stride).relu()
+    assert (expected == 0).any() and (expected > 0).any()
     assert looked_up.shape == expected.shape
     th.testing.assert_close(looked_up, expected)
 
@@ -58,12 +60,18 @@ def _some_places() -> list[Places]:
 
 
 @pytest.mark.parametrize("places", _some_places(), ids=["linear", "convolution"])
-def test_gradients_of_any_order(places: Places) -> None:
+def test_gradients_of_first_and_second_order(places: Places) -> None:
     views = used_codes(_views(2, 3, n_views=3)).views
     table = th.randn(int(views.max()) + 1, int(places.way.max()) + 1, 2, dtype=th.float64, requires_grad=True)
-    assert th.autograd.gradcheck(lambda x: sum_tiles(views, x, places), (table,))
-    # What is linear has no second derivative of its own: square it.
-    assert th.autograd.gradgradcheck(lambda x: sum_tiles(views, x, places) ** 2, (table,))
+    bias = th.randn(2, dtype=th.float64, requires_grad=True)
+
+    def square(table: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        """What is linear has no second derivative of its own."""
+        return rectified_sums(views, table, bias, places) ** 2
+
+    assert (square(table, bias) == 0).any()
+    assert th.autograd.gradcheck(square, (table, bias))
+    assert th.autograd.gradgradcheck(square, (table, bias))
 
 
 def test_codes_that_occur() -> None:

@@ -27,7 +27,7 @@ from sb3_saf.common.tile_sums import (
     Places,
     places_of_convolution,
     places_of_linear,
-    sum_tiles,
+    rectified_sums,
     table_of_convolution,
     used_codes,
 )
@@ -173,16 +173,16 @@ class PaperCNN(BaseFeaturesExtractor):
         if self._places is None or not self.pixels.looks_up(observations):
             features: th.Tensor = self.net(self.pixels(observations))
             return features
-        looked_up: th.Tensor = self.net[1:](self._first_layer(observations, self._places))
+        looked_up: th.Tensor = self.net[2:](self._first_layer(observations, self._places))
         return looked_up
 
     def _first_layer(self, codes: th.Tensor, places: Places) -> th.Tensor:
-        """(K, 32, h, w) outputs of the first convolution: (K, rows, columns)."""
+        """(K, 32, h, w) outputs of the first convolution and its ReLU: (K, rows, columns)."""
         first = self.net[0]
         assert isinstance(first, nn.Conv2d) and first.bias is not None
         used = used_codes(codes.flatten(1))
         table = table_of_convolution(self.pixels.tiles(used.codes), first.weight, stride=2)
-        return sum_tiles(used.views, table, places).add_(first.bias.view(-1, 1, 1))
+        return rectified_sums(used.views, table, first.bias, places)
 
 
 def _after_convolutions(size: int) -> int:
@@ -276,7 +276,7 @@ class LightEncoder(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """(K, *shape) views to (K, features_dim)."""
         if self.pixels.looks_up(observations):
-            looked_up: th.Tensor = self.net[1:](self._first_layer(observations))
+            looked_up: th.Tensor = self.net[2:](self._first_layer(observations))
             return looked_up
         if self.pixels.layout == "codes":
             by_code = self.embed(self.tile_inputs)
@@ -287,7 +287,7 @@ class LightEncoder(BaseFeaturesExtractor):
         return features
 
     def _first_layer(self, codes: th.Tensor) -> th.Tensor:
-        """(K, hidden) outputs of the first linear layer: (K, rows, columns)."""
+        """(K, hidden) outputs of the first linear layer and its ReLU: (K, rows, columns)."""
         first = self.net[0]
         assert isinstance(first, nn.Linear)
         used = used_codes(codes.flatten(1))
@@ -295,7 +295,7 @@ class LightEncoder(BaseFeaturesExtractor):
         # Weights are (hidden, T * e): what a code adds at each of the T places, (U, T, hidden).
         by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
         table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
-        return sum_tiles(used.views, table, self._places).add_(first.bias)
+        return rectified_sums(used.views, table, first.bias, self._places)
 
     def _inputs_of_codes(self, one_hot: bool) -> th.Tensor:
         """(n_codes, inputs) what the embedding reads of every tile."""

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 from numba import njit
+from torch.autograd.function import once_differentiable
 
 Ints: TypeAlias = npt.NDArray[np.int64]
 Floats: TypeAlias = npt.NDArray[Any]
@@ -120,50 +121,68 @@ def used_codes(views: th.Tensor) -> UsedCodes:
     return UsedCodes(th.from_numpy(codes), th.from_numpy(number[array]))
 
 
-def sum_tiles(views: th.Tensor, table: th.Tensor, places: Places) -> th.Tensor:
+def rectified_sums(views: th.Tensor, table: th.Tensor, bias: th.Tensor, places: Places) -> th.Tensor:
     """
-    Add up what tiles add.
+    Add up what tiles add and the bias, and cut off below zero: a first layer and its ReLU in one pass over memory.
 
     :param views: (K, T) int64 on the CPU, numbers of codes
     :param table: (U, S, W)
+    :param bias: (W,)
     :param places: of the layer
-    :return: (K, W) or (K, W, height, width), channels last in memory; differentiable by ``table`` any number of times
+    :return: (K, W) or (K, W, height, width), channels last in memory; differentiable by table and bias, twice
     """
-    summed: th.Tensor = _Gathered.apply(table, views, places)
+    summed: th.Tensor = _Rectified.apply(table, bias, views, places)
     return summed
 
 
-class _Gathered(th.autograd.Function):
-    """(U, S, W) table -> (K, W, *size) sums. It is linear, and :class:`_Scattered` is its transpose."""
+class _Rectified(th.autograd.Function):
+    """(U, S, W) table and (W,) bias -> (K, W, *size). But for what is cut off, :class:`_Back` is its transpose."""
 
     @staticmethod
-    def forward(ctx: Any, table: th.Tensor, views: th.Tensor, places: Places) -> th.Tensor:
+    def forward(ctx: Any, table: th.Tensor, bias: th.Tensor, views: th.Tensor, places: Places) -> th.Tensor:
+        sums = _gathered(table, bias, views, places, rectify=True)
+        ctx.save_for_backward(sums)
         ctx.views, ctx.places, ctx.n_codes, ctx.n_ways = views, places, *table.shape[:2]
-        # Not a permuted view: writing into one in place, as the next layers do, makes autograd copy.
-        sums = table.new_empty((len(views), table.shape[2], *places.size))
-        if places.size:
-            sums = th.empty_like(sums, memory_format=th.channels_last)
-        _gather(_flat(views), _flat(table), _flat(_places_last(sums)), *places[1:], views.shape[1], *table.shape[1:])
         return sums
 
     @staticmethod
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[Any, ...]:
-        return _Scattered.apply(gradients[0], ctx.views, ctx.places, ctx.n_codes, ctx.n_ways), None, None
+        (sums,) = ctx.saved_tensors
+        return *_Back.apply(gradients[0], sums, ctx.views, ctx.places, ctx.n_codes, ctx.n_ways), None, None
 
 
-class _Scattered(th.autograd.Function):
-    """(K, W, *size) -> (U, S, W): each place gives its numbers to all that it sees."""
+class _Back(th.autograd.Function):
+    """(K, W, *size) -> (U, S, W) and (W,): each place above zero gives its numbers to the bias and all that it sees."""
 
     @staticmethod
-    def forward(ctx: Any, sums: th.Tensor, views: th.Tensor, places: Places, n_codes: int, n_ways: int) -> th.Tensor:
+    def forward(
+        ctx: Any, gradient: th.Tensor, sums: th.Tensor, views: th.Tensor, places: Places, n_codes: int, n_ways: int
+    ) -> tuple[th.Tensor, th.Tensor]:
+        ctx.save_for_backward(sums)
         ctx.views, ctx.places = views, places
-        table = sums.new_zeros((n_codes, n_ways, sums.shape[1]))
-        _scatter(_flat(views), _flat(_places_last(sums)), _flat(table), *places[1:], views.shape[1], *table.shape[1:])
-        return table
+        table = gradient.new_zeros((n_codes, n_ways, gradient.shape[1]))
+        bias = gradient.new_zeros(gradient.shape[1])
+        arrays = (_flat(views), _flat(_places_last(gradient)), _flat(_places_last(sums)), _flat(table), _flat(bias))
+        _scatter(*arrays, *places[1:], views.shape[1], n_ways)
+        return table, bias
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[Any, ...]:
-        return _Gathered.apply(gradients[0], ctx.views, ctx.places), None, None, None, None
+        (sums,) = ctx.saved_tensors
+        table, bias = gradients
+        back = _gathered(table, bias, ctx.views, ctx.places, rectify=False) * (sums > 0)
+        return back, None, None, None, None, None
+
+
+def _gathered(table: th.Tensor, bias: th.Tensor, views: th.Tensor, places: Places, rectify: bool) -> th.Tensor:
+    # Not a permuted view: writing into one in place makes autograd copy.
+    sums = table.new_empty((len(views), table.shape[2], *places.size))
+    if places.size:
+        sums = th.empty_like(sums, memory_format=th.channels_last)
+    arrays = (_flat(views), _flat(table), _flat(bias), _flat(_places_last(sums)))
+    _gather(*arrays, *places[1:], views.shape[1], table.shape[1], rectify)
+    return sums
 
 
 def _places_last(sums: th.Tensor) -> th.Tensor:
@@ -187,11 +206,23 @@ def _mark(views: npt.NDArray[Any], seen: npt.NDArray[np.bool_]) -> None:
 
 @njit(cache=True, nogil=True)
 def _gather(
-    views: Ints, table: Floats, sums: Floats, first: Ints, tile: Ints, way: Ints, n_tiles: int, n_ways: int, width: int
+    views: Ints,
+    table: Floats,
+    bias: Floats,
+    sums: Floats,
+    first: Ints,
+    tile: Ints,
+    way: Ints,
+    n_tiles: int,
+    n_ways: int,
+    rectify: bool,
 ) -> None:
     """Write every place's sum, two tiles at a time."""
     u = np.uint64
+    width = len(bias)
     size, to = u(width), u(0)
+    # Arrays, since a zero written as such would be of double precision.
+    lowest = np.full_like(bias, 0 if rectify else -np.inf)
     for view in range(views.size // n_tiles):
         base = u(view) * u(n_tiles)
         for place in range(first.size - 1):
@@ -212,21 +243,41 @@ def _gather(
                 for w in range(width):
                     sums[to + u(w)] += table[a + u(w)] + table[b + u(w)]
                 j += u(2)
+            for w in range(width):
+                whole = sums[to + u(w)] + bias[u(w)]
+                sums[to + u(w)] = lowest[u(w)] if whole < lowest[u(w)] else whole
             to += size
 
 
 @njit(cache=True, nogil=True)
 def _scatter(
-    views: Ints, sums: Floats, table: Floats, first: Ints, tile: Ints, way: Ints, n_tiles: int, n_ways: int, width: int
+    views: Ints,
+    gradient: Floats,
+    sums: Floats,
+    table: Floats,
+    bias: Floats,
+    first: Ints,
+    tile: Ints,
+    way: Ints,
+    n_tiles: int,
+    n_ways: int,
 ) -> None:
-    """Add every place's numbers to the rows of the table that it took."""
+    """Add the numbers of every place that is above zero to the rows of the table that it took, and to the bias."""
     u = np.uint64
+    width = len(bias)
     size, source = u(width), u(0)
+    zero, passed, of_view = np.zeros_like(bias), np.zeros_like(bias), np.zeros_like(bias)
     for view in range(views.size // n_tiles):
         base = u(view) * u(n_tiles)
+        of_view[:] = 0
         for place in range(first.size - 1):
+            for w in range(width):
+                passed[u(w)] = zero[u(w)] if sums[source + u(w)] <= zero[u(w)] else gradient[source + u(w)]
+                of_view[u(w)] += passed[u(w)]
             for j in range(first[u(place)], first[u(place) + u(1)]):
                 to = (u(views[base + u(tile[u(j)])]) * u(n_ways) + u(way[u(j)])) * size
                 for w in range(width):
-                    table[to + u(w)] += sums[source + u(w)]
+                    table[to + u(w)] += passed[u(w)]
             source += size
+        for w in range(width):
+            bias[u(w)] += of_view[u(w)]
