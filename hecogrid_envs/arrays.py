@@ -143,4 +143,5 @@ def empty_games(book: RuleBook, n_games: int) -> Games:
         paid=aligned(n_games, np.int32),
     )
     games.order[...] = np.arange(book.n_agents)
+    games.planes.reshape(n_games, -1)[...] = book.blank_planes  # the outer wall and what lies beyond it stay
     return games

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from hecogrid_envs.constants import Terrain
-from hecogrid_envs.core.jit import inlined, kernel, kernel_entry
-from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
+from hecogrid_envs.core.jit import hot, inlined, kernel, kernel_entry
+from hecogrid_envs.core.occupancy import arrive, plane_offset, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.tiles import FIRST_TERRAIN
 
 _EMPTY = int(Terrain.EMPTY)
 _WALL = int(Terrain.WALL)
@@ -89,25 +90,48 @@ def _place_agent(games: Games, book: RuleBook, e: int, agent: int) -> None:
     games.y[e, agent] = y
 
 
-@kernel
+@hot
 def _draw_level(games: Games, book: RuleBook, e: int) -> None:
     """Derive everything that views need from terrain and agents, at the start of an episode."""
-    planes, bits = e * 4 * book.plane_bytes, e * 4 * book.bits_bytes
-    for i in range(4 * book.plane_bytes):
-        games.planes[planes + i] = book.blank_planes[i]
+    bits = e * 4 * book.bits_bytes
     for i in range(4 * book.bits_bytes):
-        games.wall_bits[bits + i] = book.blank_bits[i]
+        games.wall_bits[np.uint64(bits + i)] = book.blank_bits[np.uint64(i)]
+    _draw_terrain(games, book, e)
+    for y in range(1, book.width - 1):
+        for x in range(1, book.width - 1):
+            ground = games.terrain[e, np.uint64(y * book.width + x)]
+            if ground == _WALL:
+                set_wall_bits(games, book, e, x, y)
+            elif ground == _KEY:
+                redraw_cell(games, book, e, x, y)
     for agent in range(book.n_agents):
         games.sight_known[e, agent] = 0
         games.colour[e, agent] = book.first_colour if book.released else present_colour(games, book, e, agent)
+    for agent in range(book.n_agents):
+        redraw_cell(games, book, e, games.x[e, agent], games.y[e, agent])
+
+
+@inlined
+def _draw_terrain(games: Games, book: RuleBook, e: int) -> None:
+    """
+    Write every cell inside the outer wall into the four planes, as if it looked the same from everywhere.
+
+    The same as :func:`redraw_cell` for each, without a question per cell, whose answers no processor can guess.
+    """
+    stride = book.stride
+    end = stride * stride - 1
+    plane = e * 4 * book.plane_bytes
     for y in range(1, book.width - 1):
-        for x in range(1, book.width - 1):
-            cell = y * book.width + x
-            ground = games.terrain[e, cell]
-            if ground != _EMPTY or games.head[e, cell] >= 0:
-                redraw_cell(games, book, e, x, y)
-                if ground == _WALL:
-                    set_wall_bits(games, book, e, x, y)
+        cell = y * book.width + 1
+        # As in plane_offset: towards larger x, by ones in one orientation, by whole rows in the other.
+        along, across = plane_offset(book, 3, 1, y), plane_offset(book, 2, 1, y)
+        for _ in range(book.width - 2):
+            code = FIRST_TERRAIN + games.terrain[np.uint64(e), np.uint64(cell)]
+            games.planes[np.uint64(plane + end - across)] = code
+            games.planes[np.uint64(plane + book.plane_bytes + end - along)] = code
+            games.planes[np.uint64(plane + 2 * book.plane_bytes + across)] = code
+            games.planes[np.uint64(plane + 3 * book.plane_bytes + along)] = code
+            cell, along, across = cell + 1, along + 1, across + stride
 
 
 @inlined
