@@ -3,7 +3,8 @@ Machine instructions per agent-step of the compiled kernels: a guard against slo
 
 ``python -m benchmarks.instructions`` counts under Valgrind's Callgrind and prints the counts beside the recorded ones;
 ``--record`` writes them to ``benchmarks/instructions.json``. Kernels are compiled for plain x86-64, so that the counts
-are those of a compiler, not of a machine. Same workload as ``benchmarks.environments``, resets left out.
+are those of a compiler, not of a machine. Same workload as ``benchmarks.environments``; new levels are counted by
+themselves, per agent.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs.core.sharing import RESET
 
 RECORD: Final = Path(__file__).parent / "instructions.json"
 #: How much more than recorded is a failure: releases of Python differ by some instructions per call.
@@ -92,6 +94,7 @@ def _works() -> Iterator[tuple[str, Callable[[], object]]]:
             batch.step(actions[STEPS])
             if observation == "tiles":
                 yield f"{task}, step", partial(_play_step, batch, iter(actions))
+                yield f"{task}, new level", partial(_draw_levels, batch)
             yield f"{task}, step and {observation}", partial(_play_step, batch, iter(actions), out)
 
 
@@ -102,6 +105,12 @@ def _play_step(
         batch.step(next(actions))
     else:
         batch.advance(next(actions), out)
+
+
+def _draw_levels(batch: GameBatch) -> None:
+    """New levels without what :meth:`GameBatch.reset` does in Python."""
+    batch._fresh[...] = True
+    batch._shares.play(RESET)
 
 
 def _play() -> None:
