@@ -110,6 +110,8 @@ def main() -> None:
     for change in CHANGES:
         weights = train_elsewhere(change) if change.variables else train(change)
         print(f"| {change.name} | {verdict(reference, weights)} |", flush=True)
+    two, again = (train(Change("two threads", threads=2)) for _ in range(2))
+    print(f"| torch on 2 threads, the same again | {verdict(two, again)} |")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import torch as th
 from torch import nn
 
 from sb3_saf.common.networks import AgentHeads, mlp
+from sb3_saf.common.taking import take
 
 #: One head for all agents, or one for each.
 Heads = Literal["shared", "per_agent"]
@@ -75,7 +76,7 @@ class JointStates(TeamStates):
 
     def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`; agents that take no part are read as zeros."""
-        members = features[teams] if self.members is None else self.members.states(features, teams, active)
+        members = take(features, teams) if self.members is None else self.members.states(features, teams, active)
         return self.join(members, active)
 
     def join(self, members: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:

@@ -29,6 +29,7 @@ from sb3_saf.common.encoders import ObservationEncoder
 from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.common.parts import NetworkSpec, TeamParts
 from sb3_saf.common.row_policy import TeamRowsPolicy, entry_of, take_named
+from sb3_saf.common.taking import take_of_agents
 from sb3_saf.common.teams import STATE_KEY
 from sb3_saf.common.value_normalizer import ValueNormalizer
 from sb3_saf.common.views import OwnViews
@@ -235,7 +236,8 @@ class TeamPolicy(TeamRowsPolicy):
         critic, active = self.value_net, self._active(obs)
         if isinstance(critic, TeamCritic):
             views = self.views.teams(self._team(obs), own, active)
-            values: th.Tensor = critic(views.features, views.teams, views.active)[views.rows, self._agent(obs)]
+            of_teams = critic(views.features, views.teams, views.active)
+            values = take_of_agents(of_teams, views.rows, self._agent(obs))
         elif isinstance(critic, StateCritic):
             values = self._values_of_states(obs, critic)
         else:
@@ -258,7 +260,8 @@ class TeamPolicy(TeamRowsPolicy):
         assert space is not None
         states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
         found = self.views.find(states)
-        return self._in_chunks(critic, states[found.index], space)[found.inverse, self._agent(obs)]
+        values = self._in_chunks(critic, states[found.index], space)
+        return take_of_agents(values, found.inverse, self._agent(obs))
 
 
 def _with_fused_steps(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_saf.common.parts import check_at_least_one
+from sb3_saf.common.taking import take
 from sb3_saf.common.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -87,7 +88,7 @@ class TeamRowsPolicy(BasePolicy):
         if features_extractor is not None and features_extractor is not self.features_extractor:
             raise ValueError("a team policy encodes with its own features_extractor; call the other extractor directly")
         own = self.views.own(self._own(obs))
-        return own.features[own.rows]
+        return take(own.features, own.rows)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """

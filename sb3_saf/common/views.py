@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_saf.common.distinct import distinct_rows, every_row
+from sb3_saf.common.taking import take
 
 
 class OwnViews(NamedTuple):
@@ -109,6 +110,7 @@ class ViewEncoder:
         :return: (B, ...)
         """
         if agent is None:
-            return module(views.features, None)[views.rows]
+            return take(module(views.features, None), views.rows)
         pairs = self.find(th.stack([views.rows, agent], dim=1))
-        return module(views.features[views.rows[pairs.index]], agent[pairs.index])[pairs.inverse]
+        of_pairs = module(take(views.features, views.rows[pairs.index]), agent[pairs.index])
+        return take(of_pairs, pairs.inverse)

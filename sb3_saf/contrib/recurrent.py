@@ -22,6 +22,7 @@ from sb3_saf.common.actor import Actor
 from sb3_saf.common.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.common.parts import TeamParts, check_at_least_one
 from sb3_saf.common.policies import NetArch, TeamPolicy
+from sb3_saf.common.taking import take, take_of_agents
 from sb3_saf.common.views import OwnViews
 from sb3_saf.ippo.policies import IPPOParts
 from sb3_saf.mappo.policies import MAPPOParts
@@ -226,7 +227,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     def _recall_distribution(
         self, obs: PyTorchObs, own: OwnViews, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> tuple[Distribution, LstmStates]:
-        latent, states = self._process(own.features[own.rows], lstm_states, episode_starts, self.lstm_actor)
+        latent, states = self._process(take(own.features, own.rows), lstm_states, episode_starts, self.lstm_actor)
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs, padded=True)
         if masks is None:
@@ -247,9 +248,11 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         """(B, S)"""
         if critic.team_states is None:
             own = self.views.own(self._own(obs)) if own is None else own
-            return own.features[own.rows]
+            return take(own.features, own.rows)
         views = self.views.teams(self._team(obs), own, self._active(obs))
-        return critic.team_states.states(views.features, views.teams, views.active)[views.rows, self._agent(obs)]
+        return take_of_agents(
+            critic.team_states.states(views.features, views.teams, views.active), views.rows, self._agent(obs)
+        )
 
     def _process(
         self, inputs: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor, lstm: nn.LSTM

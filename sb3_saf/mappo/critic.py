@@ -11,6 +11,7 @@ from torch import nn
 
 from sb3_saf.common.critic import Heads, JointValueHead, StateCritic, TeamCritic
 from sb3_saf.common.encoders import ObservationEncoder
+from sb3_saf.common.taking import take
 
 
 class JointCritic(TeamCritic):
@@ -39,7 +40,7 @@ class JointCritic(TeamCritic):
 
     def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; features of agents that take no part are read as zeros."""
-        members = features[teams]
+        members = take(features, teams)
         if active is not None:
             members = members * active.unsqueeze(2)
         values: th.Tensor = self.value_head(members)

@@ -14,6 +14,7 @@ import torch as th
 from torch import nn
 
 from sb3_saf.common.distinct import Distinct
+from sb3_saf.common.taking import take
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.mixers import JointChoice, Mixed
 from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
@@ -122,7 +123,7 @@ def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
     with th.no_grad():
         new = views.views[views.n_now :]
         every = known.detach() if not len(new) else th.cat([known.detach(), policy.encode_with(encoder, new)])
-    features = Features(known[views.now], every[views.after])
+    features = Features(take(known, views.now), take(every, views.after))
     return features, _recall(policy.online, features, samples)
 
 
@@ -131,10 +132,10 @@ def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
     networks = policy.target
     if networks.memory is not None:
         every = policy.encode_with(networks.encoder, views.views)
-        features = Features(every[views.now], every[views.after])
+        features = Features(take(every, views.now), take(every, views.after))
         return features, _recall(networks, features, samples)
     seen, rows = views.after.unique(return_inverse=True)
-    after = policy.encode_with(networks.encoder, views.views[seen])[rows]
+    after = take(policy.encode_with(networks.encoder, views.views[seen]), rows)
     features = Features(after, after)  # nobody reads the target's features of before
     return features, features
 

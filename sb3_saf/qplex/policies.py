@@ -19,6 +19,7 @@ from sb3_saf.common.actor import Actor
 from sb3_saf.common.encoders import ObservationEncoder
 from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.common.row_policy import TeamRowsPolicy, take_named
+from sb3_saf.common.taking import take
 from sb3_saf.common.teams import Array
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
@@ -173,7 +174,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         """(G, d) features of states (G, *state), each distinct one encoded once."""
         assert self.team_spaces.state is not None
         found = self.views.find(states)
-        return self._in_chunks(encoder, states[found.index], self.team_spaces.state)[found.inverse]
+        return take(self._in_chunks(encoder, states[found.index], self.team_spaces.state), found.inverse)
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
@@ -228,7 +229,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         self, memory: AgentMemory, obs: PyTorchObs, state: State | None, episode_start: np.ndarray | None
     ) -> tuple[np.ndarray, State]:
         own = self.views.own(self._own(obs))
-        features = own.features[own.rows]
+        features = take(own.features, own.rows)
         last = th.full((len(features),), -1, dtype=th.long, device=features.device)
         remembered = memory.empty(len(features), features)
         if state is not None:

@@ -11,6 +11,7 @@ from torch import nn
 from sb3_saf.common.critic import Heads, JointValueHead, OwnValueHead, TeamCritic, TeamStates
 from sb3_saf.common.networks import mlp
 from sb3_saf.common.parts import CriticInput
+from sb3_saf.common.taking import take
 from sb3_saf.saf.knowledge_source import Exchanged, KnowledgeSource
 
 
@@ -69,7 +70,7 @@ class SAFStates(TeamStates):
         :param active: (G, N) bool, agents that take part; all if None
         """
         # g_theta and g_omega depend on one view only: once per view, then gathered.
-        messages, states = self.message_net(features)[teams], self.state_net(features)[teams]
+        messages, states = take(self.message_net(features), teams), take(self.state_net(features), teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
 
     def combine(self, states: th.Tensor, read: th.Tensor) -> th.Tensor:

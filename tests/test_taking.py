@@ -1,0 +1,77 @@
+"""Rows are taken by number so that gradients, and with them trainings, repeat on any number of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch as th
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
+
+from sb3_saf import QPLEX, LightEncoder, TeamRolloutBuffer, make_team_env
+from sb3_saf.common.taking import take, take_of_agents
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Of torch, for one test."""
+    before = th.get_num_threads()
+    th.set_num_threads(2)
+    yield
+    th.set_num_threads(before)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
+def test_taking_is_indexing(shape: tuple[int, ...]) -> None:
+    x = th.randn(4, *shape, dtype=th.float64, requires_grad=True)
+    rows = th.tensor([[0, 3, 3], [1, 0, 3]])
+    assert th.equal(take(x, rows), x[rows])
+    assert th.autograd.gradcheck(lambda x: take(x, rows), (x,))
+    of_agents = th.randn(3, 4, *shape, dtype=th.float64)
+    teams, agent = th.tensor([2, 0, 2]), th.tensor([3, 1, 3])
+    assert th.equal(take_of_agents(of_agents, teams, agent), of_agents[teams, agent])
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_the_gradient_repeats() -> None:
+    x, rows, weights = th.randn(500, 64), th.randint(0, 500, (8_000,)), th.randn(8_000, 64)
+
+    def gradient() -> th.Tensor:
+        leaf = x.clone().requires_grad_()
+        return th.autograd.grad((take(leaf, rows) * weights).sum(), leaf)[0]
+
+    assert all(th.equal(gradient(), gradient()) for _ in range(10))
+
+
+def _trained(algorithm: type[Any], policy: str, **kwargs: Any) -> th.Tensor:
+    env = make_team_env("TeamSupport", n_envs=32, seed=0, n_agents=5, grid_size=12, n_treasures=20)
+    policy_kwargs = {"features_extractor_class": LightEncoder}
+    model = algorithm(policy, env, seed=0, policy_kwargs=policy_kwargs, device="cpu", **kwargs)
+    parameters = list(model.policy.parameters())
+    before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
+    model.learn(8_000)
+    after = th.nn.utils.parameters_to_vector(parameters).detach()
+    assert not th.equal(before, after)
+    return after
+
+
+_PPO = {"n_steps": 50, "batch_size": 4_000, "n_epochs": 4, "rollout_buffer_class": TeamRolloutBuffer}
+_RECURRENT: dict[str, Any] = {"n_steps": 50, "batch_size": 4_000, "n_epochs": 2}
+_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 1_300}
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize(
+    ("algorithm", "policy", "kwargs"),
+    [
+        (PPO, "SAFPolicy", _PPO),
+        (PPO, "MAPPOPolicy", _PPO),
+        (PPO, "IPPOPolicy", _PPO),
+        (RecurrentPPO, "SAFLstmPolicy", _RECURRENT),
+        (QPLEX, "QPLEXPolicy", _QPLEX),
+    ],
+)
+def test_a_training_repeats_on_two_threads(algorithm: type[Any], policy: str, kwargs: dict[str, Any]) -> None:
+    assert th.equal(_trained(algorithm, policy, **kwargs), _trained(algorithm, policy, **kwargs))
