@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_saf
 from hecogrid_envs.constants import Command
-from hecogrid_envs.params import check_task
+from hecogrid_envs.params import TaskName, check_task
 from sb3_saf.experiments.cells import Cell
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.results import Results
@@ -47,13 +47,14 @@ def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
 def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
     """Numbers by name."""
     protocol = results.protocol()
-    assert protocol is not None
+    if protocol is None:
+        raise ValueError(f"{results.folder} does not say how its cells were trained: its protocol file is missing")
     settings = protocol.settings(cell)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=16)
     model = settings.make_model(env, cell.seed, device="cpu")
     sb3_saf.load_weights(model, results.cell_folder(cell) / "model.zip")
     scalars: dict[str, Any] = dict(sb3_saf.inspect_team(model, env, n_episodes).scalars)
-    scalars |= useless_commands(*commands_and_zones(model, env))
+    scalars |= useless_commands(cell.task, *commands_and_zones(model, env))
     greedy = sb3_saf.evaluate_team(model, env, n_eval_episodes=n_episodes, deterministic=True)
     return {name: float(value) for name, value in scalars.items() if value is not None} | {"greedy": greedy.mean}
 
@@ -70,15 +71,20 @@ def commands_and_zones(model: BaseAlgorithm, env: Any) -> tuple[npt.NDArray[Any]
     return np.stack(commands), np.stack(zones)
 
 
-def useless_commands(commands: npt.NDArray[np.uint8], zones: npt.NDArray[np.integer[Any]]) -> dict[str, float]:
+def useless_commands(
+    task: TaskName, commands: npt.NDArray[np.uint8], zones: npt.NDArray[np.integer[Any]]
+) -> dict[str, float]:
     """
-    How many actions are wasted: without keys, as in TeamSupport and TeamTogether, three commands do nothing at all.
+    How many actions are wasted: two commands do nothing at all, and without keys, in TeamSupport and TeamTogether, a
+    third does nothing either.
 
+    :param task: whose rules hold
     :param commands: of agents in game steps
     :param zones: where they were
     :return: share of all commands, by zone
     """
-    useless = np.isin(commands, [Command.DROP, Command.TOGGLE, Command.DONE])
+    nothing = [Command.TOGGLE, Command.DONE] + ([] if task == "KeyForTreasure" else [Command.DROP])
+    useless = np.isin(commands, nothing)
     return {f"useless/zone_{zone}": float(useless[zones == zone].mean()) for zone in np.unique(zones)}
 
 
@@ -95,6 +101,12 @@ def main() -> None:
     results = Results(options.folder)
     for cell in cells(results, options.only):
         found[cell.task, cell.level.slug, cell.method].append(look(cell, results, options.episodes))
+    if not found:
+        parser.exit(
+            1,
+            f"no trained team under {options.folder / 'cells' / options.only}: expected the folder of an experiment (the "
+            "-f of python -m sb3_saf.experiments run), and a setting that it has\n",
+        )
     means = {
         key: {name: float(np.mean([one[name] for one in looks if name in one])) for name in looks[0]}
         for key, looks in found.items()

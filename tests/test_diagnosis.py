@@ -60,5 +60,24 @@ def test_it_looks_into_every_trained_team(
 
 def test_useless_commands_are_counted_by_zone() -> None:
     commands = np.array([Command.FORWARD, Command.TOGGLE, Command.DONE, Command.DROP, Command.PICKUP], dtype=np.uint8)
-    counted = diagnosis.useless_commands(commands, np.array([0, 0, 2, 2, 2]))
+    zones = np.array([0, 0, 2, 2, 2])
+    counted = diagnosis.useless_commands("TeamSupport", commands, zones)
     assert counted == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(2 / 3)}
+    with_keys = diagnosis.useless_commands("KeyForTreasure", commands, zones)
+    assert with_keys == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(1 / 3)}
+
+
+def test_a_folder_without_trained_teams_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["diagnosis", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit, match="1"):
+        diagnosis.main()
+    assert "expected the folder of an experiment" in capsys.readouterr().err
+
+
+def test_a_folder_without_protocol_is_an_error(tmp_path: Path) -> None:
+    save_team(tmp_path, "ippo", 0)
+    results = Results(tmp_path)
+    with pytest.raises(ValueError, match="its protocol file is missing"):
+        diagnosis.look(next(diagnosis.cells(results)), results, 1)
