@@ -48,7 +48,7 @@ def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
     """Numbers by name."""
     protocol = results.protocol()
     if protocol is None:
-        raise ValueError(f"{results.folder} does not say how its cells were trained: its protocol file is missing")
+        raise ValueError(f"{results.folder} does not say how its cells were trained: settings.json is missing")
     settings = protocol.settings(cell)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=16)
     model = settings.make_model(env, cell.seed, device="cpu")
@@ -104,8 +104,8 @@ def main() -> None:
     if not found:
         parser.exit(
             1,
-            f"no trained team under {options.folder / 'cells' / options.only}: expected the folder of an experiment (the "
-            "-f of python -m sb3_saf.experiments run), and a setting that it has\n",
+            f"no trained team under {options.folder / 'cells' / options.only}: expected the folder of an experiment "
+            "(-f of python -m sb3_saf.experiments run), and a setting that it has\n",
         )
     means = {
         key: {name: float(np.mean([one[name] for one in looks if name in one])) for name in looks[0]}
