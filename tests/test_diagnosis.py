@@ -79,5 +79,5 @@ def test_a_folder_without_trained_teams_is_an_error(
 def test_a_folder_without_protocol_is_an_error(tmp_path: Path) -> None:
     save_team(tmp_path, "ippo", 0)
     results = Results(tmp_path)
-    with pytest.raises(ValueError, match="settings.json is missing"):
+    with pytest.raises(ValueError, match=r"settings\.json is missing"):
         diagnosis.look(next(diagnosis.cells(results)), results, 1)
