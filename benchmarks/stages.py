@@ -5,6 +5,9 @@ One table per setting: SAF, MAPPO and IPPO in the ``small`` size of the zoo (lig
 network. Every stage counts its own time only: what the games take is not counted again in the rollout that steps them.
 Wall-clock; the stages are found by wrapping the functions that SB3's PPO calls, so the numbers are of the real program
 and sum to the whole.
+
+On a GPU, ``--device cuda --only "SAF, paper size"`` waits for the device between stages, so that each is charged with
+its own kernels, and ends with what 10 million game steps would take; ``--no-wait`` lets them overlap as in a training.
 """
 
 from __future__ import annotations
@@ -19,21 +22,30 @@ from typing import Any, Final, NamedTuple
 
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common import on_policy_algorithm
 
 from sb3_saf import LightEncoder, PaperCNN, TeamRolloutBuffer, make_team_env
 
 REST: Final = "all else"
+TRANSFER: Final = "arrays to the device"
 
 
 class Stopwatch:
-    """Adds up the seconds of nested stages, each without those inside it."""
+    """
+    Adds up the seconds of nested stages, each without those inside it.
 
-    def __init__(self) -> None:
+    :param wait: waits until the device is done with what it was given; None where calls are done when they return
+    """
+
+    def __init__(self, wait: Callable[[], None] | None = None) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
+        self._wait = wait
         self._stack: list[str] = []
         self._since = time.perf_counter()
 
     def _charge(self) -> None:
+        if self._wait is not None:
+            self._wait()
         now = time.perf_counter()
         self.seconds[self._stack[-1] if self._stack else REST] += now - self._since
         self._since = now
@@ -105,9 +117,12 @@ SETTINGS: Final = {
     },
     "SAF, paper network, 16 games": Setting("SAFPolicy", PaperCNN, {}, 16, 1, 10),
 }
+#: The whole size takes a GPU; a minute per rollout without one.
+PAPER_SIZE: Final = {"SAF, paper size": Setting("SAFPolicy", PaperCNN, {}, 128, 1, 10)}
+PAPER_GAME_STEPS: Final = 10_000_000
 
 
-def make_model(setting: Setting, steps: int = 50) -> PPO:
+def make_model(setting: Setting, steps: int = 50, device: str = "cpu") -> PPO:
     """The algorithm of a setting, on TeamSupport."""
     env = make_team_env("TeamSupport", n_envs=setting.n_games, seed=0, **setting.env)
     rows = steps * env.num_envs
@@ -124,19 +139,25 @@ def make_model(setting: Setting, steps: int = 50) -> PPO:
         rollout_buffer_class=TeamRolloutBuffer,
         policy_kwargs={"features_extractor_class": setting.encoder},
         seed=0,
-        device="cpu",
+        device=device,
     )
 
 
-def watch(model: Any) -> Stopwatch:
-    """Watch everything that PPO does with its parts."""
-    watch = Stopwatch()
+def watch(model: Any, wait: bool = True) -> Stopwatch:
+    """
+    Watch everything that PPO does with its parts.
+
+    :param wait: for a GPU, between stages
+    """
+    watch = Stopwatch(th.cuda.synchronize if wait and model.device.type == "cuda" else None)
     policy, buffer, env = model.policy, model.rollout_buffer, model.env
     watch.watch(env.unwrapped, "step_wait", "games")
     watch.watch(env, "step", "joint view, monitor")
     watch.watch(buffer, "add", "rollout buffer")
     watch.watch(buffer, "compute_returns_and_advantage", "advantages")
     watch.watch_items(buffer, "get", "minibatches")
+    watch.watch(buffer, "to_torch", TRANSFER)
+    watch.watch(on_policy_algorithm, "obs_as_tensor", TRANSFER)
     watch.watch(policy, "forward", "rollout: heads, drawing actions")
     watch.watch(policy, "predict_values", "rollout: heads, drawing actions")
     watch.watch(policy, "evaluate_actions", "update: likelihood, entropy, gathering")
@@ -149,20 +170,33 @@ def watch(model: Any) -> Stopwatch:
     return watch
 
 
-def profile(setting: Setting, rollouts: int) -> tuple[dict[str, float], int]:
+def profile(setting: Setting, rollouts: int, device: str = "cpu", wait: bool = True) -> tuple[dict[str, float], int]:
     """Seconds by stage, and agent-steps; one rollout and update before warm up."""
-    model = make_model(setting)
+    model = make_model(setting, device=device)
     assert model.env is not None
     rows = model.n_steps * model.env.num_envs
     model.learn(rows)
-    backward, clip = th.Tensor.backward, th.nn.utils.clip_grad_norm_
-    stopwatch = watch(model)
-    try:
+    with unpatched():
+        stopwatch = watch(model, wait)
         stopwatch.start()
         model.learn(rollouts * rows, reset_num_timesteps=False)
         return stopwatch.stop(), rollouts * rows
+
+
+@contextmanager
+def unpatched() -> Iterator[None]:
+    """Functions that are not the model's own are as before, afterwards."""
+    owners: list[tuple[Any, str]] = [
+        (th.Tensor, "backward"),
+        (th.nn.utils, "clip_grad_norm_"),
+        (on_policy_algorithm, "obs_as_tensor"),
+    ]
+    before = [getattr(owner, name) for owner, name in owners]
+    try:
+        yield
     finally:
-        th.Tensor.backward, th.nn.utils.clip_grad_norm_ = backward, clip  # type: ignore[method-assign]
+        for (owner, name), function in zip(owners, before, strict=True):
+            setattr(owner, name, function)
 
 
 def main() -> None:
@@ -170,16 +204,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rollouts", type=int, default=3)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--only", choices=list(SETTINGS), help="one setting")
+    parser.add_argument("--device", default="cpu", help="such as cuda")
+    parser.add_argument(
+        "--no-wait", action="store_true", help="for the device between stages: its time goes to whom waits"
+    )
+    parser.add_argument("--only", choices=[*SETTINGS, *PAPER_SIZE], help="one setting")
     options = parser.parse_args()
+    if options.device.startswith("cuda") and not th.cuda.is_available():
+        parser.error(
+            f"--device {options.device}: torch {th.__version__} finds no GPU here; leave it out to measure the CPU"
+        )
     th.set_num_threads(options.threads)
     for name in [options.only] if options.only else SETTINGS:
-        seconds, rows = profile(SETTINGS[name], options.rollouts)
+        setting = {**SETTINGS, **PAPER_SIZE}[name]
+        seconds, rows = profile(setting, options.rollouts, options.device, not options.no_wait)
         whole = sum(seconds.values())
-        print(f"\n{name}: {rows / whole:,.0f} agent-steps/s, {options.threads} thread(s)\n")
+        print(f"\n{name}: {rows / whole:,.0f} agent-steps/s, {options.device}, {options.threads} thread(s)\n")
         print("| stage | us per agent-step | share |\n| --- | --- | --- |")
         for stage, spent in sorted(seconds.items(), key=lambda item: -item[1]):
             print(f"| {stage} | {1e6 * spent / rows:.2f} | {100 * spent / whole:.1f} % |")
+        if name in PAPER_SIZE:
+            hours = PAPER_GAME_STEPS * 10 * whole / rows / 3600
+            print(f"\n{PAPER_GAME_STEPS:,} game steps of 10 agents at this rate: {hours:.2f} hours")
 
 
 if __name__ == "__main__":
