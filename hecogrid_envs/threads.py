@@ -17,6 +17,7 @@ from hecogrid_envs.core.jit import entry_point
 from hecogrid_envs.core.sharing import (
     DESK_PART,
     END,
+    FINISHED,
     FIRST,
     NEXT,
     PIECES,
@@ -58,6 +59,8 @@ class Helpers:
         self._desk = aligned(DESK_PART * (1 + len(shares)), np.int64)
         for part, (first, end) in zip(self._desk.reshape(-1, DESK_PART)[1:], shares, strict=True):
             part[FIRST], part[END], part[NEXT] = first, end, PIECES
+        # As after a task: an interrupt may come before the first is posted.
+        self._desk[FINISHED] = shares[-1][1]
         self._bells = [threading.Semaphore(0) for _ in shares[1:]]
         #: Arrays of the task on the desk, which stay where they are until it is done.
         self._posted: tuple[U8, U8] | None = None

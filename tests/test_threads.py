@@ -16,7 +16,7 @@ import pytest
 from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
 from hecogrid_envs.arrays import aligned
 from hecogrid_envs.core.sharing import DESK_PART, END, FIRST, NEXT, STEP, lead, post
-from hecogrid_envs.threads import NOTHING
+from hecogrid_envs.threads import NOTHING, Helpers
 
 PARAMS = HECOGridParams(n_agents=5, grid_size=12, n_treasures=30, observation="tiles")
 
@@ -70,6 +70,16 @@ def test_nobody_waits_for_a_helper_that_does_not_come() -> None:
     post(desk, STEP, NOTHING, NOTHING)
     desk[DESK_PART + NEXT] += 1
     assert not lead(*arguments, desk, 1_000)
+
+
+def test_an_interrupt_before_the_first_task_is_survived() -> None:
+    alone, batch = batch_of(1), batch_of(1)
+    helpers = Helpers(batch._shares._arguments, [(0, 3), (3, 6)])
+    helpers._posted = (NOTHING, NOTHING)
+    batch._shares._arguments[2].actions[...] = 2
+    helpers.play(STEP, NOTHING, NOTHING)
+    alone.step(np.full((6, 5), 2))
+    np.testing.assert_array_equal(alone.observe(), batch.observe())
 
 
 @pytest.mark.parametrize(("n_threads", "n_games"), [(2, 3), (2, 40), (3, 17), (5, 5)])

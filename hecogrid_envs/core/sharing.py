@@ -25,7 +25,7 @@ _TASK: Final = 1
 _VIEWS: Final = 2
 _LAST: Final = 4
 #: Games that are done.
-_FINISHED: Final = 8
+FINISHED: Final = 8
 #: Numbers from one part of the desk to the next. Half a part is a cache line, so that writing does not disturb others.
 DESK_PART: Final = 16
 #: Numbers of a thread's part: the next piece of its share that nobody has taken yet, then what stays as it is.
@@ -111,7 +111,7 @@ def lead(games: Games, book: RuleBook, work: Workspace, desk: I64, polls: int) -
     """
     _take_games(games, book, work, desk, len(desk) // DESK_PART - 1)
     n_games = desk[len(desk) - DESK_PART + END]
-    while load_shared(desk, _FINISHED) != n_games:
+    while load_shared(desk, FINISHED) != n_games:
         polls -= 1
         if polls < 0:
             return False
@@ -145,7 +145,7 @@ def _take_games(games: Games, book: RuleBook, work: Workspace, desk: I64, own: i
             play_share(games, book, work, desk[_TASK], views, last_views, first, last)
             played += last - first
     if played:
-        take_shared(desk, _FINISHED, played)
+        take_shared(desk, FINISHED, played)
 
 
 @hot_entry
@@ -161,7 +161,7 @@ def post(desk: I64, task: int, views: U8, last_views: U8) -> bool:
     desk[_TASK] = task
     desk[_VIEWS], desk[_VIEWS + 1] = views.ctypes.data, len(views)
     desk[_LAST], desk[_LAST + 1] = last_views.ctypes.data, len(last_views)
-    store_shared(desk, _FINISHED, 0)
+    store_shared(desk, FINISHED, 0)
     n_shares = len(desk) // DESK_PART - 1
     for share in range(1, n_shares + 1):
         # A helper that still looks for games of the last task may take of this one from here on.
