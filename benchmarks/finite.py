@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_saf import FiniteCallback
-from sb3_saf.zoo.settings import load_settings
+from sb3_saf.training.settings import load_settings
 
 ROUNDS = 5
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_saf
 from hecogrid_envs import TASK_NAMES, make_vec_env
-from sb3_saf.zoo.settings import load_settings
+from sb3_saf.training.settings import load_settings
 
 N_GAMES: Final = 128
 #: Of all samples, those that are left out of the slope.

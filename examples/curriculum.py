@@ -23,8 +23,8 @@ import numpy as np
 import torch as th
 
 import sb3_saf
-from sb3_saf.common.evaluation import confidence_interval
-from sb3_saf.zoo.settings import load_settings
+from sb3_saf.evaluation import confidence_interval
+from sb3_saf.training.settings import load_settings
 
 N_EPISODES = 64
 RANDOM = "random"

@@ -22,8 +22,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf import RandomPolicy, TeamRolloutBuffer, TurnsInParallel, evaluate_team, make_team_env
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.evaluation import EvaluationResult
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.evaluation import EvaluationResult
 
 #: Evaluation games are seeded apart from training's.
 EVALUATION_SEED = 10_000

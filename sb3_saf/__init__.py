@@ -22,38 +22,38 @@ def _is_installed(name: str) -> bool:
 
 
 if _is_installed("stable_baselines3"):
+    from sb3_saf.buffers.replay import TeamReplayBuffer
+    from sb3_saf.buffers.rollout import TeamRolloutBuffer
+    from sb3_saf.callbacks.evaluation import TeamEvalCallback
+    from sb3_saf.callbacks.finite import FiniteCallback
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
-    from sb3_saf.common.buffers import TeamRolloutBuffer
-    from sb3_saf.common.callbacks import TeamEvalCallback
-    from sb3_saf.common.centralized import CentralizedValueWrapper
-    from sb3_saf.common.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
-    from sb3_saf.common.env import make_team_env
-    from sb3_saf.common.errors import NonFiniteError
-    from sb3_saf.common.evaluation import (
+    from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+    from sb3_saf.envs.make import make_team_env
+    from sb3_saf.envs.monitor import TeamMonitor
+    from sb3_saf.envs.turns import TurnsInParallel
+    from sb3_saf.errors import NonFiniteError
+    from sb3_saf.evaluation import (
         EvaluationResult,
         RandomPolicy,
         confidence_interval,
         evaluate_policy,
         evaluate_team,
     )
-    from sb3_saf.common.finite import FiniteCallback
-    from sb3_saf.common.monitor import TeamMonitor
-    from sb3_saf.common.turns import TurnsInParallel
-    from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
-    from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
     from sb3_saf.export.weights import load_weights
     from sb3_saf.export.writer import export_actors
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
-    from sb3_saf.ippo.policies import IPPOPolicy
-    from sb3_saf.mappo.policies import MAPPOPolicy
+    from sb3_saf.networks.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
+    from sb3_saf.policies.ippo import IPPOPolicy
+    from sb3_saf.policies.mappo import MAPPOPolicy
+    from sb3_saf.policies.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
+    from sb3_saf.policies.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
+    from sb3_saf.policies.saf import SAFPolicy
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
-    from sb3_saf.qplex.replay_buffer import TeamReplayBuffer
     from sb3_saf.registration import register_all
-    from sb3_saf.saf.policies import SAFPolicy
 
     register_all()
 else:

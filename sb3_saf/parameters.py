@@ -13,11 +13,11 @@ import numpy as np
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.common.policies import TeamActorCriticPolicy
-from sb3_saf.common.teams import TeamSpaces
-from sb3_saf.ippo.policies import IPPOPolicy
-from sb3_saf.mappo.policies import MAPPOPolicy
-from sb3_saf.saf.policies import SAFPolicy
+from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.policies.ippo import IPPOPolicy
+from sb3_saf.policies.mappo import MAPPOPolicy
+from sb3_saf.policies.saf import SAFPolicy
 
 N_AGENTS: Final = 10
 #: Parts that only the released code has and that the paper's figure for SAF includes.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_saf.zoo.plot import main
+from sb3_saf.training.plot import main
 
 if __name__ == "__main__":
     main()

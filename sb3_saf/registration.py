@@ -10,15 +10,15 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.common.game_steps import log_game_steps
-from sb3_saf.common.stock_policies import warn_of_stock_policies
-from sb3_saf.contrib.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
-from sb3_saf.contrib.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
-from sb3_saf.ippo.policies import IPPOPolicy
-from sb3_saf.mappo.policies import MAPPOPolicy
+from sb3_saf.callbacks.game_steps import log_game_steps
+from sb3_saf.policies.ippo import IPPOPolicy
+from sb3_saf.policies.mappo import MAPPOPolicy
+from sb3_saf.policies.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
+from sb3_saf.policies.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
+from sb3_saf.policies.saf import SAFPolicy
+from sb3_saf.policies.stock_policies import warn_of_stock_policies
 from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
 from sb3_saf.qplex.qplex import QPLEX
-from sb3_saf.saf.policies import SAFPolicy
 
 #: Which names each algorithm learns. SB3 keeps one dict per algorithm.
 POLICIES: Final[dict[type[BaseAlgorithm], dict[str, type[BasePolicy]]]] = {

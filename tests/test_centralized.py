@@ -12,9 +12,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.monitor import TeamMonitor
-from sb3_saf.common.teams import TeamSpaces, find_n_agents
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.teams import TeamSpaces, find_n_agents
 from tests.team_venv import VECTOR, Array, TeamVenv, see_where, still
 
 

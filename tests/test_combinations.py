@@ -14,8 +14,8 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 from stable_baselines3 import PPO
 
 from sb3_saf import SAFLstmPolicy, SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.value_normalizer import ValueNormalizer
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.networks.value_normalizer import ValueNormalizer
 from tests.toy_envs import TellingEnv
 
 N_AGENTS, N_ACTIONS = 3, 4

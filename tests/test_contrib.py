@@ -21,12 +21,12 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_saf
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy, evaluate_team, make_team_env
-from sb3_saf.common.distributions import distribution_of, masked_parameters, mixture_of
-from sb3_saf.common.policies import TeamPolicy
-from sb3_saf.common.teams import TeamSpaces
-from sb3_saf.contrib.maskable import TeamMaskablePolicy
-from sb3_saf.contrib.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
-from sb3_saf.saf.policy_pool import PolicyPool
+from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.networks.distributions import distribution_of, masked_parameters, mixture_of
+from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.maskable import TeamMaskablePolicy
+from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from tests.contrib_teams import CueTeams, MaskedTeams, choices_of, is_allowed, random_masks
 from tests.toy_envs import CounterEnv
 from tests.toy_teams import VECTOR, ToyTeams, take, team_rows, to_numpy

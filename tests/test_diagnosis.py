@@ -13,7 +13,7 @@ from benchmarks import diagnosis
 from hecogrid_envs.constants import Command
 from sb3_saf.experiments.cells import Protocol
 from sb3_saf.experiments.results import Results
-from sb3_saf.zoo.settings import load_settings
+from sb3_saf.training.settings import load_settings
 
 #: A network of another shape than the zoo's: the diagnosis must read what was trained from the folder.
 OVERRIDES = {"policy_kwargs": {"features_extractor_class": "LightEncoder", "net_arch": [32]}}

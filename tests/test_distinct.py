@@ -10,9 +10,9 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_saf.common import distinct
-from sb3_saf.common.distinct import Distinct, distinct_rows, every_row
-from sb3_saf.common.views import ViewEncoder
+from sb3_saf.networks import unique as distinct
+from sb3_saf.networks.unique import Distinct, distinct_rows, every_row
+from sb3_saf.networks.views import ViewEncoder
 
 Finder = Callable[[th.Tensor], Distinct]
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 
 from sb3_saf import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
-from sb3_saf.common.encoders import PixelInput
+from sb3_saf.networks.encoders import PixelInput
 from tests.toy_teams import PICTURE, CodeSpace, samples
 
 CHANNELS_LAST = spaces.Box(0, 255, (12, 12, 3), np.uint8)

@@ -14,16 +14,16 @@ from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_saf.common.callbacks import TeamEvalCallback
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.evaluation import (
+from sb3_saf.callbacks.evaluation import TeamEvalCallback
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.evaluation import (
     EvaluationResult,
     RandomPolicy,
     confidence_interval,
     evaluate_policy,
     evaluate_team,
 )
-from sb3_saf.common.monitor import TeamMonitor
 from tests.team_venv import Array, TeamVenv
 
 

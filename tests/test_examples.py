@@ -11,7 +11,7 @@ import pytest
 import sb3_saf
 from examples import curriculum
 from examples.train_pettingzoo import ENVIRONMENTS, main
-from sb3_saf.zoo.settings import Settings
+from sb3_saf.training.settings import Settings
 
 NEEDS = {"multiwalker": "Box2D", "pursuit": "pettingzoo.sisl.pursuit_v5", "hanabi": "pyspiel"}
 

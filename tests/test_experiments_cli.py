@@ -14,7 +14,7 @@ from sb3_saf.experiments.measure import Burst, full_rate
 from sb3_saf.experiments.plan import _duration
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine, run
-from sb3_saf.zoo.algorithms import ALGOS
+from sb3_saf.training.algorithms import ALGOS
 from tests.experiments_jobs import InlineEngine
 
 

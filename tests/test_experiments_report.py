@@ -20,7 +20,7 @@ from sb3_saf.experiments.options import protocol_of
 from sb3_saf.experiments.page import _protocol_words
 from sb3_saf.experiments.page_tables import losses
 from sb3_saf.experiments.selection import complete
-from sb3_saf.zoo.statistics import Estimate, mean_over_seeds
+from sb3_saf.training.statistics import Estimate, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
 
 pytest.importorskip("rliable")

@@ -25,7 +25,7 @@ from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine, Summary, run
 from sb3_saf.experiments.table import Row
 from sb3_saf.experiments.work import Work, curve, do
-from sb3_saf.zoo.seeds import evaluation_seed
+from sb3_saf.training.seeds import evaluation_seed
 from tests.experiments_jobs import InlineEngine, read_table, wait_until
 
 SMOKE = Protocol("smoke")

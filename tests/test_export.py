@@ -38,9 +38,9 @@ from sb3_saf import (
     load_weights,
     make_team_env,
 )
-from sb3_saf.common.policies import TeamActorCriticPolicy
 from sb3_saf.export import files as export_files
 from sb3_saf.export.manifest import DATA_FILES, MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, DataFile, Manifest
+from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.lone_agent import TRAINING, Absent
 from tests.test_policies import ACTIONS, equal_weights, make_model, make_policy
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, samples

@@ -16,8 +16,8 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_saf import Actor, ExportError, MAPPOPolicy, SAFPolicy, export_actors, make_team_env
-from sb3_saf.common.policies import TeamActorCriticPolicy
-from sb3_saf.common.teams import TeamSpaces
+from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests import test_contrib
 from tests.contrib_teams import random_masks
 from tests.test_contrib import ACTIONS, MASKABLE

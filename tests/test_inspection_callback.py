@@ -29,17 +29,17 @@ from sb3_saf import (
     inspect_team,
     make_team_env,
 )
-from sb3_saf.common.policies import TeamPolicy
-from sb3_saf.common.teams import TeamSpaces
+from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.inspection import film
 from sb3_saf.inspection.calibration import calibrate, lambda_returns
 from sb3_saf.inspection.doors import zone_function
 from sb3_saf.inspection.episodes import Played, Player
 from sb3_saf.inspection.report import critic_scalars, message_scalars, pool_scalars
-from sb3_saf.ippo.policies import IPPOPolicy
-from sb3_saf.saf.critic import SAFCritic
-from sb3_saf.saf.policies import SAFPolicy
-from sb3_saf.saf.policy_pool import PolicyPool, PoolOutput
+from sb3_saf.networks.policy_pool import PolicyPool, PoolOutput
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.ippo import IPPOPolicy
+from sb3_saf.policies.saf import SAFPolicy
+from sb3_saf.policies.saf_critic import SAFCritic
 from tests.contrib_teams import MaskedTeams
 from tests.probe_envs import ConstantReward, DelayedReward, Message, Probe
 from tests.team_venv import TeamVenv

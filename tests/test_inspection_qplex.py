@@ -16,8 +16,8 @@ from sb3_saf import QPLEX, InspectionCallback, evaluate_team, make_team_env
 from sb3_saf.inspection.calibration import lambda_returns
 from sb3_saf.inspection.episodes import Player
 from sb3_saf.inspection.q_insides import QInsides
+from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.qplex.policies import QPLEXPolicy
-from sb3_saf.saf.policy_pool import PolicyPool
 from tests.probe_envs import ConstantReward
 from tests.toy_envs import TellingEnv
 

@@ -16,10 +16,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from hecogrid_envs.supersuit_bridge import SuperSuitVecEnv
 from hecogrid_envs.vec_env import NativeVecEnv
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.env import make_team_env
-from sb3_saf.common.evaluation import RandomPolicy, evaluate_team
-from sb3_saf.common.monitor import TeamMonitor
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.envs.make import make_team_env
+from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.evaluation import RandomPolicy, evaluate_team
 from tests.team_venv import Array, TeamVenv
 from tests.toy_envs import CounterEnv
 
@@ -221,5 +221,5 @@ def test_wrong_calls(make: Callable[[], VecEnv], message: str) -> None:
 
 
 def test_learning_does_not_import_the_game() -> None:
-    code = "import sys, sb3_saf.common.env; sys.exit('hecogrid_envs' in sys.modules)"
+    code = "import sys, sb3_saf.envs.make; sys.exit('hecogrid_envs' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

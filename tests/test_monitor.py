@@ -18,10 +18,10 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import sb3_saf
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.evaluation import RandomPolicy
-from sb3_saf.common.game_steps import game_steps, log_game_steps
-from sb3_saf.common.monitor import TeamMonitor
+from sb3_saf.callbacks.game_steps import game_steps, log_game_steps
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.evaluation import RandomPolicy
 from tests.team_venv import TeamVenv, still
 
 #: Team return of an episode of game e that lasts n steps: agents 0, 1, 2 get 100 e + 10 i + step.

@@ -24,8 +24,8 @@ from hecogrid_envs.text import parse_level, render_text
 from sb3_saf.experiments.cells import check_methods
 from sb3_saf.experiments.definitions import find_experiment
 from sb3_saf.experiments.files import pack, unpack
-from sb3_saf.zoo.settings import ENV_IDS, load_settings
-from sb3_saf.zoo.yaml_files import SIZES, load_yaml
+from sb3_saf.training.settings import ENV_IDS, load_settings
+from sb3_saf.training.yaml_files import SIZES, load_yaml
 
 COUNT = int(os.environ.get("MUTATIONS", "100"))
 #: Seconds of the processor after which a mutation counts as a hang.

@@ -11,7 +11,7 @@ import pytest
 from stable_baselines3 import PPO
 
 from sb3_saf import RandomPolicy, make_team_env
-from sb3_saf.common.stock_policies import warn_of_stock_policies
+from sb3_saf.policies.stock_policies import warn_of_stock_policies
 from tests.toy_envs import CounterEnv, TellingEnv
 
 

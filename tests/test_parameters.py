@@ -8,10 +8,10 @@ import sys
 import pytest
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy
-from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.parameters import count, paper_policy, parameter_table
-from sb3_saf.saf.critic import SAFCritic
-from sb3_saf.saf.policy_pool import PolicyPool
+from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.policies.saf_critic import SAFCritic
 
 ACTOR, OWN_CRITIC, JOINT_CRITIC, CNN = 25_735, 24_961, 98_689, 1_233_056
 

@@ -20,11 +20,11 @@ from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
-from sb3_saf.common.networks import Linear
-from sb3_saf.common.policies import TeamActorCriticPolicy
-from sb3_saf.common.teams import TeamSpaces
-from sb3_saf.mappo.critic import JointCritic
-from sb3_saf.mappo.policies import MAPPOParts
+from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.networks.layers import Linear
+from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.policies.mappo import MAPPOParts
+from sb3_saf.policies.mappo_critic import JointCritic
 from sb3_saf.registration import register
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, take, team_rows, to_numpy
 

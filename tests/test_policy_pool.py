@@ -13,9 +13,9 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution, make_proba_distribution
 from torch import nn
 
-from sb3_saf.common import distributions
-from sb3_saf.common.actor import ActionHead, SinglePolicy
-from sb3_saf.common.distributions import (
+from sb3_saf.networks import distributions
+from sb3_saf.networks.actor import ActionHead, SinglePolicy
+from sb3_saf.networks.distributions import (
     PoolDistribution,
     SelectedDistribution,
     distribution_of,
@@ -23,7 +23,7 @@ from sb3_saf.common.distributions import (
     mixture_of,
     n_action_parameters,
 )
-from sb3_saf.saf.policy_pool import PolicyPool, Selection, draw_policy
+from sb3_saf.networks.policy_pool import PolicyPool, Selection, draw_policy
 
 N_ROWS, N_POLICIES = 4, 3
 DISCRETE = spaces.Discrete(5)

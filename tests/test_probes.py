@@ -18,9 +18,9 @@ from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
-from sb3_saf.common.centralized import TimeLimit
-from sb3_saf.common.policies import TeamActorCriticPolicy
-from sb3_saf.common.value_normalizer import ValueNormalizer
+from sb3_saf.envs.joint_observation import TimeLimit
+from sb3_saf.networks.value_normalizer import ValueNormalizer
+from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.probe_envs import (
     ConstantReward,
     DelayedReward,

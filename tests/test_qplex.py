@@ -26,8 +26,8 @@ from sb3_saf import (
     load_weights,
     make_team_env,
 )
-from sb3_saf.common.centralized import CentralizedValueWrapper, TimeLimit
-from sb3_saf.common.monitor import TeamMonitor
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
+from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import MixerName

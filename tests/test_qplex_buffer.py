@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from sb3_saf.common.teams import TeamSpaces
-from sb3_saf.qplex.replay_buffer import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.envs.teams import TeamSpaces
 
 N_AGENTS, N_GAMES, N_ACTIONS = 2, 3, 4
 OWN = spaces.Box(0, 255, (3,), np.uint8)
@@ -181,6 +181,6 @@ def test_rows_that_are_no_teams_are_refused() -> None:
 
 
 def test_memory_that_does_not_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_saf.qplex.replay_buffer.free_memory", lambda: 100)
+    monkeypatch.setattr("sb3_saf.buffers.replay.free_memory", lambda: 100)
     with pytest.warns(UserWarning, match="replay buffer of 30 game steps takes"):
         make_buffer()

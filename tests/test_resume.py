@@ -24,7 +24,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import sb3_saf
 from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
-from sb3_saf.common.teams import TeamVecEnvWrapper
+from sb3_saf.envs.teams import TeamVecEnvWrapper
 from tests.killed_runs import ALGOS
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8

@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_saf import TeamRolloutBuffer
-from sb3_saf.common.policies import TeamActorCriticPolicy
+from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.test_policies import ACTIONS, VARIANTS
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 

@@ -12,9 +12,9 @@ from torch import nn
 
 from hecogrid_envs import make_vec_env
 from sb3_saf import LightEncoder, PaperCNN
-from sb3_saf.common.encoders import PixelInput
-from sb3_saf.common.networks import Tanh, mlp
-from sb3_saf.common.tile_sums import (
+from sb3_saf.networks.encoders import PixelInput
+from sb3_saf.networks.layers import Tanh, mlp
+from sb3_saf.networks.tile_sums import (
     Places,
     places_of_convolution,
     places_of_linear,

@@ -1,1 +1,1 @@
-"""Hyperparameters and levels, as YAML files; ``sb3_saf.zoo.settings`` reads them."""
+"""Hyperparameters and levels, as YAML files; ``sb3_saf.training.settings`` reads them."""

@@ -12,6 +12,7 @@ from typing import NoReturn
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.checkpoints.callbacks import all_callbacks, callback_states
 from sb3_saf.checkpoints.data import Tree, encode
 from sb3_saf.checkpoints.environments import environment_state
@@ -21,8 +22,7 @@ from sb3_saf.checkpoints.logs import logger_state
 from sb3_saf.checkpoints.models import description, is_off_policy, model_state, require_resumable
 from sb3_saf.checkpoints.software import software
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.common.game_steps import game_steps
-from sb3_saf.common.teams import check_count, require_n_agents
+from sb3_saf.envs.teams import check_count, require_n_agents
 
 #: The run that a model is in: its name is in every checkpoint, so that no other run goes on in the folder.
 _RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, str] = weakref.WeakKeyDictionary()

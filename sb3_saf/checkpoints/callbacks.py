@@ -16,10 +16,10 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnNoModelImprovement,
 )
 
+from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import Stateful, environment_state, load_environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
-from sb3_saf.common.callbacks import TeamEvalCallback
 from sb3_saf.inspection.callback import InspectionCallback
 
 _COUNTERS: Final[dict[Any, tuple[str, ...]]] = {

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
-from sb3_saf.common.centralized import CentralizedValueWrapper
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 
 
 @runtime_checkable

@@ -17,6 +17,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_saf.callbacks.finite import FiniteCallback
 from sb3_saf.checkpoints.callback import TeamCheckpointCallback, enter_run
 from sb3_saf.checkpoints.callbacks import all_callbacks, load_callback_states
 from sb3_saf.checkpoints.data import Tree
@@ -27,8 +28,7 @@ from sb3_saf.checkpoints.logs import continue_logs
 from sb3_saf.checkpoints.models import check_description, is_off_policy, load_model_state, require_resumable
 from sb3_saf.checkpoints.software import warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.common.errors import NonFiniteError
-from sb3_saf.common.finite import FiniteCallback
+from sb3_saf.errors import NonFiniteError
 
 #: Torch's own words for distributions of actions that weights too large have made of NaN.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)

@@ -9,10 +9,10 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_saf.buffers.replay import TeamReplayBuffer
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.qplex.qplex import QPLEX
-from sb3_saf.qplex.replay_buffer import TeamReplayBuffer
 
 #: Arguments that have to be those of the checkpoint. Schedules are compared by their values, see :func:`description`.
 _ARGUMENTS: Final = (

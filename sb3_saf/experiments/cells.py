@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from hecogrid_envs.params import TaskName
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
-from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.names import unknown_name
-from sb3_saf.zoo.settings import Settings, load_settings
-from sb3_saf.zoo.yaml_files import Size
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.names import unknown_name
+from sb3_saf.training.settings import Settings, load_settings
+from sb3_saf.training.yaml_files import Size
 
 #: An algorithm whose settings give the random team its environment, which is the same for all.
 _ANY_ALGORITHM = "ippo"

@@ -28,7 +28,7 @@ from sb3_saf.experiments.options import (
     wanted_of,
     workers_of,
 )
-from sb3_saf.zoo.commands import USAGE_ERROR, OneLineParser
+from sb3_saf.training.commands import USAGE_ERROR, OneLineParser
 
 #: What a shell reports for a process that Ctrl-C has ended.
 _INTERRUPTED: Final = 130

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import pandas as pd
 
-from sb3_saf.zoo.statistics import Estimate, mean_over_seeds
+from sb3_saf.training.statistics import Estimate, mean_over_seeds
 
 #: Two seeds may agree by chance, and an interval then has no width.
 FEWEST_SEEDS: Final = 3

@@ -6,8 +6,8 @@ from collections.abc import Collection
 from typing import Final, NamedTuple
 
 from hecogrid_envs.params import TaskName
-from sb3_saf.zoo.names import unknown_name
-from sb3_saf.zoo.yaml_files import Size
+from sb3_saf.training.names import unknown_name
+from sb3_saf.training.yaml_files import Size
 
 #: Seeds of a run that names none. The spec asks for at least three; smoke is for tests.
 DEFAULT_SEEDS: Final[dict[Size, tuple[int, ...]]] = {"paper": (0, 1, 2), "small": (0, 1, 2), "smoke": (0, 1)}

@@ -15,12 +15,12 @@ from sb3_saf.experiments.local import LocalEngine
 from sb3_saf.experiments.on_ray import RayEngine, require_ray
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Machine
-from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.commands import KeyValues
-from sb3_saf.zoo.devices import check_device
-from sb3_saf.zoo.names import unknown_name
-from sb3_saf.zoo.seeds import check_seed
-from sb3_saf.zoo.yaml_files import SIZES, Size
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.commands import KeyValues
+from sb3_saf.training.devices import check_device
+from sb3_saf.training.names import unknown_name
+from sb3_saf.training.seeds import check_seed
+from sb3_saf.training.yaml_files import SIZES, Size
 
 PROGRAM: Final = "python -m sb3_saf.experiments"
 DEFAULT_SIZE: Final[Size] = "small"

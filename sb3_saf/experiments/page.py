@@ -15,8 +15,8 @@ from sb3_saf.experiments.files import write_text
 from sb3_saf.experiments.options import PROGRAM
 from sb3_saf.experiments.page_tables import aggregates, comparisons, losses, means, numbers
 from sb3_saf.experiments.results import FAILED, Results
-from sb3_saf.zoo.algorithms import ALGOS
-from sb3_saf.zoo.commands import option_words
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.commands import option_words
 
 #: Missing cells that are named.
 _MOST_NAMED = 20

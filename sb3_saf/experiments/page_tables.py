@@ -10,7 +10,7 @@ import pandas as pd
 from sb3_saf.experiments.comparisons import FEWEST_SEEDS, compare
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level, View
 from sb3_saf.experiments.selection import complete, of_view, strata, with_levels
-from sb3_saf.zoo.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
+from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
 _NOTHING = "–"
 

@@ -15,8 +15,8 @@ from sb3_saf.experiments.page import Content, write_page
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.selection import complete, of_view, strata
 from sb3_saf.experiments.table import requested, rows, write_table
-from sb3_saf.zoo.figures import draw_aggregates, draw_curves, draw_levels
-from sb3_saf.zoo.statistics import score_matrices
+from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_levels
+from sb3_saf.training.statistics import score_matrices
 
 
 class Report(NamedTuple):

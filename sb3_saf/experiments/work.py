@@ -25,10 +25,10 @@ from sb3_saf.experiments.cells import Cell, Protocol
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import pack, read_json, to_json, write_text
 from sb3_saf.experiments.results import FINISHED, config_of
-from sb3_saf.zoo.commands import option_words
-from sb3_saf.zoo.inspection import inspection
-from sb3_saf.zoo.seeds import evaluation_seed
-from sb3_saf.zoo.versions import software_versions
+from sb3_saf.training.commands import option_words
+from sb3_saf.training.inspection import inspection
+from sb3_saf.training.seeds import evaluation_seed
+from sb3_saf.training.versions import software_versions
 
 #: Points of a learning curve at most.
 CURVE_POINTS: Final = 100

@@ -8,13 +8,13 @@ from typing import Final, TypeAlias
 import numpy as np
 import torch as th
 
-from sb3_saf.common.policies import TeamPolicy
-from sb3_saf.contrib.recurrent import TeamRecurrentPolicy
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.manifest import MemoryNet
 from sb3_saf.export.network import ActorNetwork
+from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
-from sb3_saf.saf.policy_pool import PolicyPool
 
 #: Policies whose actors read one agent's own observation, mask and memory, and nothing else.
 ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy

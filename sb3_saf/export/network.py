@@ -1,7 +1,7 @@
 """
 The networks of an actor in torch alone: encoder and policies, from raw own observations to action parameters.
 
-The layers are those of ``sb3_saf.common``, under the same names, without what training needs around them. Letters: K
+The layers are those of ``sb3_saf.networks``, under the same names, without what training needs around them. Letters: K
 rows, d features, N agents, U policies, P parameters of one policy's distribution, A actions.
 """
 
@@ -14,7 +14,6 @@ from typing import Final
 import torch as th
 from torch import nn
 
-from sb3_saf.common.networks import mlp
 from sb3_saf.export.manifest import (
     ACTIVATION_NAMES,
     ActorNet,
@@ -24,6 +23,7 @@ from sb3_saf.export.manifest import (
     SpaceRecord,
     picture_shape,
 )
+from sb3_saf.networks.layers import mlp
 
 #: Activations that a file may name.
 ACTIVATIONS: Final[dict[str, type[nn.Module]]] = {name: getattr(nn, name) for name in ACTIVATION_NAMES}
@@ -255,7 +255,7 @@ class AgentPolicies(nn.Module):
 
 class PolicyPool(nn.Module):
     """
-    U policies and the choice among them: see ``sb3_saf.saf.policy_pool.PolicyPool``.
+    U policies and the choice among them: see ``sb3_saf.networks.policy_pool.PolicyPool``.
 
     :param query_net: (K, d) features to (K, latent) queries
     :param latent_dim: size of queries and signature keys

@@ -17,19 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
 
-from sb3_saf.common.actor import ActionHead, SinglePolicy
-from sb3_saf.common.encoders import (
-    LightEncoder,
-    MLPEncoder,
-    NatureEncoder,
-    ObservationEncoder,
-    PaperCNN,
-    is_tile_space,
-)
-from sb3_saf.common.networks import AgentHeads
-from sb3_saf.common.policies import TeamPolicy
-from sb3_saf.contrib.maskable import TeamMaskablePolicy
-from sb3_saf.contrib.recurrent import TeamRecurrentPolicy
 from sb3_saf.export.comparison import ExportablePolicy, compare, some_inputs
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import write_folder
@@ -47,8 +34,21 @@ from sb3_saf.export.manifest import (
     SpaceRecord,
 )
 from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor, make_memory
+from sb3_saf.networks.actor import ActionHead, SinglePolicy
+from sb3_saf.networks.encoders import (
+    LightEncoder,
+    MLPEncoder,
+    NatureEncoder,
+    ObservationEncoder,
+    PaperCNN,
+    is_tile_space,
+)
+from sb3_saf.networks.layers import AgentHeads
+from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.maskable import TeamMaskablePolicy
+from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
-from sb3_saf.saf.policy_pool import PolicyPool
 
 
 def export_actors(

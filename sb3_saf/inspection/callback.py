@@ -12,9 +12,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, Image
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, sync_envs_normalization
 
-from sb3_saf.common.centralized import CentralizedValueWrapper
-from sb3_saf.common.game_steps import game_steps
-from sb3_saf.common.teams import check_count, require_n_agents
+from sb3_saf.callbacks.game_steps import game_steps
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.envs.teams import check_count, require_n_agents
 from sb3_saf.inspection.doors import Zones, check_zones, zone_function
 from sb3_saf.inspection.episodes import Player
 from sb3_saf.inspection.inspection import Inspection, inspect_with

@@ -14,8 +14,8 @@ import torch as th
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_saf.common.centralized import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.common.teams import ACTIVE_KEY, require_n_agents, team_dones
+from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.envs.teams import ACTIVE_KEY, require_n_agents, team_dones
 from sb3_saf.inspection.doors import Picture, ZoneFunction, draws_pictures, picture, zones_now
 from sb3_saf.inspection.insides import Insides, Replacement, StepView, takes_masks
 from sb3_saf.inspection.kinds import OurPolicy, insides_of

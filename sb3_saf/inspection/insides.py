@@ -16,13 +16,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.common.critic import JointStates, TeamStates
-from sb3_saf.common.distributions import masked_parameters
-from sb3_saf.common.policies import TeamPolicy
-from sb3_saf.contrib.maskable import TeamMaskablePolicy
-from sb3_saf.contrib.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
-from sb3_saf.saf.critic import SAFCritic, SAFStates
-from sb3_saf.saf.policy_pool import PolicyPool
+from sb3_saf.networks.critic import JointStates, TeamStates
+from sb3_saf.networks.distributions import masked_parameters
+from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.maskable import TeamMaskablePolicy
+from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
+from sb3_saf.policies.saf_critic import SAFCritic, SAFStates
 
 Tensors = dict[str, th.Tensor]
 

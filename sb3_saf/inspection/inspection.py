@@ -10,14 +10,14 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_saf.common.randomness import own_randomness
-from sb3_saf.common.teams import check_count
+from sb3_saf.envs.teams import check_count
 from sb3_saf.inspection import figures, film, report
 from sb3_saf.inspection.calibration import calibrate, lambda_returns
 from sb3_saf.inspection.doors import Picture, ReturnScale, Zones, check_zones, return_scale, zone_colours, zone_function
 from sb3_saf.inspection.episodes import Played, Player
 from sb3_saf.inspection.kinds import require_our_policy
 from sb3_saf.inspection.pool import chosen_by, differences
+from sb3_saf.randomness import own_randomness
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

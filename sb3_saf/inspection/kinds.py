@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.common.policies import TeamPolicy
-from sb3_saf.contrib.recurrent import TeamRecurrentPolicy
 from sb3_saf.inspection.insides import Insides, RecurrentInsides
 from sb3_saf.inspection.q_insides import QInsides
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
 
 #: Policies of this package.

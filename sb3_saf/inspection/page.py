@@ -13,7 +13,7 @@ from typing import Any, Final
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
-from sb3_saf.common.teams import require_n_agents
+from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.inspection.kinds import OurPolicy
 
 #: Formats that hold numbers only.

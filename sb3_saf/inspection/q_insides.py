@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_saf.common.teams import STATE_KEY
+from sb3_saf.buffers.replay import TeamSteps
+from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.inspection.insides import PoolView, StepView, Tensors
+from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.learning import greedy_q_tot
 from sb3_saf.qplex.policies import QPLEXPolicy, State
-from sb3_saf.qplex.replay_buffer import TeamSteps
-from sb3_saf.saf.policy_pool import PolicyPool
 
 
 class QInsides:

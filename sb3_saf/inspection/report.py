@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_saf.common.evaluation import confidence_interval
+from sb3_saf.evaluation import confidence_interval
 from sb3_saf.inspection.calibration import calibrate, lambda_returns, rmse
 from sb3_saf.inspection.doors import ReturnScale
 from sb3_saf.inspection.episodes import Played

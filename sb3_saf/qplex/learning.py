@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
-from sb3_saf.common.distinct import Distinct
-from sb3_saf.common.taking import take
+from sb3_saf.buffers.replay import Sequences, TeamReplaySamples, TeamSteps
+from sb3_saf.networks.gather import take
+from sb3_saf.networks.unique import Distinct
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.mixers import JointChoice, Mixed
 from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
-from sb3_saf.qplex.replay_buffer import Sequences, TeamReplaySamples, TeamSteps
 
 
 class TeamError(NamedTuple):

@@ -19,7 +19,7 @@ from typing import Final, Literal, NamedTuple, get_args
 import torch as th
 from torch import nn
 
-from sb3_saf.common.networks import mlp
+from sb3_saf.networks.layers import mlp
 
 MixerName = Literal["vdn", "qmix", "qplex"]
 MIXER_NAMES: Final[tuple[MixerName, ...]] = get_args(MixerName)

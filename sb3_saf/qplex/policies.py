@@ -15,12 +15,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.common.actor import Actor
-from sb3_saf.common.encoders import ObservationEncoder
-from sb3_saf.common.networks import HIDDEN_GAIN, orthogonal_init
-from sb3_saf.common.row_policy import TeamRowsPolicy, take_named
-from sb3_saf.common.taking import take
-from sb3_saf.common.teams import Array
+from sb3_saf.envs.teams import Array
+from sb3_saf.networks.actor import Actor
+from sb3_saf.networks.encoders import ObservationEncoder
+from sb3_saf.networks.gather import take
+from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
+from sb3_saf.policies.rows import TeamRowsPolicy, take_named
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
 from sb3_saf.qplex.parts import QPLEXLstmParts, QPLEXParts, QPLEXPoolParts

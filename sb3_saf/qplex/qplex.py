@@ -25,7 +25,8 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.common.teams import (
+from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
     AGENT_KEY,
@@ -39,7 +40,6 @@ from sb3_saf.common.teams import (
 from sb3_saf.qplex.learning import TeamError, team_errors
 from sb3_saf.qplex.mixers import MixerName, check_mixer
 from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy, State
-from sb3_saf.qplex.replay_buffer import TeamReplayBuffer, TeamReplaySamples
 
 SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
 

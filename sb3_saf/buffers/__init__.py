@@ -1,0 +1,1 @@
+"""Rollouts and replays of whole teams."""

@@ -1,0 +1,326 @@
+"""Rollouts of teams: each observation stored once, minibatches of whole teams."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, TensorDict
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_saf.envs.teams import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    TEAM_KEY,
+    Array,
+    TeamSpaces,
+    check_whole_teams,
+)
+from sb3_saf.networks.value_normalizer import Rescaling, update_statistics
+
+#: Arrays with one entry per step and row, beside the observations.
+_ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
+
+
+class TeamRolloutBuffer(DictRolloutBuffer):
+    """
+    SB3's rollout buffer for the observations of ``CentralizedValueWrapper``, through ``rollout_buffer_class``.
+
+    - **Memory**: the own observations of a team are stored once, ``(T, E, N, *shape)`` in their own dtype; ``team`` and
+      ``agent`` are rebuilt when a minibatch is drawn. SB3's buffer stores N + 1 observations per row. A row of HECOGrid
+      with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes of action, reward, value and so on,
+      where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. The large arrays are made once and reused by all
+      rollouts.
+    - **Minibatches** hold whole teams, agents in index order, so no team is encoded in two minibatches. ``batch_size``
+      counts rows and must be a multiple of N; the last minibatch may be smaller.
+    - **Advantages** are SB3's, computed by its code.
+    - **Value normalisation**: a policy with ``normalize_values=True`` gets the returns of each rollout into its
+      statistics. Minibatches then give as old values what the unchanged critic says under the new statistics, so that
+      PPO's ``clip_range_vf`` starts from no difference; advantages and :attr:`values` are those of the rollout.
+    - **Agents that take no part** (``"active"``, where observations have it): minibatches leave their rows out, so that
+      loss, entropy and the normalisation of advantages see active rows only; ``batch_size`` is then an upper bound. An
+      agent's own end is the end of its return, see :meth:`compute_returns_and_advantage`.
+    - ``"action_mask"`` is stored for each row, ``"state"`` once per game.
+    - Rows that are not whole teams in index order are refused when they are added.
+
+    The order of teams comes from NumPy's global generator, as in SB3, so seeded runs repeat.
+
+    :param buffer_size: T, steps per rollout
+    :param observation_space: Dict observation space of ``CentralizedValueWrapper``
+    :param action_space: one agent's action space
+    :param device: where minibatches go
+    :param gae_lambda: trade-off of bias and variance of the advantages, 1 for Monte-Carlo
+    :param gamma: discount factor
+    :param n_envs: B, rows
+    :raises ValueError: if the space is not that of teams or the rows are no whole teams
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space[Any],
+        device: th.device | str = "auto",
+        gae_lambda: float = 1,
+        gamma: float = 0.99,
+        n_envs: int = 1,
+    ) -> None:
+        self.team_spaces = TeamSpaces.from_observation_space(observation_space)
+        self.n_agents = self.team_spaces.n_agents
+        self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
+        self._agents = np.tile(np.arange(self.n_agents), self.n_games)
+        self._allocated = False
+        self._rescaling: Rescaling | None = None
+        super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
+
+    def reset(self) -> None:
+        """Forget the rollout; the arrays stay, since touching fresh memory costs as much as the encoder."""
+        if not self._allocated:
+            # SB3 makes one array for each key of obs_shape, and stores those keys alone.
+            by_row = [key for key in (OBS_KEY, ACTION_MASK_KEY) if key in self.obs_shape]
+            self.obs_shape = {key: self.obs_shape[key] for key in by_row}
+            super().reset()
+            self._allocate_by_game()
+            self._allocated = True
+        self.generator_ready = False
+        BaseBuffer.reset(self)
+
+    def _allocate_by_game(self) -> None:
+        """Arrays with one entry per step and game: (T, E, ...)."""
+        self.active: Array | None = None
+        self.states: Array | None = None
+        shape = (self.buffer_size, self.n_games)
+        if self.team_spaces.active is not None:
+            self.active = np.ones((*shape, self.n_agents), dtype=np.int8)
+        if self.team_spaces.state is not None:
+            state = self.team_spaces.state
+            self.states = np.zeros((*shape, *(state.shape or ())), dtype=state.dtype)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the rollout takes."""
+        by_game = [array for array in (self.active, self.states) if array is not None]
+        arrays = [*self.observations.values(), *by_game, *(getattr(self, name) for name in _ROW_ARRAYS)]
+        return sum(array.nbytes for array in arrays)
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, Array],
+        action: Array,
+        reward: Array,
+        episode_start: Array,
+        value: th.Tensor,
+        log_prob: th.Tensor,
+    ) -> None:
+        """
+        Store one step of all games.
+
+        :param obs: Dict observation of B rows
+        :param action: (B, ...)
+        :param reward: (B,)
+        :param episode_start: (B,) whether an episode starts with this step
+        :param value: (B,) or (B, 1) predicted values
+        :param log_prob: (B,)
+        :raises ValueError: if the rows are not whole teams in index order
+        """
+        self._check_rows(obs)
+        for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
+            if array is not None:
+                array[self.pos] = self._of_games(obs, key, array)
+        super().add(obs, action, reward, episode_start, value, log_prob)
+
+    def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
+        """What all rows of a game share, once per game: (B, ...) -> (E, ...)."""
+        expected = (self.n_envs, *stored.shape[2:])
+        rows = np.asarray(obs[key])
+        if rows.shape != expected or not np.can_cast(rows.dtype, stored.dtype, "same_kind"):
+            raise ValueError(
+                f"expected {key!r} of shape {expected} and dtype {stored.dtype}, got {rows.shape} and {rows.dtype}; "
+                "fill the buffer from the environment that it was made for"
+            )
+        by_game = rows.reshape(self.n_games, self.n_agents, *stored.shape[2:])
+        differs = by_game[:, 0] != by_game[:, self.pos % self.n_agents]
+        if differs.any():
+            game = int(np.flatnonzero(differs.reshape(self.n_games, -1).any(axis=1))[0])
+            raise ValueError(f"expected one {key!r} for all rows of a game, but the rows of game {game} differ")
+        return by_game[:, 0]
+
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: npt.NDArray[Any]) -> None:
+        """
+        Advantages A and returns A + V of each agent, by SB3's recursion.
+
+        With c_t = 1 if the agent takes part at step t, and b_t = 1 if an episode begins there::
+
+            m_t = c_{t+1} (1 - b_{t+1})              (1 if the agent's own episode goes on after step t)
+            A_t = r_t + gamma m_t V_{t+1} - V_t + gamma lambda m_t A_{t+1}
+
+        So nothing that comes after an agent's own end counts for it. After the last step T, b is ``dones`` and
+        V_T ``last_values``: the policies of this package give zero to agents that take no part, which stands for c_T.
+        Advantages of rows that take no part are never read.
+
+        Then the returns of rows that take part go into the statistics of a policy that normalises values.
+
+        :param last_values: (B,) or (B, 1) values after the last step, as they come from the policy
+        :param dones: (B,) whether an episode ended with the last step
+        """
+        if self.active is None:
+            super().compute_returns_and_advantage(last_values, dones)
+            self._rescaling = update_statistics(last_values, self.returns)
+            return
+        starts = self.episode_starts
+        idle = self.active.reshape(self.buffer_size, self.n_envs) == 0
+        self.episode_starts = np.where(idle, np.float32(1), starts)
+        super().compute_returns_and_advantage(last_values, dones)
+        self.episode_starts = starts
+        self._rescaling = update_statistics(last_values, self.returns[~idle])
+
+    def _check_rows(self, obs: dict[str, Array]) -> None:
+        own, team, agents = (np.asarray(obs[key]) for key in (OBS_KEY, TEAM_KEY, AGENT_KEY))
+        self._check_shapes(own, team)
+        if not np.array_equal(agents.reshape(-1), self._agents):
+            raise ValueError(
+                f"expected rows game-major, then agent, with {AGENT_KEY!r} 0 to {self.n_agents - 1} in each team, got "
+                f"{agents.reshape(-1)[: 2 * self.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may "
+                "reorder rows"
+            )
+        # All rows of a team hold the same N observations. One row per team is compared at each step, another at the
+        # next: a full comparison would read N times as much memory and finds nothing that N steps of this do not.
+        seen_by = self.pos % self.n_agents
+        seen = team.reshape(self.n_games, self.n_agents, *team.shape[1:])[:, seen_by]
+        if not np.array_equal(seen, own.reshape(seen.shape)):
+            game = int(np.flatnonzero((seen != own.reshape(seen.shape)).reshape(self.n_games, -1).any(axis=1))[0])
+            raise ValueError(
+                f"expected {TEAM_KEY!r} to hold the {OBS_KEY!r} of the team's own rows, but they differ for agent "
+                f"{seen_by} of game {game}; change or normalise observations below CentralizedValueWrapper only"
+            )
+
+    def _check_shapes(self, own: Array, team: Array) -> None:
+        own_shape = (self.n_envs, *self.team_spaces.own_shape)
+        team_shape = (self.n_envs, self.n_agents, *self.team_spaces.own_shape)
+        dtype = self.observations[OBS_KEY].dtype
+        if own.shape != own_shape or team.shape != team_shape or not np.can_cast(own.dtype, dtype, "same_kind"):
+            raise ValueError(
+                f"expected {OBS_KEY!r} of shape {own_shape} and dtype {dtype} and {TEAM_KEY!r} of shape {team_shape}, "
+                f"got {own.shape} and {own.dtype}, and {team.shape}; fill the buffer from the environment that it was "
+                "made for, and change or normalise observations below CentralizedValueWrapper"
+            )
+
+    def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
+        """
+        Go through the rollout once, in an order of teams drawn anew.
+
+        :param batch_size: rows per minibatch, a multiple of N; None for all. Where agents take no part, rows are fewer
+        :return: minibatches of whole teams: rows of one team are consecutive and in index order
+        :raises ValueError: if the buffer is not full, N does not divide ``batch_size``, or nobody ever took part
+        """
+        if not self.full:
+            raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
+        teams_per_batch = self._teams_per_batch(batch_size)
+        teams = self._playing_teams()
+        # SB3 seeds NumPy's global generator, and no other, from the run's seed.
+        order = teams[np.random.permutation(len(teams))]  # noqa: NPY002
+        for start in range(0, len(order), teams_per_batch):
+            yield self._get_samples(order[start : start + teams_per_batch])
+
+    def _playing_teams(self) -> npt.NDArray[np.int64]:
+        """Team steps in which somebody takes part, each ``step * E + game``."""
+        if self.active is None:
+            return np.arange(self.buffer_size * self.n_games)
+        playing = np.flatnonzero(self.active.any(axis=2))
+        if not len(playing):
+            raise ValueError(
+                f"expected agents that take part, got none in {self.buffer_size} steps of {self.n_games} games; there "
+                f"is nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or collect longer rollouts"
+            )
+        return playing
+
+    def _teams_per_batch(self, batch_size: int | None) -> int:
+        if batch_size is None:
+            return self.buffer_size * self.n_games
+        if batch_size < 1 or batch_size % self.n_agents:
+            raise ValueError(
+                f"batch_size counts rows and must be a multiple of n_agents={self.n_agents}, because TeamRolloutBuffer "
+                f"gives whole teams, got {batch_size}; use batch_size={self._nearest_batch_sizes(batch_size)}"
+            )
+        return batch_size // self.n_agents
+
+    def _nearest_batch_sizes(self, batch_size: int) -> str:
+        """What somebody may have meant."""
+        rollout = self.buffer_size * self.n_games * self.n_agents
+        if batch_size > rollout:
+            return f"{rollout}, the whole rollout (n_steps={self.buffer_size} x {self.n_games} games x {self.n_agents})"
+        below = max(batch_size // self.n_agents, 0) * self.n_agents
+        return " or ".join(str(size) for size in (below, below + self.n_agents) if size > 0)
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None
+    ) -> DictRolloutBufferSamples:
+        """
+        Rows of the given team steps whose agents take part.
+
+        :param batch_inds: (K,) each is ``step * E + game``
+        :param env: unused, as in SB3's buffers for rollouts
+        :return: K * N rows, less those of agents that take no part
+        """
+        samples = DictRolloutBufferSamples(
+            observations=self._rebuild(batch_inds),
+            actions=self._take(self.actions, batch_inds).float().flatten(end_dim=1),
+            old_values=self._old_values(batch_inds),
+            old_log_prob=self._take(self.log_probs, batch_inds).flatten(),
+            advantages=self._take(self.advantages, batch_inds).flatten(),
+            returns=self._take(self.returns, batch_inds).flatten(),
+        )
+        if self.active is None:
+            return samples
+        active = self._of_team_steps(self.active, batch_inds)
+        if active.all():
+            return samples
+        rows = th.as_tensor(np.flatnonzero(active), device=self.device)
+        observations = {key: entry[rows] for key, entry in samples.observations.items()}
+        return DictRolloutBufferSamples(observations, *(part[rows] for part in samples[1:]))
+
+    def _of_team_steps(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
+        """(T, E, ...) -> (K, ...)."""
+        return array.reshape(self.buffer_size * self.n_games, *array.shape[2:])[team_steps]
+
+    def _old_values(self, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
+        values = self._take(self.values, team_steps).flatten()
+        if self._rescaling is None:
+            return values
+        return values * self._rescaling.scale + self._rescaling.shift
+
+    def _take(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
+        """(T, B, ...) -> (K, N, ...); rows lie game-major, so each team step is one stretch of memory."""
+        by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
+        return self.to_torch(by_team[team_steps], copy=False)
+
+    def _rebuild(self, team_steps: npt.NDArray[np.int64]) -> TensorDict:
+        """
+        The Dict observation of all rows of some teams, in the shapes of SB3's buffer.
+
+        :param team_steps: (K,)
+        """
+        own = self._take(self.observations[OBS_KEY], team_steps)
+        n_teams, n_agents = own.shape[:2]
+        shape = self.team_spaces.own_shape
+        team = own.reshape(n_teams, 1, n_agents, *shape).expand(n_teams, n_agents, n_agents, *shape)
+        rows = {
+            OBS_KEY: own.flatten(end_dim=1),
+            TEAM_KEY: team.reshape(n_teams * n_agents, n_agents, *shape),
+            AGENT_KEY: th.arange(n_agents, device=own.device).repeat(n_teams).unsqueeze(1),
+        }
+        if ACTION_MASK_KEY in self.observations:
+            rows[ACTION_MASK_KEY] = self._take(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
+        for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
+            if array is not None:
+                by_game = self.to_torch(self._of_team_steps(array, team_steps), copy=False)
+                rows[key] = by_game.repeat_interleave(n_agents, dim=0)
+        return rows

@@ -1,0 +1,159 @@
+"""Evaluation during training, in team episodes and game steps."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, game_steps
+from sb3_saf.envs.teams import check_other_games, require_n_agents
+from sb3_saf.evaluation import EvaluationResult, evaluate_team
+
+
+class TeamEvalCallback(EvalCallback):
+    """
+    SB3's EvalCallback for teams.
+
+    It writes what SB3's writes: ``evaluations.npz`` (with one more array, ``game_steps``), ``best_model.zip``,
+    ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/success_rate``, and also ``eval/game_steps``. Returns are team
+    returns, lengths are game steps. SB3's ``timesteps`` stay agents' steps (game steps x N), in which SB3 counts.
+
+    :param eval_env: environment of teams, for instance from ``make_team_env`` with a seed of its own
+    :param callback_on_new_best: called when the mean team return is the best so far
+    :param callback_after_eval: called after every evaluation
+    :param n_eval_episodes: team episodes per evaluation
+    :param eval_freq: **game steps** between evaluations, summed over all parallel games; 0 or less for none
+    :param log_path: folder for ``evaluations.npz``
+    :param best_model_save_path: folder for ``best_model.zip``
+    :param deterministic: whether the model takes its most likely actions
+    :param render: whether to render the evaluation
+    :param verbose: 0 for silence, 1 to print results
+    :param warn: warn if ``eval_env`` has no TeamMonitor
+    :raises ValueError: if ``eval_env`` is not made of teams, or its games are those of training
+    """
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        callback_on_new_best: BaseCallback | None = None,
+        callback_after_eval: BaseCallback | None = None,
+        n_eval_episodes: int = 5,
+        eval_freq: int = 10_000,
+        log_path: str | None = None,
+        best_model_save_path: str | None = None,
+        deterministic: bool = True,
+        render: bool = False,
+        verbose: int = 1,
+        warn: bool = True,
+    ) -> None:
+        require_n_agents(eval_env)
+        super().__init__(
+            eval_env,
+            callback_on_new_best=callback_on_new_best,
+            callback_after_eval=callback_after_eval,
+            n_eval_episodes=n_eval_episodes,
+            eval_freq=eval_freq,
+            log_path=log_path,
+            best_model_save_path=best_model_save_path,
+            deterministic=deterministic,
+            render=render,
+            verbose=verbose,
+            warn=warn,
+        )
+        self.evaluations_game_steps: list[int] = []
+        self._next_evaluation = 0
+
+    def _init_callback(self) -> None:
+        require_n_agents(self.training_env)
+        check_other_games(self.training_env, self.eval_env)
+        super()._init_callback()
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._plan_next()
+
+    def _game_steps(self) -> int:
+        steps = game_steps(self.model)
+        assert steps is not None, "_init_callback has checked that the environment is made of teams"
+        return steps
+
+    def _plan_next(self) -> None:
+        """The next multiple of ``eval_freq``: E games at a time, steps may jump over it."""
+        if self.eval_freq > 0:
+            self._next_evaluation = (self._game_steps() // self.eval_freq + 1) * self.eval_freq
+
+    def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation:
+            return True
+        self._plan_next()
+        return self._evaluate()
+
+    def _evaluate(self) -> bool:
+        """Play, store and log: whether training goes on."""
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        self._is_success_buffer = []
+        result = evaluate_team(
+            self.model,
+            self.eval_env,
+            self.n_eval_episodes,
+            self.deterministic,
+            render=self.render,
+            callback=self._log_success_callback,
+            warn=self.warn,
+        )
+        self.last_mean_reward = result.mean
+        self._store(result)
+        self._log(result)
+        return self._react(result)
+
+    def _store(self, result: EvaluationResult) -> None:
+        if self.log_path is None:
+            return
+        self.evaluations_timesteps.append(self.num_timesteps)
+        self.evaluations_game_steps.append(self._game_steps())
+        self.evaluations_results.append(result.returns)
+        self.evaluations_length.append(result.lengths)
+        arrays = {
+            "timesteps": np.array(self.evaluations_timesteps),
+            "game_steps": np.array(self.evaluations_game_steps),
+            "results": np.array(self.evaluations_results),
+            "ep_lengths": np.array(self.evaluations_length),
+        }
+        if self._is_success_buffer:
+            self.evaluations_successes.append(self._is_success_buffer)
+            arrays["successes"] = np.array(self.evaluations_successes)
+        np.savez(self.log_path, **arrays)  # type: ignore[arg-type]
+
+    def _log(self, result: EvaluationResult) -> None:
+        steps, mean_length = self._game_steps(), float(np.mean(result.lengths))
+        self._say(f"Evaluation after {steps} game steps: team return {result}, {mean_length:.2f} steps per episode")
+        self.logger.record("eval/mean_reward", result.mean)
+        self.logger.record("eval/mean_ep_length", mean_length)
+        self.logger.record("eval/game_steps", steps)
+        if self._is_success_buffer:
+            success_rate = float(np.mean(self._is_success_buffer))
+            self._say(f"Success rate: {100 * success_rate:.2f} %")
+            self.logger.record("eval/success_rate", success_rate)
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.record(GAME_STEPS_TAG, steps)
+        self.logger.dump(self.num_timesteps)
+
+    def _react(self, result: EvaluationResult) -> bool:
+        """Keep the best model and call the callbacks: whether training goes on."""
+        go_on = True
+        if result.mean > self.best_mean_reward:
+            self._say("New best mean team return")
+            self.best_mean_reward = result.mean
+            if self.best_model_save_path is not None:
+                self.model.save(os.path.join(self.best_model_save_path, "best_model"))
+            if self.callback_on_new_best is not None:
+                go_on = self.callback_on_new_best.on_step()
+        return go_on and (self.callback is None or self._on_event())
+
+    def _say(self, text: str) -> None:
+        if self.verbose >= 1:
+            print(text)

@@ -1,1 +1,0 @@
-"""What the algorithms share: teams of rows, distinct-row encoding, buffers, monitors, evaluation, networks."""

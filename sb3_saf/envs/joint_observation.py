@@ -1,0 +1,277 @@
+"""The joint view: every row carries what a centralised critic needs, and an actor can still read its own part alone."""
+
+from __future__ import annotations
+
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from sb3_saf.envs.row_spaces import RowSpaces, channels_first
+from sb3_saf.envs.teams import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    TEAM_KEY,
+    Array,
+    TeamSpaces,
+    TeamVecEnvWrapper,
+    check_finite,
+    require_n_agents,
+    team_dones,
+)
+
+TimeLimit = Literal["terminal", "bootstrap"]
+TIME_LIMITS: Final[tuple[TimeLimit, ...]] = get_args(TimeLimit)
+
+TERMINAL_OBSERVATION: Final = "terminal_observation"
+TRUNCATED: Final = "TimeLimit.truncated"
+#: What sb3-contrib asks an environment for.
+_ACTION_MASKS: Final = "action_masks"
+
+
+class CentralizedValueWrapper(TeamVecEnvWrapper):
+    """
+    Turn the rows of flattened teams into rows that a centralised critic can judge one by one.
+
+    The observation of a row becomes a Dict:
+
+    ========= ================ ======================================================================
+    key       shape of a row   content
+    ========= ================ ======================================================================
+    ``obs``   ``(*shape)``     the agent's own observation, all that its policy may read
+    ``team``  ``(N, *shape)``  own observations of all agents of its team, in index order (always a Box)
+    ``agent`` ``()``           index of the agent in its team, Discrete(N)
+    ========= ================ ======================================================================
+
+    Environments that tell more get more keys (:class:`RowSpaces` says how a VecEnv tells it; ``make_team_env`` does
+    it for any PettingZoo environment):
+
+    =============== ============== ================================================================================
+    key             shape of a row content
+    =============== ============== ================================================================================
+    ``active``      ``(N,)``       1 for the agents of its team that take part, in index order (MultiBinary)
+    ``action_mask`` ``(A,)``       1 for its legal actions (MultiBinary); an agent that takes no part has action 0
+    ``state``       ``(*state)``   the state of its game, the same in all rows of the game
+    =============== ============== ================================================================================
+
+    Shuffled minibatches, ``predict_values`` on a single row and SB3's own buffers are therefore all correct.
+
+    Images (3-D, uint8, 0 to 255) with channels last are transposed here, once, to channels first, and SB3 adds no
+    transposition of its own. A space with an attribute ``atlas`` holds codes, not pixels: it is passed on as it is.
+    The arrays of one step are never written to by a later one.
+
+    :param venv: rows of flattened teams, game-major, then agent
+    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
+    :param time_limit: ``"terminal"`` treats a time limit as a true end (as in the paper's experiments);
+        ``"bootstrap"`` lets the algorithm add the value of the last observation where the env sets
+        ``"TimeLimit.truncated"``
+    :raises ValueError: if N is unknown or does not divide the rows, the observation space is a Tuple or a Dict of
+        other keys, or ``time_limit`` is neither of the two
+    """
+
+    def __init__(self, venv: VecEnv, n_agents: int | None = None, time_limit: TimeLimit = "terminal") -> None:
+        if time_limit not in TIME_LIMITS:
+            raise ValueError(f"time_limit must be {' or '.join(map(repr, TIME_LIMITS))}, got {time_limit!r}")
+        raw = RowSpaces.of(venv.observation_space, venv.action_space)
+        team = TeamSpaces.of(
+            channels_first(raw.own),
+            require_n_agents(venv, n_agents),
+            raw.active,
+            raw.n_masked_actions,
+            None if raw.state is None else channels_first(raw.state),
+        )
+        inner = _NoTransposition(venv) if _sb3_would_transpose(team) else venv
+        super().__init__(inner, n_agents, team.to_dict_space())
+        self.time_limit = time_limit
+        self.team_spaces = team
+        self._raw = raw
+        self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
+        self._n_steps = 0
+        self._masks_shown: Array | None = None
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""
+        return self._shows_masks(attr_name) or super().has_attr(attr_name)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of the rows' games; ``action_masks``, which MaskablePPO asks for, also where observations have
+        ``action_mask`` and the games have no such method.
+
+        :param method_name: of the game
+        :param method_args: positional arguments
+        :param indices: rows
+        :param method_kwargs: keyword arguments
+        :return: one result per row
+        """
+        if self._shows_masks(method_name) and not super().has_attr(method_name):
+            assert self._masks_shown is not None, "algorithms reset the environment before they ask"
+            return [self._masks_shown[row].astype(bool) for row in self._get_indices(indices)]
+        return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+
+    def _shows_masks(self, method_name: str) -> bool:
+        return method_name == _ACTION_MASKS and self.team_spaces.action_mask is not None
+
+    def reset(self) -> dict[str, Array]:
+        """
+        Start new episodes in all games.
+
+        :return: the Dict observation of all rows
+        """
+        return self._joint_view(self.venv.reset())
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Wait for the step of all games.
+
+        :return: Dict observation, rewards (B,), dones (B,) bool, infos; ``terminal_observation`` is the complete Dict
+            observation of its row
+        :raises ValueError: for NaN or infinity, dones that differ inside a team, agents without any legal action, and
+            missing terminal observations
+        """
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self._n_steps += 1
+        check_finite("rewards", rewards, self.n_agents, self._n_steps)
+        ended = team_dones(dones, self.n_agents)
+        # Copies, because SB3 adds bootstrapped values to the rewards in place.
+        return (
+            self._joint_view(obs),
+            np.array(rewards),
+            np.repeat(ended, self.n_agents),
+            self._complete_infos(infos, ended),
+        )
+
+    def _joint_view(self, obs: object) -> dict[str, Array]:
+        parts = self._checked_parts(obs, "observations")
+        teams = parts[OBS_KEY].reshape(self.n_games, *self.team_spaces.team.shape)
+        joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0), AGENT_KEY: self._agents.copy()}
+        if ACTIVE_KEY in parts:
+            joint[ACTIVE_KEY] = np.repeat(parts[ACTIVE_KEY], self.n_agents, axis=0)
+        self._masks_shown = parts.get(ACTION_MASK_KEY)
+        return joint
+
+    def _checked_parts(self, obs: Any, what: str, game: int | None = None) -> dict[str, Array]:
+        """
+        What rows of all games or one tell, checked and copied.
+
+        :return: own observations (B, *shape); where told, active agents (E, N), action masks (B, A), states (B, *state)
+        """
+        raw, team = self._raw, self.team_spaces
+        entries = raw.entries(obs, what)
+        parts = {OBS_KEY: self._rows(entries[OBS_KEY], raw.own, team.own, what, game)}
+        if raw.active:
+            parts[ACTIVE_KEY] = np.asarray(entries[ACTIVE_KEY]).reshape(-1, self.n_agents).astype(np.int8)
+        if raw.n_masked_actions is not None:
+            parts[ACTION_MASK_KEY] = self._masks(entries[ACTION_MASK_KEY], parts.get(ACTIVE_KEY), game)
+        if raw.state is not None:
+            assert team.state is not None
+            parts[STATE_KEY] = self._rows(entries[STATE_KEY], raw.state, team.state, f"states in {what}", game)
+        return parts
+
+    def _rows(
+        self, obs: object, raw: spaces.Space[Any], stored: spaces.Space[Any], what: str, game: int | None = None
+    ) -> Array:
+        """Check and copy an entry of the rows of all games or one, channels first: (B, *raw shape) -> (B, *shape)."""
+        rows = np.asarray(obs)
+        expected = (self.num_envs if game is None else self.n_agents, *(raw.shape or ()))
+        if rows.shape != expected or not np.can_cast(rows.dtype, raw.dtype or rows.dtype, "same_kind"):
+            raise ValueError(
+                f"expected {what} of shape {expected} and dtype {raw.dtype} as in {raw}, got "
+                f"shape {rows.shape} and dtype {rows.dtype}; make the environment return what its space promises"
+            )
+        check_finite(what, rows, self.n_agents, self._n_steps, first_game=game or 0)
+        if raw is not stored:
+            rows = np.moveaxis(rows, -1, 1)
+        return np.array(rows, dtype=raw.dtype, order="C")
+
+    def _masks(self, masks: object, active: Array | None, game: int | None) -> Array:
+        """Check and copy action masks. Rows that do not act, and last observations without masks, get action 0."""
+        rows = np.array(masks, dtype=np.int8)
+        idle = np.zeros(len(rows), dtype=bool) if active is None else active.reshape(-1) == 0
+        stuck = ~idle & ~rows.any(axis=1)
+        if stuck.any() and game is None:
+            row = int(np.flatnonzero(stuck)[0])
+            raise ValueError(
+                f"expected at least one legal action in the {ACTION_MASK_KEY!r} of an agent that takes part, got none "
+                f"at step {self._n_steps} for agent {row % self.n_agents} of game {row // self.n_agents}; give agents "
+                "that have to wait for their turn one action that does nothing"
+            )
+        rows[idle | stuck] = np.arange(rows.shape[1]) == 0
+        return rows
+
+    def _complete_infos(self, infos: list[dict[str, Any]], ended: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:
+        infos = list(infos)
+        for game in np.flatnonzero(ended).tolist():
+            first = game * self.n_agents
+            last = self._terminal_parts(infos[first : first + self.n_agents], game)
+            for agent in range(self.n_agents):
+                infos[first + agent] = self._terminal_info(infos[first + agent], last, agent)
+        return infos
+
+    def _terminal_parts(self, infos: list[dict[str, Any]], game: int) -> dict[str, Array]:
+        """What the last observations of a team tell whose episode ended, as in :meth:`_checked_parts`."""
+        observations: list[Any] = [info.get(TERMINAL_OBSERVATION) for info in infos]
+        missing = [agent for agent, observation in enumerate(observations) if observation is None]
+        if missing:
+            raise ValueError(
+                f"expected infos[row]['{TERMINAL_OBSERVATION}'] for all {self.n_agents} agents of game {game}, whose "
+                f"episode ended at step {self._n_steps}, got none for agents {missing}; every row of a done team must "
+                "carry its last observation, as SB3's VecEnvs do"
+            )
+        if not self._raw.is_dict:
+            return self._checked_parts(_stacked(observations, game), "terminal observations", game)
+        entries = [self._raw.entries(observation, "terminal observations") for observation in observations]
+        stacked = {key: _stacked([entry[key] for entry in entries], game) for key in entries[0]}
+        return self._checked_parts(stacked, "terminal observations", game)
+
+    def _terminal_info(self, info: dict[str, Any], last: dict[str, Array], agent: int) -> dict[str, Any]:
+        row = {key: part[agent] for key, part in last.items() if key != ACTIVE_KEY}
+        row |= {TEAM_KEY: last[OBS_KEY], AGENT_KEY: np.int64(agent)}
+        if ACTIVE_KEY in last:
+            row[ACTIVE_KEY] = last[ACTIVE_KEY][0]
+        info = {**info, TERMINAL_OBSERVATION: row}
+        if self.time_limit == "terminal" and TRUNCATED in info:
+            info[TRUNCATED] = False
+        return info
+
+
+def _stacked(observations: list[Any], game: int) -> Array:
+    shapes = {np.shape(observation) for observation in observations}
+    if len(shapes) > 1:
+        raise ValueError(
+            f"expected terminal observations of one shape for the agents of game {game}, got {sorted(shapes)}; "
+            "make the environment return what its space promises"
+        )
+    return np.stack(observations)
+
+
+class _NoTransposition(VecTransposeImage):
+    """
+    Does nothing but keep SB3 from transposing: it adds a VecTransposeImage only where it finds none.
+
+    :param venv: any vector environment
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        # The parent would refuse spaces that are not of images.
+        VecEnvWrapper.__init__(self, venv)
+        self.skip = True
+
+
+def _sb3_would_transpose(team: TeamSpaces) -> bool:
+    """
+    Whether SB3 would take a part for channel-last images and transpose it behind our back.
+
+    The N views of a team in bytes, (N, width, height), look just like an image.
+    """
+    seen = [space for space in (team.own, team.team, team.state) if space is not None]
+    return any(is_image_space(space) and int(np.argmin(space.shape or (0,))) != 0 for space in seen)

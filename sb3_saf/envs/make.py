@@ -1,0 +1,167 @@
+"""From a task, an environment or a factory to the vector environment that the policies of this package train on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, Literal, TypeAlias, get_args
+
+from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
+from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.teams import check_count
+
+Backend = Literal["native", "supersuit"]
+BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+#: Whether to look for action masks: where there are any, always, never.
+AskMasks: TypeAlias = Literal["auto"] | bool
+
+AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
+EnvFactory: TypeAlias = "Callable[..., AnyParallelEnv]"
+
+
+def make_team_env(
+    env: str | AnyParallelEnv | EnvFactory,
+    n_envs: int = 1,
+    seed: int | None = None,
+    backend: Backend | None = None,
+    time_limit: TimeLimit = "terminal",
+    monitor_dir: str | None = None,
+    n_cpus: int = 1,
+    *,
+    active: bool | None = None,
+    action_masks: AskMasks = "auto",
+    state: bool = False,
+    **params: Any,
+) -> CentralizedValueWrapper:
+    """
+    Make E parallel games, ready for ``PPO("SAFPolicy", ...)``.
+
+    The chain is: games flattened to rows, :class:`TeamMonitor`, :class:`CentralizedValueWrapper`.
+
+    HECOGrid tasks give ``observation="tiles"`` here unless told otherwise: the same views as one code per cell, from
+    which the encoder makes the same pixels, in 48 times less memory than ``observation="rgb"``.
+
+    Environments of others may have agents that die or join, action masks, and a state:
+
+    - An agent that has ended, or not joined yet, keeps its row, which shows zeros; ``"active"`` tells the critics, and
+      ``TeamRolloutBuffer`` keeps such rows out of the loss.
+    - Masks come from observations of the form {"observation", "action_mask"}, which are taken apart, or from
+      ``infos[agent]["action_mask"]``. Policies of this package take legal actions only.
+    - The environment's ``state()`` can be the input of MAPPO's critic, ``policy_kwargs={"critic_input": "state"}``.
+
+    :param env: a HECOGrid task ("TeamTogether", or its id "hecogrid/TeamTogether-v0"), a PettingZoo ParallelEnv whose
+        agents have equal spaces, or a factory that returns one (``simple_spread_v3.parallel_env``). Of a ParallelEnv,
+        copies are used
+    :param n_envs: E, parallel games
+    :param seed: the run's seed, from which each game gets its own; None for fresh ones. An algorithm that is given a
+        ``seed`` replaces it with its own
+    :param backend: ``"native"`` steps all games at once in compiled code, for HECOGrid only and its default;
+        ``"supersuit"`` goes through SuperSuit, the default for all else. Both give HECOGrid's same numbers
+    :param time_limit: ``"terminal"`` treats a time limit as a true end, ``"bootstrap"`` adds the value of what follows
+    :param monitor_dir: folder for a ``monitor.csv`` with one line per team episode; None for none
+    :param n_cpus: processes among which ``"supersuit"`` divides the games
+    :param active: whether observations tell which agents take part; None for "yes" but for HECOGrid, whose agents
+        always do
+    :param action_masks: ``"auto"`` for masks where the environment gives any (for infos, those of its first reset
+        decide), True to insist on them, False for none
+    :param state: whether observations have the environment's ``state()``
+    :param params: of the task or the factory, for instance ``n_agents=5``
+    :raises ValueError: if the arguments do not fit together, with what to do
+    """
+    check_count("n_envs", n_envs)
+    check_count("n_cpus", n_cpus)
+    _check_backend(backend)
+    if isinstance(env, str):
+        _refuse_signals(active, action_masks, state)
+        venv = _hecogrid(env, n_envs, seed, backend or "native", n_cpus, params)
+    else:
+        signals = {"active": active is not False, "action_masks": action_masks, "state": state}
+        venv = _foreign(env, n_envs, seed, backend or "supersuit", n_cpus, params, signals)
+    if monitor_dir is not None:
+        os.makedirs(monitor_dir, exist_ok=True)
+    return CentralizedValueWrapper(TeamMonitor(venv, filename=monitor_dir), time_limit=time_limit)
+
+
+def _check_backend(backend: Backend | None) -> None:
+    if backend is not None and backend not in BACKENDS:
+        raise ValueError(f"backend must be {', '.join(map(repr, BACKENDS))} or None, got {backend!r}")
+
+
+def _refuse_signals(active: bool | None, action_masks: AskMasks, state: bool) -> None:
+    asked = {"active=True": active, "action_masks=True": action_masks is True, "state=True": state}
+    for argument, is_asked in asked.items():
+        if is_asked:
+            raise ValueError(
+                f"{argument} goes through SuperSuit, and a HECOGrid task named by a string does not ask for it: its "
+                "agents always take part and may do anything. Leave it out, or pass a factory for env, for instance "
+                "hecogrid_envs.tasks.team_support.parallel_env"
+            )
+
+
+def _hecogrid(
+    task: str, n_envs: int, seed: int | None, backend: Backend, n_cpus: int, params: dict[str, Any]
+) -> VecEnv:
+    """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
+    from hecogrid_envs import make_vec_env
+    from hecogrid_envs.params import check_task
+
+    try:
+        name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))
+    except ValueError as error:
+        raise ValueError(
+            f"{error}. For any other environment pass a PettingZoo ParallelEnv or a factory that returns one, for "
+            "instance simple_spread_v3.parallel_env"
+        ) from None
+    if n_cpus != 1:
+        if backend == "native":
+            raise ValueError(
+                f"n_cpus={n_cpus} divides games among SuperSuit's processes, but backend='native' steps all games at "
+                "once; leave n_cpus out (native has n_threads) or use backend='supersuit'"
+            )
+        params = {**params, "n_cpus": n_cpus}
+    return make_vec_env(name, n_envs, seed=seed, backend=backend, **{"observation": "tiles", **params})
+
+
+def _foreign(
+    env: AnyParallelEnv | EnvFactory,
+    n_envs: int,
+    seed: int | None,
+    backend: Backend,
+    n_cpus: int,
+    params: dict[str, Any],
+    signals: dict[str, Any],
+) -> VecEnv:
+    """Any ParallelEnv, through SuperSuit."""
+    from hecogrid_envs.supersuit_bridge import supersuit_vec_env
+
+    if backend == "native":
+        raise ValueError(
+            f"backend='native' is the compiled core of HECOGrid, got it with {_name(env)}; leave backend out or use "
+            "backend='supersuit'"
+        )
+    return supersuit_vec_env(_bound(env, params), n_envs, seed, n_cpus, **signals)
+
+
+def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:
+    """A factory with its parameters, or the environment itself."""
+    if isinstance(env, VecEnv):
+        raise ValueError(
+            f"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv {_name(env)}; wrap it "
+            "yourself: sb3_saf.CentralizedValueWrapper(sb3_saf.TeamMonitor(venv))"
+        )
+    if not params:
+        return env
+    if isinstance(env, (ParallelEnv, AECEnv)) or not callable(env):
+        raise ValueError(
+            f"parameters {sorted(params)} go to a factory, got them with {_name(env)}; give them to the environment "
+            "when you make it, or pass its factory (such as simple_spread_v3.parallel_env) instead"
+        )
+    return partial(env, **params)
+
+
+def _name(env: object) -> str:
+    return getattr(env, "__qualname__", None) or type(env).__name__

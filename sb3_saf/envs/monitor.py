@@ -1,0 +1,175 @@
+"""Team episodes and team returns, where SB3's monitors would count every agent as an episode of its own."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Mapping
+from typing import IO, Any
+
+import numpy as np
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_saf.envs.teams import TeamVecEnvWrapper, check_finite, team_dones
+
+
+class TeamMonitor(TeamVecEnvWrapper):
+    """
+    Count team episodes.
+
+    When the episode of a game ends, the info of its **agent 0 alone** gets
+    ``info["episode"] = {"r": team return, "l": game steps, "t": seconds since the start}``, where the team return is
+    the sum of the rewards of all agents over all steps. SB3 logs the mean of what it finds under that key, so
+    ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
+
+    It is no VecMonitor: SB3's own ``evaluate_policy`` would wait for an ``"episode"`` entry in every row and never
+    return. With a TeamMonitor it does return, but takes every agent for an episode and warns that there is no monitor;
+    use ``sb3_saf.evaluate_policy``, which counts teams.
+
+    :param venv: rows of flattened teams, game-major, then agent
+    :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none
+    :param info_keywords: entries of agent 0's last info to add to the episode's
+    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
+    :raises ValueError: if N is unknown or does not divide the rows
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        filename: str | None = None,
+        info_keywords: tuple[str, ...] = (),
+        n_agents: int | None = None,
+    ) -> None:
+        super().__init__(venv, n_agents)
+        self.info_keywords = info_keywords
+        self.episode_count = 0
+        self.t_start = time.time()
+        self._returns = np.zeros(self.n_games, dtype=np.float64)
+        self._lengths = np.zeros(self.n_games, dtype=np.int64)
+        self._n_steps = 0
+        self._filename = filename
+        self._writer: ResultsWriter | None = None
+
+    def reset(self) -> VecEnvObs:
+        """
+        Start new episodes in all games; unfinished ones are not counted.
+
+        The first reset begins the file. A resumed run has none, so it finds the file of before.
+
+        :return: observations as ``venv`` gives them
+        """
+        if self._writer is None:
+            self._writer = self._open(override_existing=True)
+        self._returns[:] = 0
+        self._lengths[:] = 0
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Wait for the step of all games.
+
+        :return: what ``venv`` gives, with the episode entries in a copy of the infos
+        :raises ValueError: for NaN or infinity in the rewards, or dones that differ inside a team
+        """
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self._n_steps += 1
+        check_finite("rewards", rewards, self.n_agents, self._n_steps)
+        ended = team_dones(dones, self.n_agents)
+        # Sums of many float32 rewards drift; sums of float64 do not.
+        self._returns += rewards.reshape(self.n_games, self.n_agents).sum(axis=1, dtype=np.float64)
+        self._lengths += 1
+        if ended.any():
+            infos = list(infos)
+            for game in np.flatnonzero(ended).tolist():
+                row = game * self.n_agents
+                infos[row] = {**infos[row], "episode": self._finish_episode(game, infos[row])}
+        return obs, rewards, dones, infos
+
+    def _finish_episode(self, game: int, info: dict[str, Any]) -> dict[str, Any]:
+        missing = [key for key in self.info_keywords if key not in info]
+        if missing:
+            raise ValueError(
+                f"expected the info_keywords {list(self.info_keywords)} in the last info of agent 0, got "
+                f"{sorted(map(str, info))} in game {game}; leave out {missing} or let the environment give them"
+            )
+        episode: dict[str, Any] = {
+            "r": float(self._returns[game]),
+            "l": int(self._lengths[game]),
+            "t": round(time.time() - self.t_start, 6),
+            **{key: info[key] for key in self.info_keywords},
+        }
+        self._returns[game] = 0
+        self._lengths[game] = 0
+        self.episode_count += 1
+        if self._writer is not None:
+            self._writer.write_row(episode)
+        return episode
+
+    def _open(self, override_existing: bool) -> ResultsWriter | None:
+        if self._filename is None:
+            return None
+        header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(getattr(self.venv, "spec", None))}
+        return ResultsWriter(self._filename, header, self.info_keywords, override_existing)
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        Counters, unfinished episodes, and how long the file is.
+
+        :return: plain data for :meth:`load_checkpoint_state`
+        """
+        return {
+            "returns": self._returns.copy(),
+            "lengths": self._lengths.copy(),
+            "episode_count": self.episode_count,
+            "t_start": self.t_start,
+            "n_steps": self._n_steps,
+            "file_size": None if self._writer is None else _synced_size(self._writer.file_handler),
+        }
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there: lines that were written to the file later are cut off, for they will come again.
+
+        :param state: what :meth:`checkpoint_state` gave
+        """
+        self._returns[:] = state["returns"]
+        self._lengths[:] = state["lengths"]
+        self.episode_count = state["episode_count"]
+        self.t_start = state["t_start"]
+        self._n_steps = state["n_steps"]
+        if self._filename is None or state["file_size"] is None:
+            return
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = self._open(override_existing=False)
+        assert self._writer is not None
+        _cut(self._writer.file_handler, state["file_size"])
+
+    def close(self) -> None:
+        """Close the file and the environment."""
+        if self._writer is not None:
+            self._writer.close()
+        super().close()
+
+
+def _synced_size(file: IO[Any]) -> int:
+    """Bytes of a file that are surely on the disk."""
+    file.flush()
+    os.fsync(file.fileno())
+    return os.fstat(file.fileno()).st_size
+
+
+def _cut(file: IO[Any], size: int) -> None:
+    found = os.fstat(file.fileno()).st_size
+    if found < size:
+        warnings.warn(
+            f"expected {file.name} with the {size} bytes that it had at the checkpoint, got {found}: episodes before "
+            "the checkpoint are missing in it",
+            UserWarning,
+            stacklevel=3,
+        )
+        return
+    os.truncate(file.fileno(), size)

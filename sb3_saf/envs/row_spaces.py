@@ -1,0 +1,107 @@
+"""What a vector environment of flattened teams tells of each row, before ``CentralizedValueWrapper`` joins teams."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+
+from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, ALL_KEYS, OBS_KEY, OPTIONAL_KEYS, STATE_KEY, TEAM_KEYS
+
+_ROW_KEYS = {OBS_KEY, *OPTIONAL_KEYS}
+
+
+class RowSpaces(NamedTuple):
+    """
+    The parts of a row's observation.
+
+    A VecEnv of flattened teams gives rows their own observations alone, or Dicts with the keys ``"obs"`` and any of
+
+    - ``"active"``, Discrete(2): 1 while the row's agent takes part;
+    - ``"action_mask"``, MultiBinary(A): 1 for legal actions, where actions are Discrete(A);
+    - ``"state"``: the state of the row's game, equal in all its rows.
+
+    :param own: space of the row's own observation
+    :param active: whether rows tell if their agent takes part
+    :param n_masked_actions: A if rows have masks, else None
+    :param state: space of the game's state if rows have it
+    :param is_dict: whether rows are Dicts
+    """
+
+    own: spaces.Space[Any]
+    active: bool = False
+    n_masked_actions: int | None = None
+    state: spaces.Space[Any] | None = None
+    is_dict: bool = False
+
+    @classmethod
+    def of(cls, space: spaces.Space[Any], action_space: spaces.Space[Any]) -> RowSpaces:
+        """
+        Take the observation space of rows apart.
+
+        :param space: observation space of the VecEnv
+        :param action_space: its action space
+        :raises ValueError: if the space has rows of teams already, or an optional key is of another form
+        """
+        if not isinstance(space, spaces.Dict):
+            return cls(space)
+        keys = set(space.spaces)
+        if set(TEAM_KEYS) <= keys <= ALL_KEYS:
+            raise ValueError(
+                "expected a VecEnv of own observations, got one that already has the Dict observation of "
+                "CentralizedValueWrapper; wrap it once (sb3_saf.make_team_env has done so)"
+            )
+        if OBS_KEY not in keys or not keys <= _ROW_KEYS:
+            return cls(space)  # an own observation of an unknown form, which TeamSpaces refuses with what to do
+        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
+        if active is not None and active != spaces.Discrete(2):
+            raise ValueError(f"expected {ACTIVE_KEY!r} of a row to be Discrete(2), got {active}")
+        if action_mask is not None and not _fits(action_mask, action_space):
+            raise ValueError(
+                f"expected {ACTION_MASK_KEY!r} of a row to be MultiBinary(A) where actions are Discrete(A), got "
+                f"{action_mask} for {action_space}"
+            )
+        n_masked = None if action_mask is None else int((action_mask.shape or ())[0])
+        return cls(space.spaces[OBS_KEY], active is not None, n_masked, state, is_dict=True)
+
+    def entries(self, obs: Any, what: str) -> Mapping[str, Any]:
+        """
+        The parts of rows.
+
+        :param obs: own observations, or Dicts where the space is a Dict
+        :param what: what they are, for the message
+        :raises ValueError: if keys are missing
+        """
+        if not self.is_dict:
+            return {OBS_KEY: obs}
+        told = {
+            ACTIVE_KEY: self.active,
+            ACTION_MASK_KEY: self.n_masked_actions is not None,
+            STATE_KEY: self.state is not None,
+        }
+        keys = [OBS_KEY, *(key for key, is_told in told.items() if is_told)]
+        if not isinstance(obs, Mapping) or not set(keys) <= set(obs):
+            got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__
+            raise ValueError(f"expected {what} to be a dict with the keys {keys}, got {got}")
+        return {key: obs[key] for key in keys}
+
+
+def _fits(action_mask: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
+    return isinstance(action_space, spaces.Discrete) and action_mask == spaces.MultiBinary(int(action_space.n))
+
+
+def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """
+    The same space, or a new one with channels first if it is of channel-last images.
+
+    :param space: of own observations or states; with an attribute ``atlas`` it holds codes, not pixels
+    """
+    if hasattr(space, "atlas") or not isinstance(space, spaces.Box) or not is_image_space(space):
+        return space
+    if is_image_space_channels_first(space):
+        return space
+    height, width, channels = space.shape
+    return spaces.Box(0, 255, (channels, height, width), np.uint8)

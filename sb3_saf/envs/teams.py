@@ -1,0 +1,375 @@
+"""
+Teams of rows: the one place that knows how agents of a team lie in a vector environment.
+
+Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row ``e * N + i`` is agent ``i`` of game
+``e``.
+"""
+
+from __future__ import annotations
+
+from numbers import Integral
+from typing import Any, Final, Literal, NamedTuple, get_args
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from sb3_saf.errors import NonFiniteError
+
+TeamKey = Literal["obs", "team", "agent"]
+
+#: The row's own observation.
+OBS_KEY: Final = "obs"
+#: The own observations of all agents of the row's team, in index order.
+TEAM_KEY: Final = "team"
+#: The index of the row's agent in its team.
+AGENT_KEY: Final = "agent"
+TEAM_KEYS: Final[tuple[TeamKey, ...]] = get_args(TeamKey)
+
+OptionalKey = Literal["active", "action_mask", "state"]
+
+#: Which agents of the row's team take part, in index order.
+ACTIVE_KEY: Final = "active"
+#: The row's own legal actions.
+ACTION_MASK_KEY: Final = "action_mask"
+#: The state of the row's game, for critics.
+STATE_KEY: Final = "state"
+#: Only observations of environments that give them have these.
+OPTIONAL_KEYS: Final[tuple[OptionalKey, ...]] = get_args(OptionalKey)
+ALL_KEYS: Final[frozenset[str]] = frozenset(TEAM_KEYS + OPTIONAL_KEYS)
+
+Array = npt.NDArray[Any]
+
+#: Attributes by which a vector environment of flattened teams tells its shape.
+_TEAM_ATTRIBUTES: Final = ("n_agents", "n_games")
+
+
+class TeamSpaces(NamedTuple):
+    """
+    The parts of the Dict observation that ``CentralizedValueWrapper`` gives.
+
+    :param own: space of one agent's own observation (key ``"obs"``), shape ``(*shape)``
+    :param team: Box of all own observations of a team (key ``"team"``), shape ``(N, *shape)``, dtype as in ``own``
+    :param agent: Discrete(N), the agent's index (key ``"agent"``)
+    :param n_agents: N
+    :param active: MultiBinary(N), which agents of the team take part (key ``"active"``); None if all always do
+    :param action_mask: MultiBinary(A), the row's legal actions (key ``"action_mask"``); None if all always are
+    :param state: space of the game's state (key ``"state"``), or None
+    """
+
+    own: spaces.Space[Any]
+    team: spaces.Box
+    agent: spaces.Discrete
+    n_agents: int
+    active: spaces.MultiBinary | None = None
+    action_mask: spaces.MultiBinary | None = None
+    state: spaces.Space[Any] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        own: spaces.Space[Any],
+        n_agents: int,
+        active: bool = False,
+        n_masked_actions: int | None = None,
+        state: spaces.Space[Any] | None = None,
+    ) -> TeamSpaces:
+        """
+        Spaces of a team whose agents all have one observation space.
+
+        :param own: Box, Discrete, MultiDiscrete or MultiBinary
+        :param n_agents: N
+        :param active: whether rows tell which agents take part
+        :param n_masked_actions: A if rows have action masks
+        :param state: space of the game's state if rows have it
+        :raises ValueError: if ``own`` is of another kind
+        """
+        low, high = _bounds(own)
+        team = spaces.Box(
+            np.repeat(low[np.newaxis], n_agents, axis=0),
+            np.repeat(high[np.newaxis], n_agents, axis=0),
+            dtype=low.dtype.type,
+        )
+        return cls(
+            own,
+            team,
+            spaces.Discrete(n_agents),
+            n_agents,
+            spaces.MultiBinary(n_agents) if active else None,
+            None if n_masked_actions is None else spaces.MultiBinary(n_masked_actions),
+            None if state is None else _checked_state(state),
+        )
+
+    @classmethod
+    def from_observation_space(cls, space: spaces.Space[Any]) -> TeamSpaces:
+        """
+        Take the Dict observation space of ``CentralizedValueWrapper`` apart.
+
+        :param space: the observation space that an algorithm, a policy or a buffer was given
+        :raises ValueError: if the space is not that of a team, with what to do
+        """
+        if not isinstance(space, spaces.Dict) or not set(TEAM_KEYS) <= set(space.spaces) <= ALL_KEYS:
+            raise ValueError(_not_a_team_space(f"got {space}"))
+        own, team, agent = (space.spaces[key] for key in TEAM_KEYS)
+        if not isinstance(agent, spaces.Discrete) or agent.start != 0:
+            raise ValueError(_not_a_team_space(f"its {AGENT_KEY!r} must be Discrete(N) from 0, got {agent}"))
+        n_agents = int(agent.n)
+        expected = (n_agents, *(own.shape or ()))
+        if not isinstance(team, spaces.Box) or team.shape != expected or team.dtype != own.dtype:
+            raise ValueError(
+                _not_a_team_space(
+                    f"its {TEAM_KEY!r} must be a Box of shape {expected} and dtype {own.dtype}, got {team}"
+                )
+            )
+        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
+        if active is not None and active != spaces.MultiBinary(n_agents):
+            raise ValueError(_not_a_team_space(f"its {ACTIVE_KEY!r} must be MultiBinary({n_agents}), got {active}"))
+        if action_mask is not None and not (
+            isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
+        ):
+            raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
+        if state is not None:
+            _checked_state(state)
+        return cls(own, team, agent, n_agents, active, action_mask, state)  # type: ignore[arg-type]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of a row's observation."""
+        optional = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
+        return (*TEAM_KEYS, *(key for key, space in optional.items() if space is not None))
+
+    @property
+    def own_shape(self) -> tuple[int, ...]:
+        """Shape of one agent's own observation; ``()`` for Discrete."""
+        return self.team.shape[1:]
+
+    def to_dict_space(self) -> spaces.Dict:
+        """Observation space of one row; ``own`` stays the same object."""
+        parts: dict[str, spaces.Space[Any] | None] = {
+            OBS_KEY: self.own,
+            TEAM_KEY: self.team,
+            AGENT_KEY: self.agent,
+            ACTIVE_KEY: self.active,
+            ACTION_MASK_KEY: self.action_mask,
+            STATE_KEY: self.state,
+        }
+        return spaces.Dict({key: part for key, part in parts.items() if part is not None})
+
+
+def _checked_state(state: spaces.Space[Any]) -> spaces.Space[Any]:
+    if isinstance(state, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+        return state
+    raise ValueError(
+        f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {state}; flatten it first"
+    )
+
+
+def _bounds(own: spaces.Space[Any]) -> tuple[Array, Array]:
+    """Lowest and highest value of each entry of a space, in the space's dtype."""
+    if isinstance(own, spaces.Box):
+        return own.low, own.high
+    if isinstance(own, (spaces.Discrete, spaces.MultiDiscrete)):
+        low = np.asarray(own.start, dtype=own.dtype)
+        count = own.n if isinstance(own, spaces.Discrete) else own.nvec
+        return low, (low + np.asarray(count) - 1).astype(own.dtype)
+    if isinstance(own, spaces.MultiBinary):
+        return np.zeros(own.shape, dtype=own.dtype), np.ones(own.shape, dtype=own.dtype)
+    raise ValueError(
+        f"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got {own}; "
+        "flatten it in a wrapper of the environment, for instance with gymnasium.spaces.flatten"
+    )
+
+
+def _not_a_team_space(found: str) -> str:
+    keys = ", ".join(map(repr, TEAM_KEYS))
+    return (
+        f"expected the Dict observation space of CentralizedValueWrapper with the keys {keys}; {found}. Build the "
+        "environment with sb3_saf.make_team_env(...), or wrap a VecEnv of flattened teams: "
+        "sb3_saf.CentralizedValueWrapper(venv, n_agents=N)"
+    )
+
+
+def find_n_agents(venv: VecEnv) -> int | None:
+    """
+    N of a vector environment of flattened teams, through any wrappers.
+
+    SB3's own look-up through wrappers refuses an attribute that two layers have, so the layers are asked one by one.
+
+    :param venv: any vector environment
+    :return: N, or None if no layer states it
+    """
+    layer = venv
+    while isinstance(layer, VecEnvWrapper) and not _has_own(layer, "n_agents"):
+        layer = layer.venv
+    value = getattr(layer, "n_agents", None)
+    return None if value is None else check_count("n_agents", value)
+
+
+def _has_own(layer: VecEnv, name: str) -> bool:
+    return name in vars(layer) or hasattr(type(layer), name)
+
+
+def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
+    """
+    N of a vector environment of flattened teams, checked against its number of rows.
+
+    :param venv: vector environment with B rows
+    :param n_agents: N if the caller was told; None asks the environment
+    :raises ValueError: if N is unknown, contradicts the environment or does not divide B
+    """
+    stated = find_n_agents(venv)
+    if n_agents is not None:
+        n_agents = check_count("n_agents", n_agents)
+    if stated is not None and n_agents is not None and stated != n_agents:
+        raise ValueError(f"n_agents={n_agents}, but the VecEnv has teams of {stated}; leave n_agents out")
+    size = n_agents if n_agents is not None else stated
+    if size is None:
+        raise ValueError(
+            f"expected a VecEnv of flattened teams that states its team size in an attribute n_agents, got "
+            f"{type(venv).__name__} with {venv.num_envs} rows and no such attribute; build it with "
+            "sb3_saf.make_team_env(...), or state the size: CentralizedValueWrapper(venv, n_agents=N)"
+        )
+    check_whole_teams(venv.num_envs, size)
+    return size
+
+
+def check_count(name: str, value: object) -> int:
+    """
+    Check that a value is a whole number of at least 1.
+
+    :raises ValueError: with the name and the value
+    """
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+    return int(value)
+
+
+def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:
+    """
+    Check that rows make whole teams.
+
+    :param n_rows: B
+    :param n_agents: N
+    :param fix: what the error advises
+    :return: E = B / N
+    :raises ValueError: if N does not divide B
+    """
+    if n_rows % n_agents:
+        raise ValueError(
+            f"expected rows of whole teams, a multiple of n_agents={n_agents}, got {n_rows} rows "
+            f"({n_rows // n_agents} teams and {n_rows % n_agents} rows over); {fix}"
+        )
+    return n_rows // n_agents
+
+
+def team_dones(dones: Array, n_agents: int) -> npt.NDArray[np.bool_]:
+    """
+    Which games ended.
+
+    :param dones: (B,) one flag per row, of any dtype
+    :param n_agents: N
+    :return: (E,)
+    :raises ValueError: if the flags differ inside a team
+    """
+    by_game = np.asarray(dones).astype(bool).reshape(-1, n_agents)
+    ended = by_game[:, 0]
+    if (by_game != ended[:, np.newaxis]).any():
+        game = int(np.flatnonzero((by_game != ended[:, np.newaxis]).any(axis=1))[0])
+        raise ValueError(
+            f"expected one done flag for a whole team, got {by_game[game].tolist()} for the agents of game {game}; "
+            "a team episode ends for all agents at once: keep agents that are out of the game as idle rows until then "
+            "(sb3_saf.make_team_env does so), or check n_agents and the order of rows (game-major, then agent)"
+        )
+    return ended.copy()
+
+
+def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
+    """
+    Check that evaluation does not play the games that are trained on.
+
+    :param training: environment of teams; one that does not tell its seeds in an attribute ``seeded_with`` passes
+    :param evaluation: the other
+    :raises ValueError: if the seed of a game is in both
+    """
+    common = _seeds_of(training) & _seeds_of(evaluation)
+    if common:
+        raise ValueError(
+            f"expected games of evaluation that are not trained on, got {len(common)} with seeds of training games; "
+            "the environments, or the algorithm and the environment of evaluation, have equal seeds; give evaluation "
+            "another one, for instance make_team_env(..., seed=10_000)"
+        )
+
+
+def _seeds_of(venv: VecEnv) -> set[int]:
+    layer = venv
+    while isinstance(layer, VecEnvWrapper):
+        layer = layer.venv
+    return {seed for seed in getattr(layer, "seeded_with", ()) if seed is not None}
+
+
+def check_finite(name: str, values: Array, n_agents: int, step: int, first_game: int = 0) -> None:
+    """
+    Stop at NaN and infinity; integers pass unread.
+
+    :param name: what the values are, for the message
+    :param values: (B, ...) one entry per row
+    :param n_agents: N
+    :param step: steps since the environment was made, for the message
+    :param first_game: game of the first row, for the message
+    :raises NonFiniteError: naming step, game and agent of the first bad row
+    """
+    if values.dtype.kind not in "fc" or np.isfinite(values).all():
+        return
+    bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    row = int(np.flatnonzero(bad)[0])
+    raise NonFiniteError(
+        f"{name} must be finite, got {_short(values[row])} at step {step} for agent {row % n_agents} of game "
+        f"{first_game + row // n_agents}{_others(int(bad.sum()) - 1)}; repair the environment, learning from it would "
+        "ruin the model"
+    )
+
+
+def _short(value: Array) -> str:
+    entries = np.asarray(value).reshape(-1)
+    return str(entries[~np.isfinite(entries)][0])
+
+
+def _others(count: int) -> str:
+    return f" (and {count} more rows)" if count else ""
+
+
+class TeamVecEnvWrapper(VecEnvWrapper):
+    """
+    A wrapper that keeps the shape of a vector environment of flattened teams in plain sight.
+
+    ``n_agents`` and ``n_games`` are attributes here and may be attributes of the layers below, too. SB3 calls that
+    ambiguous when a further wrapper (such as VecNormalize) is asked for them; here the answers are always equal.
+
+    :param venv: vector environment with B rows
+    :param n_agents: N; None asks ``venv``
+    :param observation_space: observation space of a row if the wrapper changes it
+    :raises ValueError: if N is unknown, contradicts the environment or does not divide B
+    """
+
+    def __init__(
+        self, venv: VecEnv, n_agents: int | None = None, observation_space: spaces.Space[Any] | None = None
+    ) -> None:
+        super().__init__(venv, observation_space=observation_space)
+        self.n_agents = require_n_agents(venv, n_agents)
+        self.n_games = venv.num_envs // self.n_agents
+
+    def getattr_depth_check(self, name: str, already_found: bool) -> str | None:
+        """See the base class; the team's shape is never ambiguous."""
+        return None if name in _TEAM_ATTRIBUTES else super().getattr_depth_check(name, already_found)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """See the base class; the team's shape is always known."""
+        return attr_name in _TEAM_ATTRIBUTES or super().has_attr(attr_name)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """See the base class; the team's shape is answered here, whether the environments know it or not."""
+        if attr_name in _TEAM_ATTRIBUTES and attr_name in vars(self):
+            return [vars(self)[attr_name] for _ in self._get_indices(indices)]
+        return super().get_attr(attr_name, indices)

@@ -1,1 +1,0 @@
-"""IPPO: a local critic."""

@@ -1,1 +1,0 @@
-"""MAPPO: a joint critic."""

@@ -1,0 +1,1 @@
+"""Neural networks: encoders, actors, critics, the knowledge source, the policy pool."""

@@ -1,0 +1,153 @@
+"""
+Actors: from the features of an agent's own observation to its action distribution. Nothing else enters, so that an
+actor runs wherever the agent is. Letters: K rows, d features, P parameters of the action distribution.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.preprocessing import get_action_dim
+from torch import nn
+
+from sb3_saf.networks.distributions import distribution_of, masked_parameters, n_action_parameters
+from sb3_saf.networks.layers import AgentHeads, mlp
+
+#: Orthogonal gain of the last layer: first policies are close to uniform.
+ACTION_GAIN = 0.01
+
+
+class ActionHead(nn.Module):
+    """
+    One policy: an MLP, and for Box actions a learned standard deviation that does not depend on the observation.
+
+    :param features_dim: d
+    :param action_space: the action space
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param log_std_init: first log standard deviation, Box actions only
+    """
+
+    log_std: nn.Parameter | None
+
+    def __init__(
+        self,
+        features_dim: int,
+        action_space: spaces.Space[Any],
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        log_std_init: float,
+    ):
+        super().__init__()
+        n_outputs = n_action_parameters(action_space)
+        if isinstance(action_space, spaces.Box):
+            n_outputs = get_action_dim(action_space)
+            self.log_std = nn.Parameter(th.full((n_outputs,), log_std_init))
+        else:
+            self.register_parameter("log_std", None)
+        self.net = mlp([features_dim, *hidden, n_outputs], activation_fn, output_gain=ACTION_GAIN)
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        Parameters of the action distribution.
+
+        :param features: (K, d)
+        :return: (K, P)
+        """
+        outputs: th.Tensor = self.net(features)
+        return outputs if self.log_std is None else th.cat([outputs, self.log_std.expand_as(outputs)], dim=1)
+
+
+class Actor(nn.Module, ABC):
+    """
+    Base of all actors.
+
+    :param action_space: the action space
+    :param reads_agent: whether ``forward`` needs the agent's index
+    """
+
+    def __init__(self, action_space: spaces.Space[Any], reads_agent: bool):
+        super().__init__()
+        self.action_space = action_space
+        self.reads_agent = reads_agent
+
+    @abstractmethod
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        Everything that the action distribution depends on, as one vector per row.
+
+        :param features: (K, d) features of own observations
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: (K, P')
+        """
+
+    @abstractmethod
+    def distribution(self, parameters: th.Tensor) -> Distribution:
+        """
+        Make the distribution of what ``forward`` gave.
+
+        :param parameters: (B, P')
+        """
+
+    def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        As ``forward``, but with the parameters of every policy, which is where masks of actions have to apply.
+
+        :param features: (K, d) features of own observations
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: (K, P'')
+        """
+        result: th.Tensor = self(features, agent)
+        return result
+
+    def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
+        """
+        Make the distribution over allowed actions of what ``unmixed`` gave.
+
+        :param parameters: (B, P'')
+        :param masks: (B, M) bool, the choices that are allowed (see ``masked_parameters``)
+        """
+        return self.distribution(masked_parameters(self.action_space, parameters, masks))
+
+
+class SinglePolicy(Actor):
+    """
+    One policy for all agents, or one for each (``n_agents``): the actor of IPPO and MAPPO.
+
+    :param features_dim: d
+    :param action_space: the action space
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param log_std_init: first log standard deviation, Box actions only
+    :param n_agents: N for one policy per agent; None for one that all share
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        action_space: spaces.Space[Any],
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        log_std_init: float = 0.0,
+        n_agents: int | None = None,
+    ):
+        super().__init__(action_space, reads_agent=n_agents is not None)
+
+        def make_head() -> ActionHead:
+            return ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init)
+
+        self.head: ActionHead | AgentHeads = make_head() if n_agents is None else AgentHeads(make_head, n_agents)
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`Actor`; (K, d) to (K, P)."""
+        result: th.Tensor = self.head(features, agent) if self.reads_agent else self.head(features)
+        return result
+
+    def distribution(self, parameters: th.Tensor) -> Distribution:
+        """See :class:`Actor`; SB3's own distribution for the action space."""
+        return distribution_of(self.action_space, parameters)

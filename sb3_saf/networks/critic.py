@@ -1,0 +1,214 @@
+"""
+Critics: value estimates for training. Letters: K distinct views, G distinct teams, N agents, d features.
+
+Views and teams come separately (``features`` and ``teams``), so that what depends on a single view is computed once
+per view.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Literal, cast
+
+import torch as th
+from torch import nn
+
+from sb3_saf.networks.gather import take
+from sb3_saf.networks.layers import AgentHeads, mlp
+
+#: One head for all agents, or one for each.
+Heads = Literal["shared", "per_agent"]
+
+
+class TeamCritic(nn.Module, ABC):
+    """Base of critics that read what the whole team sees."""
+
+    @abstractmethod
+    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        Value of every agent of every team.
+
+        :param features: (K, d) features of views
+        :param teams: (G, N) int64, which view each agent of a team has
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N)
+        """
+
+
+class TeamStates(nn.Module, ABC):
+    """
+    What a critic knows of each agent, before it judges. A critic with memory remembers these.
+
+    :param states_dim: S, size of a state
+    """
+
+    def __init__(self, states_dim: int):
+        super().__init__()
+        self.states_dim = states_dim
+
+    @abstractmethod
+    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        State of every agent of every team.
+
+        :param features: (K, d) features of views
+        :param teams: (G, N) int64, which view each agent of a team has
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N, S)
+        """
+
+
+class JointStates(TeamStates):
+    """
+    An agent's state is that of its whole team, side by side, and whose state it is (one-hot).
+
+    :param features_dim: d
+    :param n_agents: N
+    :param agent_identity: False leaves out whose state it is: all agents of a team then have the same
+    :param members: makes each agent's own state, of size d; None for the features of its view
+    """
+
+    def __init__(self, features_dim: int, n_agents: int, agent_identity: bool, members: TeamStates | None = None):
+        super().__init__(features_dim * n_agents + (n_agents if agent_identity else 0))
+        self.agent_identity = agent_identity
+        self.members = members
+
+    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamStates`; agents that take no part are read as zeros."""
+        members = take(features, teams) if self.members is None else self.members.states(features, teams, active)
+        return self.join(members, active)
+
+    def join(self, members: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        Put the states of a team's members side by side.
+
+        :param members: (G, N, d)
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, N, S)
+        """
+        if active is not None:
+            members = members * active.unsqueeze(2)
+        n_teams, n_agents, _ = members.shape
+        joint = members.flatten(1).unsqueeze(1).expand(-1, n_agents, -1)
+        if not self.agent_identity:
+            return joint
+        return th.cat([joint, th.eye(n_agents, device=joint.device).expand(n_teams, -1, -1)], dim=2)
+
+
+class StateCritic(nn.Module, ABC):
+    """Base of critics that read the state of the game and nothing else."""
+
+    @abstractmethod
+    def forward(self, states: th.Tensor) -> th.Tensor:
+        """
+        Value of every agent of every game.
+
+        :param states: (G, *state) states, as SB3 preprocesses observations
+        :return: (G, N)
+        """
+
+
+class OwnValueHead(nn.Module):
+    """
+    Value of an agent from its own features.
+
+    :param features_dim: d
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param heads: one head for all agents, or one for each
+    """
+
+    def __init__(
+        self, features_dim: int, n_agents: int, hidden: Sequence[int], activation_fn: type[nn.Module], heads: Heads
+    ):
+        super().__init__()
+        self.reads_agent = heads == "per_agent"
+
+        def make_head() -> nn.Sequential:
+            return mlp([features_dim, *hidden, 1], activation_fn)
+
+        self.head: nn.Module = AgentHeads(make_head, n_agents) if self.reads_agent else make_head()
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        Values of single agents.
+
+        :param features: (K, d)
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: (K,)
+        """
+        values: th.Tensor = self.head(features, agent) if self.reads_agent else self.head(features)
+        return values.squeeze(1)
+
+    def of_teams(self, features: th.Tensor) -> th.Tensor:
+        """
+        Values of whole teams.
+
+        :param features: (G, N, d)
+        :return: (G, N)
+        """
+        n_teams, n_agents, _ = features.shape
+        agent = th.arange(n_agents, device=features.device).repeat(n_teams) if self.reads_agent else None
+        values: th.Tensor = self(features.flatten(0, 1), agent)
+        return values.view(n_teams, n_agents)
+
+
+class JointValueHead(nn.Module):
+    """
+    Value of an agent from the features of its whole team.
+
+    One head for all agents is told whose value is asked by the agent's identity (one-hot); without it, all agents of
+    a team get the same value. With one head per agent the head is the identity.
+
+    :param features_dim: d
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param heads: one head for all agents, or one for each
+    :param agent_identity: whether a shared head reads the agent's identity
+    :param joint_dim: size of the joint features where they are not N times d
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        n_agents: int,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        heads: Heads,
+        agent_identity: bool,
+        joint_dim: int | None = None,
+    ):
+        super().__init__()
+        self.n_agents = n_agents
+        self.per_agent = heads == "per_agent"
+        self.agent_identity = agent_identity and not self.per_agent
+        n_joint = features_dim * n_agents if joint_dim is None else joint_dim
+        n_inputs = n_joint + (n_agents if self.agent_identity else 0)
+        n_heads = n_agents if self.per_agent else 1
+        self.heads = nn.ModuleList(mlp([n_inputs, *hidden, 1], activation_fn) for _ in range(n_heads))
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        Values of whole teams.
+
+        :param features: (G, N, d), or joint features of any other form (G, ...)
+        :return: (G, N)
+        """
+        joint = features.flatten(1)
+        if self.agent_identity:
+            return self._with_identity(joint, self.n_agents)
+        values = th.cat([head(joint) for head in self.heads], dim=1)
+        return values.expand(-1, self.n_agents)
+
+    def _with_identity(self, joint: th.Tensor, n_agents: int) -> th.Tensor:
+        """(G, N) values of [joint features, one-hot agent]; the first layer reads the joint part once per team."""
+        first, *rest = cast(nn.Sequential, self.heads[0])
+        assert isinstance(first, nn.Linear)
+        weight_joint, weight_agent = first.weight[:, :-n_agents], first.weight[:, -n_agents:]
+        x = nn.functional.linear(joint, weight_joint, first.bias).unsqueeze(1) + weight_agent.t()
+        for layer in rest:
+            x = layer(x)
+        return x.squeeze(2)

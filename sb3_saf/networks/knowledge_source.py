@@ -1,0 +1,168 @@
+"""
+The knowledge source: a few slots that all agents write to and read from (arXiv 2210.03022, section 5).
+
+Letters: G teams, N agents, L slots, d features. Attention weights are (G, query, source).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch as th
+from torch import nn
+
+from sb3_saf.networks.layers import Attended, Attention, mlp
+
+
+class Written(NamedTuple):
+    """
+    The state of the knowledge source after writing.
+
+    :param slots: (G, L, d)
+    :param attention: (G, L, N), how much each slot took from each agent; sums to 1 over agents
+    """
+
+    slots: th.Tensor
+    attention: th.Tensor
+
+
+class Exchanged(NamedTuple):
+    """
+    What went through the knowledge source: who wrote where, who read where, and what was read.
+
+    :param read: (G, N, d), m of every agent
+    :param write_attention: (G, L, N), how much each slot took from each agent; sums to 1 over agents
+    :param read_attention: (G, N, L), how much each agent took from each slot; sums to 1 over slots
+    """
+
+    read: th.Tensor
+    write_attention: th.Tensor
+    read_attention: th.Tensor
+
+
+class CrossAttentionBlock(nn.Module):
+    """
+    Slots look at the agents' messages: x + attend(norm(x), norm(messages)), then x + mlp(norm(x)).
+
+    :param features_dim: d
+    """
+
+    def __init__(self, features_dim: int):
+        super().__init__()
+        self.query_norm = nn.LayerNorm(features_dim)
+        self.source_norm = nn.LayerNorm(features_dim)
+        self.attention = Attention(features_dim)
+        self.mlp_norm = nn.LayerNorm(features_dim)
+        self.mlp = mlp([features_dim] * 3, nn.GELU)
+
+    def forward(self, slots: th.Tensor, messages: th.Tensor, active: th.Tensor | None) -> Attended:
+        """
+        Update the slots.
+
+        :param slots: (G, L, d)
+        :param messages: (G, N, d)
+        :param active: (G, N) bool or None
+        :return: slots (G, L, d) and attention (G, L, N)
+        """
+        attended = self.attention(self.query_norm(slots), self.source_norm(messages), active)
+        slots = slots + attended.values
+        return Attended(slots + self.mlp(self.mlp_norm(slots)), attended.weights)
+
+
+class SelfAttentionBlock(nn.Module):
+    """
+    Slots look at each other: x + attend(norm(x)), then x + mlp(norm(x)).
+
+    :param features_dim: d
+    """
+
+    def __init__(self, features_dim: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(features_dim)
+        self.attention = Attention(features_dim)
+        self.mlp_norm = nn.LayerNorm(features_dim)
+        self.mlp = mlp([features_dim] * 3, nn.GELU)
+
+    def forward(self, slots: th.Tensor) -> th.Tensor:
+        """
+        Update the slots.
+
+        :param slots: (G, L, d)
+        :return: (G, L, d)
+        """
+        normed = self.norm(slots)
+        slots = slots + self.attention(normed, normed).values
+        updated: th.Tensor = slots + self.mlp(self.mlp_norm(slots))
+        return updated
+
+
+class KnowledgeSource(nn.Module):
+    """
+    Slots that attend to the agents' messages (write) and that agents attend to (read).
+
+    Writing costs L x N and reading N x L: linear in the number of agents. Which agent sent a message is marked by a
+    learned embedding; apart from that, the order of agents does not matter.
+
+    :param n_agents: N
+    :param features_dim: d of messages, states and slots
+    :param n_slots: L
+    :param n_self_attention: number of self-attention blocks after writing
+    """
+
+    def __init__(self, n_agents: int, features_dim: int = 64, n_slots: int = 4, n_self_attention: int = 2):
+        super().__init__()
+        self.agent_embeddings = nn.Parameter(th.randn(n_agents, features_dim) * features_dim**-0.5)
+        self.slots = nn.Parameter(th.randn(n_slots, features_dim) * features_dim**-0.5)
+        self.write_block = CrossAttentionBlock(features_dim)
+        self.slot_blocks = nn.ModuleList(SelfAttentionBlock(features_dim) for _ in range(n_self_attention))
+        self.read_query_norm = nn.LayerNorm(features_dim)
+        self.read_source_norm = nn.LayerNorm(features_dim)
+        self.read_attention = Attention(features_dim)
+
+    def write(self, messages: th.Tensor, active: th.Tensor | None = None) -> Written:
+        """
+        Fill the slots.
+
+        :param messages: (G, N, d), m' of every agent
+        :param active: (G, N) bool, agents that are heard; all if None
+        :return: slots (G, L, d) and write attention (G, L, N)
+        """
+        slots = self.slots.expand(len(messages), -1, -1)
+        slots, attention = self.write_block(slots, messages + self.agent_embeddings, active)
+        for block in self.slot_blocks:
+            slots = block(slots)
+        return Written(slots, attention)
+
+    def read(self, states: th.Tensor, slots: th.Tensor) -> Attended:
+        """
+        Answer the agents' queries.
+
+        :param states: (G, N, d), s of every agent
+        :param slots: (G, L, d)
+        :return: m (G, N, d) and read attention (G, N, L)
+        """
+        attended: Attended = self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
+        return attended
+
+    def exchange(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
+        """
+        Write, then read, and tell who attended to what.
+
+        :param messages: (G, N, d)
+        :param states: (G, N, d)
+        :param active: (G, N) bool or None
+        """
+        written = self.write(messages, active)
+        read = self.read(states, written.slots)
+        return Exchanged(read.values, written.attention, read.weights)
+
+    def forward(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        Write, then read.
+
+        :param messages: (G, N, d)
+        :param states: (G, N, d)
+        :param active: (G, N) bool or None
+        :return: m (G, N, d)
+        """
+        return self.exchange(messages, states, active).read

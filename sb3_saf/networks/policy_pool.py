@@ -1,0 +1,164 @@
+"""
+The policy pool: a few policies that all agents share, and a choice among them by signature keys
+(arXiv 2210.03022, section 5).
+
+Letters: K rows, U policies, d features, P parameters of one policy's action distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from torch import nn
+
+from sb3_saf.networks.actor import ActionHead, Actor
+from sb3_saf.networks.distributions import (
+    SelectedDistribution,
+    distribution_of,
+    masked_parameters,
+    mixture_log_probs,
+    mixture_of,
+    n_action_parameters,
+    policy_parameters,
+)
+from sb3_saf.networks.layers import mlp
+
+#: How the pool acts: as the exact mixture of its policies, or through one policy drawn anew at every evaluation.
+Selection = Literal["mixture", "gumbel"]
+
+
+class PoolOutput(NamedTuple):
+    """
+    What each policy of the pool would do, and how likely each is to be chosen.
+
+    :param log_weights: (K, U), normalised
+    :param actions: (K, U, P), parameters of each policy's action distribution
+    """
+
+    log_weights: th.Tensor
+    actions: th.Tensor
+
+
+class PolicyPool(Actor):
+    """
+    U policies, of which one is chosen for each observation: weights = softmax(q . k_u / sqrt(d)), q = g_psel(z).
+
+    ``selection="mixture"``: acting by drawing u from the weights, then the action from policy u. Likelihood, entropy
+    and most likely action are those of the mixture, exactly where the action space allows it (see
+    ``sb3_saf.networks.distributions``).
+
+    ``selection="gumbel"``: one policy is drawn whenever a distribution is made (Gumbel noise on the logits, hard
+    choice, straight-through gradient), and likelihood and entropy are that policy's. This is how the released code
+    behaves; two evaluations of one action may compare different policies. Deterministic actions are the favourite
+    policy's.
+
+    :param features_dim: size of z
+    :param action_space: the action space
+    :param hidden: sizes of the policies' hidden layers
+    :param activation_fn: activation of all MLPs
+    :param n_policies: U, at least 2
+    :param selection: ``"mixture"`` or ``"gumbel"``
+    :param latent_dim: d, size of queries and signature keys
+    :param projection_hidden: sizes of the hidden layers of g_psel
+    :param log_std_init: first log standard deviation, Box actions only
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        action_space: spaces.Space[Any],
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        n_policies: int,
+        selection: Selection,
+        latent_dim: int,
+        projection_hidden: Sequence[int],
+        log_std_init: float = 0.0,
+    ):
+        super().__init__(action_space, reads_agent=False)
+        self.selection = selection
+        self.n_policies = n_policies
+        self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        self.signature_keys = nn.Parameter(th.randn(n_policies, latent_dim))
+        self.policies = nn.ModuleList(
+            ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init) for _ in range(n_policies)
+        )
+
+    def evaluate(self, features: th.Tensor) -> PoolOutput:
+        """
+        Ask every policy and weigh them.
+
+        :param features: (K, d)
+        :return: log weights (K, U) and action parameters (K, U, P)
+        """
+        logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
+        return PoolOutput(logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1))
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        See :class:`Actor`.
+
+        :param features: (K, d)
+        :param agent: not read
+        :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
+        """
+        if self._is_categorical_mixture:
+            return mixture_log_probs(*self.evaluate(features))
+        return self.unmixed(features)
+
+    def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`Actor`; (K, d) to (K, U + U P) weights and parameters."""
+        log_weights, actions = self.evaluate(features)
+        return th.cat([log_weights, actions.flatten(1)], dim=1)
+
+    def distribution(self, parameters: th.Tensor) -> Distribution:
+        """See :class:`Actor`."""
+        if self._is_categorical_mixture:
+            return distribution_of(self.action_space, parameters)
+        return self._of_pool(self._split(parameters))
+
+    def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
+        """See :class:`Actor`; masked first, then mixed, so that masks leave the choice among policies as it is."""
+        log_weights, actions = self._split(parameters)
+        return self._of_pool(PoolOutput(log_weights, masked_parameters(self.action_space, actions, masks)))
+
+    def _split(self, parameters: th.Tensor) -> PoolOutput:
+        """Weights and parameters of B rows, out of (B, U + U P)."""
+        log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
+        shape = (-1, self.n_policies, n_action_parameters(self.action_space))
+        return PoolOutput(log_weights, flat.reshape(shape))
+
+    def _of_pool(self, output: PoolOutput) -> Distribution:
+        log_weights, actions = output
+        if self.selection == "mixture":
+            return mixture_of(self.action_space, log_weights, actions)
+        favourite = policy_parameters(actions, log_weights.argmax(dim=1))
+        return SelectedDistribution(
+            drawn=distribution_of(self.action_space, draw_policy(log_weights, actions)),
+            favourite=distribution_of(self.action_space, favourite),
+        )
+
+    @property
+    def _is_categorical_mixture(self) -> bool:
+        """Whether the pool's distribution is one categorical: the mixture is then computed before rows are gathered."""
+        return self.selection == "mixture" and isinstance(self.action_space, spaces.Discrete)
+
+
+def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Draw one policy per row with its weight; gradients reach the weights straight through the hard choice.
+
+    :param log_weights: (B, U)
+    :param actions: (B, U, P)
+    :return: (B, P), bit for bit the parameters of the drawn policy
+    """
+    uniform = th.rand_like(log_weights).clamp_min(th.finfo(log_weights.dtype).tiny)
+    noisy = log_weights - (-uniform.log()).log()
+    soft = noisy.softmax(dim=1)
+    # Zero in value; in the gradient, the choice counts as if it had been soft.
+    straight_through = ((soft - soft.detach()).unsqueeze(2) * actions.detach()).sum(dim=1)
+    return policy_parameters(actions, noisy.argmax(dim=1)) + straight_through

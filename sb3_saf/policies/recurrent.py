@@ -1,0 +1,280 @@
+"""
+Policies for RecurrentPPO: actors and critics that remember (the paper's policies condition on histories).
+
+Letters: B rows (sequences one after another, padded by sb3-contrib to one length), N agents, S size of a critic's
+state, H size of the LSTMs' output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_saf.networks.actor import Actor
+from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
+from sb3_saf.networks.gather import take, take_of_agents
+from sb3_saf.networks.views import OwnViews
+from sb3_saf.policies.base import NetArch, TeamPolicy
+from sb3_saf.policies.ippo import IPPOParts
+from sb3_saf.policies.mappo import MAPPOParts
+from sb3_saf.policies.parts import TeamParts, check_at_least_one
+from sb3_saf.policies.saf import SAFParts
+
+LstmStates = tuple[th.Tensor, ...]
+
+
+class RecurrentCritic(nn.Module):
+    """
+    An LSTM over what the critic knows of the row's agent at each step, then a value head.
+
+    :param team_states: makes the LSTM's input, (B, S) of the rows' agents; None for the features of their own views
+    :param lstm: S to H
+    :param head: H to values
+    """
+
+    def __init__(self, team_states: TeamStates | None, lstm: nn.LSTM, head: OwnValueHead):
+        super().__init__()
+        self.team_states = team_states
+        self.lstm = lstm
+        self.head = head
+
+
+class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: ignore[misc]  # value_net, log_std: ours
+    """
+    Policy for RecurrentPPO on rows of teams.
+
+    Actor: the features of the agent's own observation, an LSTM that all agents share, then selection and pool (or the
+    single policy). An agent acts on its own observation and its own hidden state; nothing else reaches it.
+
+    Critic: sb3-contrib keeps one hidden state per row and shuffles rows, so a row never meets the hidden states of its
+    teammates. It needs none: the row holds what the whole team sees, and the critic's LSTM runs over what the critic
+    makes of it at each step. For SAF that is s_i^SAF, so the knowledge source comes first and memory second; for MAPPO
+    [z_1, ..., z_N] and whose value is asked; for IPPO z_i. A value head on the LSTM's output follows.
+
+    Distinct views and teams are encoded once, as in other team policies; from the LSTMs on, every row counts.
+
+    Takes the arguments of :class:`TeamPolicy` and, by keyword, the fields of its parts.
+
+    :param observation_space: Dict of ``obs``, ``team`` and ``agent``
+    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param lr_schedule: learning rate schedule
+    :param net_arch: hidden sizes of actor and critic heads, which read the LSTMs' outputs; see the base class
+    :param lstm_hidden_size: H
+    :param n_lstm_layers: layers of each LSTM
+    :param enable_critic_lstm: False leaves the critic without memory: it is then the one of PPO's policies
+    :param shared_lstm: refused; actor and critic read different things
+    :param lstm_kwargs: further arguments of both LSTMs
+    :param kwargs: those of :class:`TeamPolicy`
+    """
+
+    value_net: OwnValueHead | TeamCritic | StateCritic | RecurrentCritic  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        net_arch: NetArch | None = None,
+        *,
+        lstm_hidden_size: int = 256,
+        n_lstm_layers: int = 1,
+        enable_critic_lstm: bool = True,
+        shared_lstm: bool = False,
+        lstm_kwargs: Mapping[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        if shared_lstm:
+            raise ValueError(
+                "team policies have no LSTM shared by actor and critic, which read different things: leave "
+                "shared_lstm=False; enable_critic_lstm=False leaves the critic without memory"
+            )
+        check_at_least_one("lstm_hidden_size", lstm_hidden_size)
+        check_at_least_one("n_lstm_layers", n_lstm_layers)
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch,
+            lstm_hidden_size=lstm_hidden_size,
+            n_lstm_layers=n_lstm_layers,
+            # Of sb3-contrib's three ways, the one that makes no network for its critic: ours comes below.
+            shared_lstm=True,
+            enable_critic_lstm=False,
+            lstm_kwargs=dict(lstm_kwargs or {}),
+            **kwargs,
+        )
+        self.shared_lstm, self.enable_critic_lstm = False, enable_critic_lstm
+        self._build_critic(lr_schedule)
+
+    # --- construction -----------------------------------------------------------------------------------------------
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        # After this, sb3-contrib makes the actor's LSTM. The critic comes last, see the base class.
+        self._build_actor()
+
+    def _make_actor(self) -> Actor:
+        return self.parts.actor(self._network_spec()._replace(features_dim=self.lstm_output_dim))
+
+    def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic | RecurrentCritic:  # type: ignore[override]
+        if not self.enable_critic_lstm:
+            return super()._make_critic()
+        spec = self._network_spec()
+        team_states = self.parts.team_states(spec)
+        # RecurrentPPO stores both hidden states in arrays of one shape.
+        lstm = nn.LSTM(
+            spec.features_dim if team_states is None else team_states.states_dim,
+            self.lstm_actor.hidden_size,
+            num_layers=self.lstm_actor.num_layers,
+            **self.lstm_kwargs,
+        )
+        head = OwnValueHead(lstm.hidden_size, spec.n_agents, spec.value_hidden, spec.activation_fn, self.parts.heads)
+        return RecurrentCritic(team_states, lstm, head)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "lstm_hidden_size": self.lstm_actor.hidden_size,
+            "n_lstm_layers": self.lstm_actor.num_layers,
+            "enable_critic_lstm": self.enable_critic_lstm,
+            "lstm_kwargs": self.lstm_kwargs,
+        }
+
+    # --- what sb3-contrib calls -------------------------------------------------------------------------------------
+
+    def forward(  # type: ignore[override]
+        self, obs: PyTorchObs, lstm_states: RNNStates, episode_starts: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, RNNStates]:
+        """
+        Act and estimate values.
+
+        :param obs: rows
+        :param lstm_states: hidden and cell states of actor and critic, each (layers, sequences, H)
+        :param episode_starts: (B,) 1.0 where an episode starts, which forgets the states
+        :param deterministic: whether to take the most likely actions
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,) and the next states
+        """
+        own = self.views.own(self._own(obs))
+        distribution, actor_states = self._recall_distribution(obs, own, lstm_states.pi, episode_starts)
+        values, critic_states = self._recall_values(obs, own, lstm_states.vf, episode_starts)
+        actions = distribution.get_actions(deterministic=deterministic)
+        log_prob = distribution.log_prob(actions)
+        actions = actions.reshape((-1, *(self.action_space.shape or ())))
+        return actions, values, log_prob, RNNStates(actor_states, critic_states)
+
+    def evaluate_actions(  # type: ignore[override]
+        self, obs: PyTorchObs, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """
+        Evaluate given actions.
+
+        :param obs: rows of sequences, one after another
+        :param actions: (B, ...) actions
+        :param lstm_states: see :meth:`forward`, before the sequences
+        :param episode_starts: (B,)
+        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
+        """
+        self._warn_of_idle_rows(obs)
+        own = self.views.own(self._own(obs))
+        distribution, _ = self._recall_distribution(obs, own, lstm_states.pi, episode_starts)
+        values, _ = self._recall_values(obs, own, lstm_states.vf, episode_starts)
+        return values, self._likelihood(distribution, actions), distribution.entropy()
+
+    def get_distribution(  # type: ignore[override]
+        self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
+    ) -> tuple[Distribution, LstmStates]:
+        """
+        Action distribution; ``team`` is not read and may be missing.
+
+        :param obs: rows, or own observations alone (B, ...)
+        :param lstm_states: of the actor
+        :param episode_starts: (B,)
+        :return: distribution and the actor's next states
+        """
+        return self._recall_distribution(obs, self.views.own(self._own(obs)), lstm_states, episode_starts)
+
+    def predict_values(  # type: ignore[override]
+        self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
+    ) -> th.Tensor:
+        """
+        Estimate values.
+
+        :param obs: rows
+        :param lstm_states: of the critic
+        :param episode_starts: (B,)
+        :return: (B, 1)
+        """
+        return self._recall_values(obs, None, lstm_states, episode_starts)[0]
+
+    def remember(self, features: th.Tensor, lstm_states: LstmStates) -> tuple[th.Tensor, LstmStates]:
+        """
+        One step of the actor's LSTM, in the midst of an episode.
+
+        :param features: (B, d) of own observations
+        :param lstm_states: of the actor, (layers, B, H) each
+        :return: (B, H), which the actor reads, and the next states
+        """
+        return self._process(features, lstm_states, th.zeros(len(features), device=features.device), self.lstm_actor)
+
+    # --- memory -----------------------------------------------------------------------------------------------------
+
+    def _recall_distribution(
+        self, obs: PyTorchObs, own: OwnViews, lstm_states: LstmStates, episode_starts: th.Tensor
+    ) -> tuple[Distribution, LstmStates]:
+        latent, states = self._process(take(own.features, own.rows), lstm_states, episode_starts, self.lstm_actor)
+        agent = self._agent(obs) if self.actor.reads_agent else None
+        masks = self._action_mask(obs, padded=True)
+        if masks is None:
+            return self.actor.distribution(self.actor(latent, agent)), states
+        return self.actor.masked_distribution(self.actor.unmixed(latent, agent), masks), states
+
+    def _recall_values(
+        self, obs: PyTorchObs, own: OwnViews | None, lstm_states: LstmStates, episode_starts: th.Tensor
+    ) -> tuple[th.Tensor, LstmStates]:
+        critic = self.value_net
+        if not isinstance(critic, RecurrentCritic):
+            return self._values(obs, own), lstm_states
+        latent, states = self._process(self._critic_inputs(critic, obs, own), lstm_states, episode_starts, critic.lstm)
+        agent = self._agent(obs) if critic.head.reads_agent else None
+        return self._raw_values(obs, critic.head(latent, agent)), states
+
+    def _critic_inputs(self, critic: RecurrentCritic, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
+        """(B, S)"""
+        if critic.team_states is None:
+            own = self.views.own(self._own(obs)) if own is None else own
+            return take(own.features, own.rows)
+        views = self.views.teams(self._team(obs), own, self._active(obs))
+        return take_of_agents(
+            critic.team_states.states(views.features, views.teams, views.active), views.rows, self._agent(obs)
+        )
+
+    def _process(
+        self, inputs: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor, lstm: nn.LSTM
+    ) -> tuple[th.Tensor, LstmStates]:
+        """(B, H) outputs of an LSTM, and its states after the last step: (B, ...) inputs, sequence by sequence."""
+        outputs, states = self._process_sequence(inputs, lstm_states, episode_starts, lstm)  # type: ignore[arg-type]
+        return outputs, states  # type: ignore[return-value]  # sb3-contrib's annotation says one tensor
+
+
+class IPPOLstmPolicy(TeamRecurrentPolicy):
+    """IPPO's parts for RecurrentPPO; takes the fields of :class:`IPPOParts`, too."""
+
+    parts_class: ClassVar[type[TeamParts]] = IPPOParts
+
+
+class MAPPOLstmPolicy(TeamRecurrentPolicy):
+    """MAPPO's parts for RecurrentPPO; takes the fields of :class:`MAPPOParts`, too."""
+
+    parts_class: ClassVar[type[TeamParts]] = MAPPOParts
+
+
+class SAFLstmPolicy(TeamRecurrentPolicy):
+    """SAF's parts for RecurrentPPO; takes the fields of :class:`SAFParts`, too."""
+
+    parts_class: ClassVar[type[TeamParts]] = SAFParts

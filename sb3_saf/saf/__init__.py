@@ -1,1 +1,0 @@
-"""SAF: a knowledge source for the critic, a pool of policies for the actor."""

@@ -1,0 +1,138 @@
+"""What the zoo's commands share: options as ``key:value``, and errors of one line that say what to do."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any, NoReturn
+
+from sb3_saf.training.yaml_files import parse_value
+
+USAGE_ERROR = 2
+
+
+class CommandError(Exception):
+    """Something that the user can put right; commands print it in one line and end."""
+
+
+@contextmanager
+def user_errors(*kinds: type[Exception]) -> Iterator[None]:
+    """
+    What is raised in here is for the user, not a bug: no traceback.
+
+    :param kinds: errors of these kinds, and ValueError
+    """
+    caught: tuple[type[Exception], ...] = (ValueError, *kinds)
+    try:
+        yield
+    except caught as error:
+        raise CommandError(str(error) or type(error).__name__) from error
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, without the page of usage above it."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and where help is, and exit."""
+        self.exit(USAGE_ERROR, f"{self.prog}: error: {' '.join(message.split())} (--help lists the options)\n")
+
+
+class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Help that tells defaults where there are any to tell."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default in (None, "", False) or action.default == {}:
+            return action.help
+        return super()._get_help_string(action)
+
+
+class KeyValues(argparse.Action):
+    """``--option a:1 b:rgb`` as a dict. Values are YAML, never Python."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the pairs to those of earlier uses of the option."""
+        pairs = dict(getattr(namespace, self.dest) or {})
+        for text in values or ():
+            key, colon, value = str(text).partition(":")
+            if not colon or not key or not value:
+                parser.error(f"{option_string} expects key:value, such as coordination:2, got {text!r}")
+            try:
+                pairs[key] = parse_value(value)
+            except ValueError as error:
+                parser.error(str(error))
+        setattr(namespace, self.dest, pairs)
+
+
+def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
+    """
+    The words that give pairs to an option of :class:`KeyValues`.
+
+    :param option: such as ``"--env-kwargs"``
+    :param pairs: plain data
+    :return: empty if there are none
+    """
+    return [option, *(f"{key}:{json.dumps(value)}" for key, value in pairs.items())] if pairs else []
+
+
+def run_command(program: str, command: Callable[[], None]) -> None:
+    """
+    Run a command; errors for the user, and files that cannot be read or written, go to stderr as one line, with exit
+    code 2.
+
+    :param program: what the user typed, for the line
+    :param command: the command
+    """
+    try:
+        command()
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read along has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    except (CommandError, OSError) as error:
+        print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(USAGE_ERROR) from None
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
+
+
+@contextmanager
+def replaced(module: ModuleType, name: str, value: object) -> Iterator[None]:
+    """
+    Put something else into a module for a while: the doors that RL-Zoo3 leaves open are names in its modules.
+
+    :param module: the module
+    :param name: what to replace
+    :param value: by what
+    """
+    kept = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, kept)
+
+
+def require_zoo() -> None:
+    """
+    Check that RL-Zoo3 and what it needs are installed.
+
+    :raises CommandError: with the command that installs them
+    """
+    try:
+        import rl_zoo3.train  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise CommandError(
+            f"this command needs {error.name}, which is not installed: pip install 'sb3-saf[zoo]'"
+        ) from None

@@ -1,0 +1,249 @@
+"""
+Figures of results, from tidy tables: learning curves, bars against a level, aggregates.
+
+Every function returns a matplotlib ``Figure`` and reads no files. Intervals are 95 % everywhere; where a single run
+says nothing about its spread, none is drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from sb3_saf.training.statistics import (
+    CURVE_COLUMNS,
+    Floats,
+    interquartile_means,
+    learning_curve,
+    mean_over_seeds,
+    performance_profiles,
+    require_columns,
+)
+
+#: Colours that colour-blind readers can tell apart (Okabe and Ito, and three darker ones).
+_COLOURS: Final = {
+    "saf": "#0072B2",
+    "mappo": "#E69F00",
+    "ippo": "#009E73",
+    "saf-no-pool": "#CC79A7",
+    "saf-no-ks": "#56B4E9",
+    "qplex": "#D55E00",
+    "qplex-pool": "#8B6F00",
+    "qmix": "#882255",
+    "vdn": "#332288",
+    "random": "#666666",
+}
+_WITH_MEMORY: Final = "-lstm"
+
+_PANEL_WIDTH: Final = 4.6
+_MOST_IN_A_ROW: Final = 4
+_DPI: Final = 130
+#: Of a legend: inches of a line, and of a letter, and of what stands beside the text.
+_LINE, _LETTER, _HANDLE = 0.24, 0.085, 0.65
+TEAM_RETURN: Final = "team return (treasures)"
+
+
+class Style(NamedTuple):
+    """
+    How a method looks, the same in every figure.
+
+    :param colour: of lines and bars
+    :param line: style of lines
+    :param hatch: of bars
+    """
+
+    colour: str
+    line: str = "-"
+    hatch: str | None = None
+
+
+def method_styles(methods: Sequence[str]) -> dict[str, Style]:
+    """
+    One style per method. Known methods always have theirs, those with memory the colour of those without.
+
+    :param methods: names, in any order
+    """
+    styles = {method: _style(method) for method in methods}
+    taken = {_COLOURS["random"], *(style.colour for style in styles.values() if style is not None)}
+    free = [colour for colour in _COLOURS.values() if colour not in taken] or list(_COLOURS.values())
+    others = [method for method, style in styles.items() if style is None]
+    fresh = {method: Style(free[index % len(free)], ":", "..") for index, method in enumerate(others)}
+    return {method: style or fresh[method] for method, style in styles.items()}
+
+
+def _style(method: str) -> Style | None:
+    if method == "random":
+        return Style(_COLOURS[method], "--")
+    if method.endswith(_WITH_MEMORY) and method.removesuffix(_WITH_MEMORY) in _COLOURS:
+        return Style(_COLOURS[method.removesuffix(_WITH_MEMORY)], "--", "//")
+    return Style(_COLOURS[method]) if method in _COLOURS else None
+
+
+def _methods_of(table: pd.DataFrame) -> list[str]:
+    """Known ones first, in the order of the colours."""
+    known = list(_COLOURS)
+    found = list(dict.fromkeys(table["method"]))
+    return sorted(found, key=lambda method: known.index(method) if method in known else len(known))
+
+
+def _panels(table: pd.DataFrame, panel: str | None) -> list[tuple[str, pd.DataFrame]]:
+    if panel is None:
+        return [("", table)]
+    require_columns(table, (panel,))
+    return [(str(name), rows) for name, rows in table.groupby(panel, sort=False)]
+
+
+def _figure(n_panels: int, height: float = 3.6) -> tuple[Figure, list[Axes]]:
+    columns = min(n_panels, _MOST_IN_A_ROW)
+    rows = math.ceil(n_panels / columns)
+    figure = Figure(figsize=(_PANEL_WIDTH * columns + 0.6, height * rows), dpi=_DPI, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for unused in axes[n_panels:]:
+        unused.set_axis_off()
+    return figure, list(axes[:n_panels])
+
+
+def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
+    """Title on top, one legend for all panels below, so that it covers no data."""
+    entries: dict[str, Artist] = {}
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(axis="y", alpha=0.3)
+        ax.set_axisbelow(True)
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    width, height = figure.get_size_inches()
+    columns = max(1, min(len(entries), int(width / (_HANDLE + _LETTER * max(map(len, entries))))))
+    figure.set_size_inches(width, height + _LINE * (math.ceil(len(entries) / columns) - 1))
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns, frameon=False)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _start_at_zero(axes: Axes, values: Floats) -> None:
+    """Nobody collects less than nothing, whatever an interval of two seeds says."""
+    if len(values) and values.min() >= 0:
+        axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
+
+
+def draw_curves(
+    runs: pd.DataFrame, title: str | None = None, panel: str | None = None, y_label: str = TEAM_RETURN
+) -> Figure:
+    """
+    Learning curves: mean and 95 % interval (Student's t) over seeds.
+
+    :param runs: columns ``method``, ``seed``, ``game_steps``, ``score``
+    :param title: of the figure
+    :param panel: column whose values get a panel each, for instance ``"task"``
+    :param y_label: what a score is
+    """
+    require_columns(runs, CURVE_COLUMNS)
+    panels, methods = _panels(runs, panel), _methods_of(runs)
+    styles = method_styles(methods)
+    figure, all_axes = _figure(len(panels))
+    for ax, (name, rows) in zip(all_axes, panels, strict=True):
+        for method in [method for method in methods if (rows["method"] == method).any()]:
+            of_method, style = rows[rows["method"] == method], styles[method]
+            curve, n_seeds = learning_curve(of_method), of_method["seed"].nunique()
+            marker = "o" if len(curve) == 1 else None
+            label = f"{method} ({n_seeds} seed{'s' * (n_seeds > 1)})"
+            steps = curve["game_steps"]
+            ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
+            ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
+        ax.set(xlabel="game steps", ylabel=y_label, title=name)
+        ax.xaxis.set_major_formatter(EngFormatter(sep=""))
+        _start_at_zero(ax, rows["score"].to_numpy())
+    return _finish(figure, all_axes, title)
+
+
+def draw_levels(
+    results: pd.DataFrame,
+    level: str,
+    title: str | None = None,
+    panel: str | None = None,
+    y_label: str = TEAM_RETURN,
+) -> Figure:
+    """
+    Bars of the return against a level: mean and 95 % interval (Student's t) over seeds.
+
+    :param results: columns ``method``, ``seed``, ``score`` and the column named by ``level``; several rows of a run
+        (episodes) are averaged
+    :param level: for instance ``"coordination"``
+    :param title: of the figure
+    :param panel: column whose values get a panel each, for instance ``"task"``
+    :param y_label: what a score is
+    """
+    require_columns(results, ("method", "seed", level, "score"))
+    panels = _panels(results, panel)
+    styles = method_styles(_methods_of(results))
+    figure, all_axes = _figure(len(panels))
+    for ax, (name, rows) in zip(all_axes, panels, strict=True):
+        _draw_bars(ax, rows, level, styles)
+        ax.set(xlabel=level, ylabel=y_label, title=name)
+        _start_at_zero(ax, rows["score"].to_numpy())
+    return _finish(figure, all_axes, title)
+
+
+def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, Style]) -> None:
+    """The bars of one panel: side by side at each level, in the order of the methods."""
+    methods, levels = _methods_of(rows), sorted(rows[level].unique())
+    width = min(0.3, 0.8 / len(methods))
+    for index, method in enumerate(methods):
+        of_method = rows[rows["method"] == method]
+        found = [value for value in levels if (of_method[level] == value).any()]
+        estimates = [
+            mean_over_seeds(of_method[of_method[level] == value].groupby("seed")["score"].mean().to_numpy())
+            for value in found
+        ]
+        values = np.array([estimate.value for estimate in estimates])
+        margins = np.array([[e.value - e.low, e.high - e.value] for e in estimates]).reshape(-1, 2).T
+        places = [levels.index(value) + (index - (len(methods) - 1) / 2) * width for value in found]
+        style = styles[method]
+        ax.bar(places, values, width * 0.92, color=style.colour, hatch=style.hatch, edgecolor="white", label=method)
+        ax.errorbar(places, values, yerr=margins, fmt="none", ecolor="black", capsize=3, linewidth=1)
+    ax.set_xticks(range(len(levels)), [str(value) for value in levels])
+    ax.set_xlim(-0.6, len(levels) - 0.4)
+
+
+def draw_aggregates(
+    scores: Mapping[str, Floats], title: str | None = None, x_label: str = "normalised score"
+) -> Figure:
+    """
+    Interquartile means and performance profiles, both with stratified bootstrap intervals (rliable).
+
+    :param scores: (S, K) scores of each method on S seeds and K tasks, normalised, 0 to 1
+    :param title: of the figure
+    :param x_label: what a score is, with its unit
+    """
+    methods = _methods_of(pd.DataFrame({"method": list(scores)}))
+    styles = method_styles(methods)
+    ordered = {method: scores[method] for method in methods}
+    figure, (left, right) = _figure(2, height=max(3.6, 1.4 + 0.3 * len(methods)))
+    for row, (method, estimate) in enumerate(interquartile_means(ordered).items()):
+        colour = styles[method].colour
+        left.barh(row, estimate.high - estimate.low, left=estimate.low, height=0.6, color=colour, alpha=0.5)
+        left.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color="black", linewidth=1.5)
+    left.set_yticks(range(len(methods)), methods)
+    left.invert_yaxis()
+    left.margins(x=0.1)
+    left.use_sticky_edges = False  # bars end inside the axes
+    left.autoscale_view()
+    left.set(xlabel=x_label, title="interquartile mean")
+    top = max(float(runs.max()) for runs in scores.values())
+    thresholds = np.linspace(0, top if top > 0 else 1, 101)
+    for method, profile in performance_profiles(ordered, thresholds).items():
+        colour, line, _ = styles[method]
+        right.plot(thresholds, profile.share, color=colour, linestyle=line, label=method)
+        right.fill_between(thresholds, profile.low, profile.high, color=colour, alpha=0.2, linewidth=0)
+    right.set(xlabel=f"{x_label}, threshold", ylabel="share of runs above it", title="performance profile")
+    right.set_ylim(-0.02, 1.02)
+    return _finish(figure, [left, right], title)

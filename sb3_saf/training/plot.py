@@ -1,0 +1,103 @@
+"""``python -m sb3_saf.plot``: figures of the runs in a log folder."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from hecogrid_envs.params import HECOGridParams
+from sb3_saf.training.commands import CommandError, OneLineParser, run_command, user_errors
+from sb3_saf.training.names import unknown_name
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PROGRAM: Final = "python -m sb3_saf.plot"
+FORMATS: Final = (".png", ".pdf", ".svg")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """One command for each kind of figure."""
+    parser = OneLineParser(prog=PROGRAM, description="Draw the runs in a log folder.")
+    commands = parser.add_subparsers(dest="kind", required=True, parser_class=OneLineParser)
+    kinds = {
+        "curves": "learning curves: mean and 95 % interval over seeds, in game steps",
+        "levels": "bars of the return against a parameter of the level, mean and 95 % interval over seeds",
+        "aggregate": "interquartile means and performance profiles with stratified bootstrap intervals (rliable)",
+    }
+    for kind, text in kinds.items():
+        command = commands.add_parser(kind, help=text, description=text)
+        command.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="where the runs are")
+        command.add_argument("--algos", nargs="+", default=[], help="only these")
+        command.add_argument("--env", nargs="+", default=[], help="only these environments")
+        command.add_argument(
+            "--source",
+            choices=("evaluation", "training"),
+            default="evaluation",
+            help="team returns of evaluation games (default), or of the games that were trained on",
+        )
+        command.add_argument("--title")
+        command.add_argument("-o", "--output", type=Path, required=True, help=f"a file: {', '.join(FORMATS)}")
+        if kind == "levels":
+            command.add_argument("--level", default="coordination", help="coordination (default), heterogeneity, ...")
+    return parser
+
+
+def plot(arguments: Sequence[str] | None = None) -> None:
+    """
+    Draw a figure.
+
+    :param arguments: of the command line; None for those of this process
+    :raises CommandError: for what the user can put right
+    """
+    options = make_parser().parse_args(arguments)
+    if options.output.suffix not in FORMATS:
+        raise CommandError(f"--output must end with {', '.join(FORMATS)}, got {str(options.output)!r}")
+    levels = HECOGridParams.__dataclass_fields__
+    if options.kind == "levels" and options.level not in levels:
+        raise CommandError(str(unknown_name("parameter", options.level, levels)))
+    try:
+        with user_errors():
+            figure = _draw(options)
+    except ModuleNotFoundError as error:
+        raise CommandError(f"figures need {error.name}: pip install 'sb3-saf[render,zoo]'") from None
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(options.output)
+    print(options.output)
+
+
+def _draw(options: argparse.Namespace) -> Figure:
+    import pandas as pd
+
+    from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_levels
+    from sb3_saf.training.runs import describe, find_runs, setting_names
+    from sb3_saf.training.statistics import score_matrices
+
+    table = describe(find_runs(options.log_folder, options.algos, options.env))
+    without = [options.level] if options.kind == "levels" else []
+    table["setting"] = setting_names(table, without)
+    for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
+        if changes not in method:
+            print(f"{method}: {changes}")
+    if options.kind == "curves":
+        names = ("method", "seed", "setting")
+        curves = [
+            row.run.curve(options.source).assign(**{k: getattr(row, k) for k in names}) for row in table.itertuples()
+        ]
+        return draw_curves(pd.concat(curves), options.title, panel="setting")
+    table["score"] = [run.final_score(options.source) for run in table["run"]]
+    if options.kind == "levels":
+        return draw_levels(table, options.level, options.title, panel="setting")
+    normalised = table.assign(score=table["score"] / table["n_treasures"])
+    return draw_aggregates(score_matrices(normalised, "setting"), options.title, "treasures collected / on the map")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command.
+
+    :param arguments: of the command line; None for those of this process
+    """
+    run_command(PROGRAM, lambda: plot(arguments))

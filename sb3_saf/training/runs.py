@@ -1,0 +1,222 @@
+"""Runs in a log folder, ``FOLDER/ALGO/ENV_NUMBER``: what they were, and their results as tidy tables."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import pandas as pd
+
+from sb3_saf.training.names import unknown_name
+from sb3_saf.training.settings import Settings, load_settings, saved_settings
+from sb3_saf.training.yaml_files import load_yaml
+
+#: Where scores come from: evaluation games, or the games that were trained on.
+Source = Literal["evaluation", "training"]
+
+#: Points of a curve of training episodes.
+_N_POINTS: Final = 50
+#: Changed settings that a method's name spells out.
+_MOST_NAMED: Final = 2
+#: The part of training whose episodes count as its result.
+_FINAL_PART: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    A folder that ``sb3_saf.train`` has left.
+
+    :param folder: the folder
+    :param env_id: the environment
+    :param number: of the run, counted for each algorithm and environment
+    """
+
+    folder: Path
+    env_id: str
+    number: int
+
+    @cached_property
+    def config(self) -> Mapping[str, Any]:
+        """``config.yml``."""
+        path = self.folder / self.env_id / "config.yml"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} is no run of sb3_saf.train: there is no {path}")
+        config = load_yaml(path.read_text(encoding="utf-8"), str(path))
+        if not isinstance(config, dict) or "seed" not in config:
+            raise ValueError(f"{path} does not hold the settings of a run of sb3_saf.train")
+        return config
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What was trained."""
+        return saved_settings(self.config)
+
+    def curve(self, source: Source) -> pd.DataFrame:
+        """
+        Team return along training.
+
+        :param source: where scores come from
+        :return: columns ``game_steps``, ``score``
+        :raises ValueError: if there are no results
+        """
+        return self._evaluations() if source == "evaluation" else self._training()
+
+    def final_score(self, source: Source) -> float:
+        """
+        Mean team return at the end: of the last evaluation, or of the last tenth of training.
+
+        :param source: where scores come from
+        """
+        curve = self.curve(source)
+        if source == "evaluation":
+            return float(curve["score"].iloc[-1])
+        late = curve["game_steps"] > (1 - _FINAL_PART) * curve["game_steps"].iloc[-1]
+        return float(curve["score"][late].mean())
+
+    def _evaluations(self) -> pd.DataFrame:
+        path = self.folder / "evaluations.npz"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} has no evaluations; train with --eval-freq, or plot --source training")
+        with np.load(path) as arrays:
+            return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
+
+    def _training(self) -> pd.DataFrame:
+        path = self.folder / "monitor.csv"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} has no monitor.csv; train with sb3_saf.train")
+        return training_curve(path)
+
+
+def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFrame:
+    """
+    The learning curve of the games that were trained on.
+
+    :param monitor: a ``monitor.csv``, or the ``monitor_dir`` that ``make_team_env`` was given
+    :param n_points: means of about as many episodes each
+    :return: columns ``game_steps``, ``score``, the mean team return
+    :raises ValueError: if no episode has ended
+    """
+    path = Path(monitor)
+    if path.is_dir():
+        path /= "monitor.csv"
+    episodes = pd.read_csv(path, comment="#")
+    if episodes.empty:
+        raise ValueError(f"no episode has ended in {path.parent}; train longer")
+    steps = episodes["l"].cumsum()
+    bins = np.ceil(steps / steps.iloc[-1] * n_points).astype(int)
+    means = episodes["r"].groupby(bins).mean()
+    return pd.DataFrame({"game_steps": means.index * steps.iloc[-1] / n_points, "score": means.to_numpy()})
+
+
+def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
+    """
+    Runs in a log folder.
+
+    :param folder: the log folder
+    :param algos: only these; all if empty
+    :param env_ids: only these; all if empty
+    :raises ValueError: if there is no folder or no run, or an algorithm has none
+    """
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}; give the -f that sb3_saf.train was given")
+    found: dict[str, list[Run]] = {}
+    for config in sorted(folder.glob("*/*_*/*/config.yml")):
+        run_folder, env_id = config.parent.parent, config.parent.name
+        number = run_folder.name.removeprefix(f"{env_id}_")
+        if number.isdigit() and (not env_ids or env_id in env_ids):
+            found.setdefault(run_folder.parent.name, []).append(Run(run_folder, env_id, int(number)))
+    if not found:
+        of = f" of {', '.join(env_ids)}" if env_ids else ""
+        raise ValueError(f"there are no runs{of} in {folder}; train some: python -m sb3_saf.train -f {folder}")
+    for algo in algos:
+        if algo not in found:
+            raise unknown_name(f"algorithm among the runs in {folder}:", algo, found)
+    runs = [run for algo in (algos or found) for run in found[algo]]
+    return sorted(runs, key=lambda run: run.number)
+
+
+def describe(runs: Sequence[Run]) -> pd.DataFrame:
+    """
+    What tells runs apart.
+
+    :param runs: the runs
+    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size``, ``n_treasures`` and the parameters
+        of the level; a method's name says in what it differs from the zoo's settings and from other runs, or, where
+        that is much, has a number, and ``changes`` says it. Of runs that are alike but for their number only the latest
+        is there.
+    """
+    rows = []
+    for run in runs:
+        settings = run.settings
+        identity = {"env": settings.env_id, "size": settings.size, "seed": run.config["seed"]}
+        rows.append({**identity, **settings.env_kwargs, "run": run})
+    table = pd.DataFrame(rows)
+    table["changes"] = _changes(runs)
+    table["method"] = _method_names([run.settings.algo for run in runs], list(table["changes"]))
+    repeated = [column for column in table.columns if column != "run"]
+    return table.drop_duplicates(repeated, keep="last", ignore_index=True)
+
+
+def _changes(runs: Sequence[Run]) -> list[str]:
+    """What differs from the zoo's settings, and not in all runs of the algorithm at that size alike."""
+    own = [_different_from_the_zoo(run.settings) for run in runs]
+    peers: dict[tuple[str, str], list[dict[str, str]]] = {}
+    for run, different in zip(runs, own, strict=True):
+        peers.setdefault((run.settings.algo, run.settings.size), []).append(different)
+    texts = []
+    for run, different in zip(runs, own, strict=True):
+        others = peers[run.settings.algo, run.settings.size]
+        named = [key for key, value in different.items() if any(other.get(key) != value for other in others)]
+        texts.append(" ".join(f"{key}={different[key]}" for key in sorted(named)))
+    return texts
+
+
+def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
+    """Settings other than what the zoo has for the same game today, as text."""
+    zoo = load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)
+    ours, theirs = _flat(settings), _flat(zoo)
+    keys = [key for key in {**theirs, **ours} if repr(ours.get(key)) != repr(theirs.get(key))]
+    return {key: _short(ours.get(key, "default")) for key in keys}
+
+
+def _flat(settings: Settings) -> dict[str, Any]:
+    own = {"n_envs": settings.n_envs, "game_steps": settings.game_steps, **settings.plain}
+    of_policy = own.pop("policy_kwargs", {})
+    return {**own, **of_policy}
+
+
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _method_names(algos: Sequence[str], changes: Sequence[str]) -> list[str]:
+    """The algorithm with its changes, or with a number where these are more than a legend has room for."""
+    numbers: dict[str, dict[str, int]] = {}
+    names = []
+    for algo, text in zip(algos, changes, strict=True):
+        if text.count("=") <= _MOST_NAMED:
+            names.append(f"{algo} {text}".rstrip())
+        else:
+            known = numbers.setdefault(algo, {})
+            names.append(f"{algo}, variant {known.setdefault(text, len(known) + 1)}")
+    return names
+
+
+def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
+    """
+    A name for the games of each row: the environment, and the parameters in which the rows differ.
+
+    :param table: from :func:`describe`
+    :param without: parameters that shall not be named
+    """
+    named = {"method", "changes", "seed", "env", "run", *without}
+    varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
+    return [
+        ", ".join([row["env"].removesuffix("-v0"), *(f"{column} {row[column]}" for column in varying)])
+        for _, row in table.iterrows()
+    ]

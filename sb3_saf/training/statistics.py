@@ -1,0 +1,191 @@
+"""
+Numbers behind the figures: means with intervals over seeds, interquartile means and performance profiles by rliable.
+
+Tables are tidy: one row per observation, the column ``method`` names the algorithm, ``seed`` the run. Letters: S seeds,
+K tasks, X thresholds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from sb3_saf.evaluation import confidence_interval
+
+Floats = npt.NDArray[np.float64]
+
+#: Bootstrap samples, and the seed that makes intervals repeat.
+N_RESAMPLES: Final = 2_000
+BOOTSTRAP_SEED: Final = 0
+
+CURVE_COLUMNS: Final = ("method", "seed", "game_steps", "score")
+
+
+class Estimate(NamedTuple):
+    """
+    A value with its 95 % interval.
+
+    :param value: the estimate
+    :param low: lower end; NaN where one run cannot tell
+    :param high: upper end
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+class Profile(NamedTuple):
+    """
+    Share of runs whose score is above each threshold.
+
+    :param thresholds: (X,)
+    :param share: (X,)
+    :param low: (X,) lower end of the 95 % interval
+    :param high: (X,) upper end
+    """
+
+    thresholds: Floats
+    share: Floats
+    low: Floats
+    high: Floats
+
+
+def mean_over_seeds(values: Sequence[float] | Floats) -> Estimate:
+    """
+    Mean and Student's t interval of one value per seed.
+
+    :param values: (S,)
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    low, high = confidence_interval(sample) if len(sample) > 1 else (np.nan, np.nan)
+    return Estimate(float(sample.mean()), low, high)
+
+
+def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
+    """
+    Check a table before it is drawn.
+
+    :raises ValueError: with the columns that are missing, or if there are no rows
+    """
+    missing = [column for column in columns if column not in table.columns]
+    if missing:
+        raise ValueError(f"expected a table with the columns {', '.join(columns)}; {', '.join(missing)} is missing")
+    if table.empty:
+        raise ValueError("expected at least one row of results, got none")
+
+
+def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    Mean and interval over the seeds of one method at each point of training.
+
+    Seeds that were measured at different points are interpolated, and only where all of them were measured: a curve
+    that goes on with fewer seeds would jump.
+
+    :param runs: columns ``seed``, ``game_steps``, ``score``
+    :return: columns ``game_steps``, ``value``, ``low``, ``high``
+    """
+    curves = [
+        (by_step.index.to_numpy(dtype=np.float64), by_step.to_numpy(dtype=np.float64))
+        for by_step in (run.groupby("game_steps")["score"].mean() for _, run in runs.groupby("seed"))
+    ]
+    first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    steps = np.unique(np.concatenate([steps for steps, _ in curves]))
+    steps = steps[(steps >= first) & (steps <= last)]
+    scores = np.stack([np.interp(steps, *curve) for curve in curves])
+    estimates = [mean_over_seeds(column) for column in scores.T]
+    return pd.DataFrame(estimates, columns=["value", "low", "high"]).assign(game_steps=steps)
+
+
+def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Floats]:
+    """
+    Scores by method as rliable takes them.
+
+    :param results: columns ``method``, ``seed``, the column named by ``task``, ``score``; several rows of a run
+        (episodes) are averaged
+    :param task: the column whose values count as tasks
+    :return: (S, K) for each method
+    :raises ValueError: if a method lacks a task, or a seed of one
+    """
+    require_columns(results, ("method", "seed", task, "score"))
+    matrices: dict[str, Floats] = {}
+    tasks: dict[str, set[Any]] = {}
+    for method, rows in results.groupby("method", sort=False):
+        table = rows.groupby(["seed", task])["score"].mean().unstack(task)
+        if table.isna().to_numpy().any():
+            seed, column = next((s, c) for s in table.index for c in table.columns if pd.isna(table.loc[s, c]))
+            raise ValueError(
+                f"aggregates need every seed of a method on every task: {method} has no seed {seed} on {column}; run "
+                "it, or leave that seed or task out"
+            )
+        matrices[str(method)] = table.to_numpy(dtype=np.float64)
+        tasks[str(method)] = set(table.columns)
+    everything = set().union(*tasks.values())
+    for method, its in tasks.items():
+        if its != everything:
+            raise ValueError(
+                f"aggregates compare methods on the same tasks: {method} has no result on "
+                f"{', '.join(sorted(map(str, everything - its)))}; run it, or leave that method or task out"
+            )
+    return matrices
+
+
+def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
+    """
+    Interquartile mean of each method with a stratified bootstrap interval over seeds.
+
+    :param scores: (S, K) normalised scores of each method
+    """
+    values, intervals = _bootstrap(scores, lambda runs: np.array([_interquartile_mean(runs)]))
+    return {
+        method: Estimate(float(values[method][0]), *(float(end) for end in intervals[method][:, 0]))
+        for method in scores
+    }
+
+
+def _interquartile_mean(runs: Floats) -> float:
+    """``aggregate_iqm`` of rliable, called some ten thousand times: scipy's checks of arguments are all its cost."""
+    scores = np.sort(runs, axis=None)
+    cut = len(scores) // 4
+    return float(scores[cut : len(scores) - cut].mean())
+
+
+def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> dict[str, Profile]:
+    """
+    Share of (seed, task) pairs above each threshold, with stratified bootstrap intervals.
+
+    :param scores: (S, K) normalised scores of each method
+    :param thresholds: (X,)
+    """
+    shares, intervals = _bootstrap(scores, lambda runs: (runs[..., None] > thresholds).mean(axis=(0, 1)))
+    return {method: Profile(thresholds, shares[method], *intervals[method]) for method in scores}
+
+
+def _bootstrap(
+    scores: Mapping[str, Floats], statistic: Callable[[Floats], Floats]
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Point estimates and 95 % intervals of rliable; with a single seed nothing is known of the spread: NaN."""
+    from rliable.library import get_interval_estimates
+
+    with _seeded_global_generator():
+        values, intervals = get_interval_estimates(dict(scores), statistic, reps=N_RESAMPLES)
+    for method, runs in scores.items():
+        if len(runs) < 2:
+            intervals[method] = np.full_like(intervals[method], np.nan)
+    return values, intervals
+
+
+@contextmanager
+def _seeded_global_generator() -> Iterator[None]:
+    """Resampling repeats: rliable draws from NumPy's global generator, whatever ``random_state`` it gets."""
+    state: Any = np.random.get_state()  # noqa: NPY002
+    np.random.seed(BOOTSTRAP_SEED)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002

@@ -1,0 +1,196 @@
+"""Statistics and figures of tidy tables, against numbers worked out otherwise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+
+pytest.importorskip("rliable")
+
+from rliable import metrics
+
+from sb3_saf import confidence_interval
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_levels, method_styles
+from sb3_saf.training.statistics import (
+    interquartile_means,
+    learning_curve,
+    mean_over_seeds,
+    performance_profiles,
+    score_matrices,
+)
+
+
+def runs(**scores: list[list[float]]) -> pd.DataFrame:
+    """One list per seed, measured after 100, 200, ... game steps."""
+    rows = [
+        {"method": method, "seed": seed, "game_steps": 100 * (step + 1), "score": score, "task": "t"}
+        for method, seeds in scores.items()
+        for seed, curve in enumerate(seeds)
+        for step, score in enumerate(curve)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_mean_and_interval_over_seeds() -> None:
+    assert mean_over_seeds([1.0, 2.0, 6.0]) == (3.0, *confidence_interval([1, 2, 6]))
+    alone = mean_over_seeds([4.0])
+    assert alone.value == 4.0
+    assert np.isnan([alone.low, alone.high]).all()
+
+
+def test_a_curve_is_the_mean_over_seeds_at_every_point() -> None:
+    curve = learning_curve(runs(saf=[[1, 2, 3], [3, 4, 8]]))
+    assert curve["game_steps"].tolist() == [100, 200, 300]
+    assert curve["value"].tolist() == [2, 3, 5.5]
+    assert curve[["low", "high"]].iloc[2].tolist() == pytest.approx(list(confidence_interval([3, 8])))
+
+
+def test_a_curve_ends_where_a_seed_ends_and_is_interpolated_between() -> None:
+    table = pd.DataFrame(
+        {"seed": [0, 0, 0, 1, 1], "game_steps": [0, 100, 200, 50, 150], "score": [0.0, 10.0, 20.0, 5.0, 25.0]}
+    )
+    curve = learning_curve(table)
+    assert curve["game_steps"].tolist() == [50, 100, 150]
+    assert curve["value"].tolist() == [5.0, 12.5, 20.0]
+
+
+def test_curves_are_drawn_where_they_are() -> None:
+    table = runs(saf=[[1, 2, 3], [3, 4, 8]], mappo=[[0, 0, 1]])
+    figure = draw_curves(table, title="T", panel="task")
+    (axes,) = figure.axes
+    lines = {str(line.get_label()): line for line in axes.get_lines()}
+    assert list(lines) == ["saf (2 seeds)", "mappo (1 seed)"]
+    assert np.array_equal(lines["saf (2 seeds)"].get_xdata(), [100, 200, 300])
+    assert np.array_equal(lines["saf (2 seeds)"].get_ydata(), [2, 3, 5.5])
+    assert to_hex(str(lines["mappo (1 seed)"].get_color())) == method_styles(["mappo"])["mappo"].colour.lower()
+    assert (axes.get_xlabel(), axes.get_title()) == ("game steps", "t")
+    assert figure.get_suptitle() == "T"
+
+
+def test_bars_are_means_of_seeds_not_of_episodes() -> None:
+    table = pd.DataFrame(
+        {
+            "method": ["saf"] * 4 + ["ippo"],
+            "seed": [0, 0, 0, 1, 0],
+            "coordination": [1, 1, 1, 1, 2],
+            "score": [1.0, 2.0, 3.0, 10.0, 4.0],
+        }
+    )
+    (axes,) = draw_levels(table, "coordination").axes
+    heights = sorted(patch.get_height() for patch in axes.patches)  # type: ignore[attr-defined]
+    assert heights == [4.0, 6.0]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["1", "2"]
+
+
+def test_scores_become_matrices_of_seeds_and_tasks() -> None:
+    rows = [("saf", seed, task, 10.0 * seed + index) for seed in (0, 1) for index, task in enumerate("ab")]
+    table = pd.DataFrame([*rows, ("saf", 1, "b", 13.0)], columns=["method", "seed", "task", "score"])
+    assert score_matrices(table)["saf"].tolist() == [[0, 1], [10, 12]]
+    with pytest.raises(ValueError, match="saf has no seed 0 on b"):
+        score_matrices(table.drop(index=1))
+    other = pd.DataFrame([("ippo", 0, "a", 1.0)], columns=table.columns)
+    with pytest.raises(ValueError, match="on the same tasks: ippo has no result on b"):
+        score_matrices(pd.concat([table, other]))
+    elsewhere = pd.DataFrame([("ippo", seed, task, 1.0) for seed in (0, 1) for task in "cd"], columns=table.columns)
+    with pytest.raises(ValueError, match="on the same tasks: saf has no result on c, d"):
+        score_matrices(pd.concat([table, elsewhere]))
+
+
+def test_interquartile_mean_and_its_interval() -> None:
+    scores = np.arange(8.0).reshape(4, 2)
+    estimate = interquartile_means({"saf": scores})["saf"]
+    assert estimate.value == np.mean([2, 3, 4, 5])
+    assert estimate.low < estimate.value < estimate.high
+    # Resampling a task's seeds can at the most give its extremes.
+    assert estimate.low >= 0.5 and estimate.high <= 6.5
+    alone = interquartile_means({"saf": scores[:1]})["saf"]
+    assert np.isnan([alone.low, alone.high]).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 9), (5, 7)])
+def test_the_interquartile_mean_is_rliables(shape: tuple[int, int]) -> None:
+    scores = np.random.default_rng(0).normal(size=shape)
+    assert interquartile_means({"saf": scores})["saf"].value == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
+
+
+def test_seeds_without_spread_have_an_interval_without_width() -> None:
+    assert interquartile_means({"saf": np.full((3, 2), 0.25)})["saf"] == (0.25, 0.25, 0.25)
+
+
+def test_bootstraps_repeat_and_leave_the_global_generator_alone() -> None:
+    scores = {"saf": np.random.default_rng(0).normal(size=(5, 3))}
+    first = interquartile_means(scores)
+    before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+    assert interquartile_means(scores) == first
+    assert np.array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
+
+
+def test_performance_profiles_are_shares_above_thresholds() -> None:
+    thresholds = np.array([-1.0, 0.0, 0.5, 2.5, 3.0])
+    profile = performance_profiles({"saf": np.array([[0.0, 1.0], [2.0, 3.0]])}, thresholds)["saf"]
+    assert profile.share.tolist() == [1.0, 0.75, 0.75, 0.25, 0.0]
+    assert (profile.low <= profile.share).all()
+    assert (profile.share <= profile.high).all()
+
+
+def test_aggregates_are_drawn_at_their_values() -> None:
+    scores = {"mappo": np.array([[0.1, 0.2], [0.2, 0.3]]), "saf": np.array([[0.3, 0.5], [0.5, 0.7]])}
+    left, right = draw_aggregates(scores).axes
+    assert [label.get_text() for label in left.get_yticklabels()] == ["saf", "mappo"]
+    marks = [line.get_xdata()[0] for line in left.get_lines()]  # type: ignore[index]
+    assert marks == pytest.approx([0.5, 0.2])
+    assert [line.get_label() for line in right.get_lines()] == ["saf", "mappo"]
+
+
+def test_methods_keep_their_styles_and_none_looks_like_another() -> None:
+    assert method_styles(["ippo", "saf"])["saf"] == method_styles(["saf", "other"])["saf"]
+    methods = [*ALGOS, "random", "saf gamma=0.9", "saf, variant 1"]
+    assert len(set(method_styles(methods).values())) == len(methods)
+    assert method_styles(methods)["saf-lstm"].colour == method_styles(methods)["saf"].colour
+
+
+def long_names(count: int) -> dict[str, list[list[float]]]:
+    return {f"saf with_a_setting_of_a_long_name={index}": [[0.0, 1.0]] for index in range(count)}
+
+
+@pytest.mark.parametrize("n_panels", [1, 2, 9])
+def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
+    """Constrained layout only warns where it does not fit, and warnings are errors here."""
+    table = pd.concat([runs(**long_names(12)).assign(task=f"task {index}") for index in range(n_panels)])
+    for figure in (
+        draw_curves(table, panel="task"),
+        draw_levels(table.assign(coordination=1), "coordination", panel="task"),
+    ):
+        figure.draw_without_rendering()
+        (legend,) = figure.legends
+        box = legend.get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0
+        boxes = [axes.get_tightbbox() for axes in figure.axes if axes.axison]
+        assert all(each is not None and box.y1 <= each.y0 + 1 for each in boxes)
+
+
+def test_panels_have_their_own_levels() -> None:
+    rows = [("saf", 0, 1, 2.0, "a"), ("saf", 0, 2, 3.0, "a"), ("saf", 0, 5, 1.0, "b")]
+    table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "score", "task"])
+    ticks = [
+        [label.get_text() for label in axes.get_xticklabels()]
+        for axes in draw_levels(table, "coordination", None, "task").axes
+    ]
+    assert ticks == [["1", "2"], ["5"]]
+
+
+def test_returns_that_are_never_negative_are_drawn_from_zero() -> None:
+    wide = runs(saf=[[1, 2], [3, 9]])  # the interval of two seeds goes far below 0
+    assert draw_curves(wide).axes[0].get_ylim()[0] == 0
+    assert draw_levels(wide.assign(coordination=1), "coordination").axes[0].get_ylim()[0] == 0
+    assert draw_curves(runs(saf=[[-1, 2]])).axes[0].get_ylim()[0] < -1
+
+
+def test_tables_are_checked() -> None:
+    with pytest.raises(ValueError, match="seed is missing"):
+        draw_curves(pd.DataFrame({"method": ["saf"], "game_steps": [1], "score": [1.0]}))
+    with pytest.raises(ValueError, match="at least one row"):
+        draw_levels(pd.DataFrame(columns=["method", "seed", "coordination", "score"]), "coordination")

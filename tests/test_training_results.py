@@ -1,0 +1,287 @@
+"""Trained teams watched and drawn: ``python -m sb3_saf.enjoy`` and ``python -m sb3_saf.plot``."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import imageio_ffmpeg
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3.train")
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.utils import set_random_seed
+
+import hecogrid_envs
+from sb3_saf import EvaluationResult, evaluate_team
+from sb3_saf.training import enjoy as zoo_enjoy
+from sb3_saf.training import plot as zoo_plot
+from sb3_saf.training import train as zoo_train
+from sb3_saf.training.runs import Run, describe, find_runs, setting_names, training_curve
+from sb3_saf.training.settings import load_settings, saved_settings
+from sb3_saf.training.watching import play
+
+ENV = "TeamTogether-v0"
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """SAF and MAPPO at two levels, SAF with two seeds, and a team with memory."""
+    folder = tmp_path_factory.mktemp("logs")
+
+    def train(algo: str, *options: str) -> None:
+        given = ("--size", "smoke", "-n", "160", "--eval-freq", "80", "--eval-episodes", "4", "--verbose", "0")
+        zoo_train.main(["--algo", algo, "--env", ENV, "-f", str(folder), *given, *options])
+
+    for coordination in (1, 2):
+        train("saf", "--seed", "0", "--env-kwargs", f"coordination:{coordination}", "--save-freq", "80")
+        train("saf", "--seed", "1", "--env-kwargs", f"coordination:{coordination}")
+        train("mappo", "--seed", "0", "--env-kwargs", f"coordination:{coordination}")
+    train("saf-lstm", "--seed", "0")
+    return folder
+
+
+def enjoy(logs: Path, *options: str) -> EvaluationResult:
+    return zoo_enjoy.enjoy(["-f", str(logs), "--env", ENV, "--episodes", "6", *options])
+
+
+# --- enjoy ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_returns_are_those_of_the_saved_model_over_games_of_its_level(logs: Path, deterministic: bool) -> None:
+    options = ["--deterministic"] if deterministic else []
+    result = enjoy(logs, "--exp-id", "3", "--no-render", "--seed", "5", *options)
+    run = Run(logs / "saf" / f"{ENV}_3", ENV, 3)
+    assert run.settings.env_kwargs["coordination"] == 2
+    model = PPO.load(run.folder / f"{ENV}.zip", device="cpu")
+    set_random_seed(5)
+    expected = evaluate_team(model, run.settings.make_env(5, evaluation=True, n_envs=6), 6, deterministic=deterministic)
+    assert result == expected
+
+
+def test_latest_run_by_default_and_other_models_on_demand(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    enjoy(logs, "--no-render")
+    assert f"{ENV}_4/{ENV}.zip" in capsys.readouterr().out
+    for option, name in (
+        (["--load-best"], "best_model.zip"),
+        (["--load-checkpoint", "80"], "rl_model_80_steps.zip"),
+        (["--load-last-checkpoint"], "rl_model_160_steps.zip"),
+    ):
+        result = enjoy(logs, "--exp-id", "1", "--no-render", *option)
+        printed = capsys.readouterr().out
+        assert f"{ENV}_1/{name}" in printed
+        assert f"team return {result.mean:.2f} [" in printed
+        assert "6 team episodes" in printed
+
+
+def test_another_level(logs: Path) -> None:
+    assert set(enjoy(logs, "--no-render", "--env-kwargs", "max_cycles:7", "heterogeneity:2").lengths) == {7}
+
+
+def test_a_team_with_memory(logs: Path, tmp_path: Path) -> None:
+    assert len(enjoy(logs, "--algo", "saf-lstm", "--gif", str(tmp_path / "g.gif")).returns) == 6
+
+
+def test_gif_mp4_and_text_show_every_step(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    enjoy(logs, "--gif", str(tmp_path / "new" / "game.gif"))
+    gif = imageio.imread(tmp_path / "new" / "game.gif")
+    assert len(gif) == 11
+    assert len(np.unique(gif.reshape(11, -1), axis=0)) > 5  # it moves
+    enjoy(logs, "--mp4", str(tmp_path / "game.mp4"))
+    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / "game.mp4")[0] == 11
+    capsys.readouterr()
+    enjoy(logs, "--text")
+    pages = capsys.readouterr().out
+    assert all(f"step {step} " in pages for step in range(11))
+
+
+def test_the_shown_game_is_the_first_that_is_measured(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = Run(logs / "saf" / f"{ENV}_3", ENV, 3)
+    measured = run.settings.make_env(9, evaluation=True, n_envs=1)
+    measured.reset()
+    (expected,) = measured.env_method("get_state", indices=0)
+    env = hecogrid_envs.parallel_env(run.settings.task, render_mode="ansi", **run.settings.env_kwargs)
+    first = next(iter(play(env, PPO.load(run.folder / f"{ENV}.zip").policy, 9, True)))
+    assert all(np.array_equal(env.get_state()[key], expected[key]) for key in ("treasures", "walls", "agent_pos"))
+    assert first.startswith("step 0")
+
+
+def test_a_window_needs_a_display(
+    logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    enjoy(logs)  # SDL's dummy driver
+    capsys.readouterr()
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    line = failed(zoo_enjoy.main, ["-f", str(logs), "--env", ENV], capsys)
+    assert "there is no display" in line
+    assert "--gif FILE" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--algo", "safe"], "did you mean 'saf'"),
+        (["--env", "TeamTogehter-v0"], "did you mean 'TeamTogether-v0'"),
+        (["--algo", "ippo"], "python -m sb3_saf.train --algo ippo"),
+        (["-f", "nowhere"], "there is no folder nowhere/saf; train first"),
+        (["--exp-id", "9"], "TeamTogether-v0_9 folder was not found"),
+        (["--env", "TeamSupport-v0"], "No model found"),
+        (["--load-checkpoint", "81"], "No model found"),
+        (["--env-kwargs", "coordination:5"], "coordination must be an integer from 1 to 4"),
+        (["--env-kwargs", "n_agents:5"], "trained with 4 agents"),
+        (["--gif", "film.mp4"], "a file that ends with .gif"),
+        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--gif", "a.gif", "--text"], "not allowed with"),
+        (["--gif", "/dev/null/new/a.gif"], "Not a directory"),
+    ],
+)
+def test_mistakes_in_enjoy_are_one_line(
+    options: list[str], words: str, logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quiet = [] if "--gif" in options else ["--no-render"]
+    assert words in failed(zoo_enjoy.main, ["-f", str(logs), *quiet, *options], capsys)
+
+
+def test_a_reader_may_leave(logs: Path) -> None:
+    """As ``| head -1`` does."""
+    words = ["-m", "sb3_saf.enjoy", "-f", str(logs), "--env", ENV, "--episodes", "2", "--text"]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        assert command.stdout is not None and command.stderr is not None
+        command.stdout.close()
+        assert command.stderr.read() == b""
+
+
+def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "saf" / f"{ENV}_1"
+    (run / ENV).mkdir(parents=True)
+    (run / f"{ENV}.zip").write_bytes(b"no zip")
+    assert "is no run of sb3_saf.train" in failed(zoo_enjoy.main, ["-f", str(tmp_path), "--no-render"], capsys)
+    (run / ENV / "config.yml").write_text((logs / "saf" / f"{ENV}_1" / ENV / "config.yml").read_text())
+    assert "is not a model saved by" in failed(zoo_enjoy.main, ["-f", str(tmp_path), "--no-render"], capsys)
+
+
+def failed(main: object, options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr with which a command ended."""
+    assert callable(main)
+    with pytest.raises(SystemExit) as exit_:
+        main(options)
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "error: " in line
+    return line
+
+
+# --- runs and plot ----------------------------------------------------------------------------------------------------
+
+
+def test_runs_are_found_and_described(logs: Path) -> None:
+    table = describe(find_runs(logs, ["saf", "mappo"]))
+    found = sorted(zip(table["method"], table["seed"], table["coordination"], strict=True))
+    expected = [("saf", seed, c) for seed in (0, 1) for c in (1, 2)] + [("mappo", 0, c) for c in (1, 2)]
+    assert found == sorted(expected)
+    assert set(setting_names(table)) == {"TeamTogether, coordination 1", "TeamTogether, coordination 2"}
+    assert set(setting_names(table, ["coordination"])) == {"TeamTogether"}
+
+
+def test_results_of_a_run(logs: Path) -> None:
+    run = find_runs(logs, ["saf"])[0]
+    with np.load(run.folder / "evaluations.npz") as arrays:
+        means = arrays["results"].mean(axis=1)
+    curve = run.curve("evaluation")
+    assert curve["game_steps"].tolist() == [80, 160]
+    assert curve["score"].tolist() == means.tolist()
+    assert run.final_score("evaluation") == means[-1]
+    training = run.curve("training")
+    pd.testing.assert_frame_equal(training_curve(run.folder), training)
+    returns = np.genfromtxt(run.folder / "monitor.csv", delimiter=",", skip_header=2)[:, 0]
+    assert training["game_steps"].iloc[-1] == 160
+    assert run.final_score("training") == returns[-2:].mean()  # of 16 episodes, those that ended after 144 steps
+
+
+def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_once(logs: Path, tmp_path: Path) -> None:
+    given = ["--size", "smoke", "-n", "40", "--eval-freq", "-1", "--seed", "0", "--verbose", "0", "-f", str(tmp_path)]
+    zoo_train.main(["--algo", "saf", *given])
+    zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
+    zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
+    table = describe(find_runs(tmp_path))
+    assert list(table["method"]) == ["saf", "saf gamma=0.9"]
+    assert [run.number for run in table["run"]] == [1, 3]
+    with pytest.raises(ValueError, match="has no evaluations"):
+        table["run"][0].curve("evaluation")
+
+
+def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None:
+    """A run's settings, as training writes them."""
+    settings = load_settings("saf", ENV, "smoke", overrides=overrides)
+    config = folder / "saf" / f"{ENV}_{number}" / ENV / "config.yml"
+    config.parent.mkdir(parents=True)
+    config.write_text(yaml.safe_dump({**settings.as_dict(), "seed": seed}))
+
+
+def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
+    fake_run(tmp_path, 1)
+    fake_run(tmp_path, 2, game_steps=80, batch_size=80)
+    many: dict[str, Any] = {"gamma": 0.9123456, "ent_coef": 0.02, "policy_kwargs": {"n_slots": 3, "n_policies": 2}}
+    fake_run(tmp_path, 3, **many)
+    fake_run(tmp_path, 4, seed=1, **many)
+    fake_run(tmp_path, 5, **{**many, "gamma": 0.8})
+    table = describe(find_runs(tmp_path))
+    assert list(table["method"]) == [
+        "saf",
+        "saf batch_size=80 game_steps=80",
+        *["saf, variant 1"] * 2,
+        "saf, variant 2",
+    ]
+    assert table["changes"][2] == "ent_coef=0.02 gamma=0.912 n_policies=2 n_slots=3"
+
+
+def test_what_all_runs_share_is_not_named(tmp_path: Path) -> None:
+    for number in (1, 2):
+        fake_run(tmp_path, number, seed=number, game_steps=80)
+    assert list(describe(find_runs(tmp_path))["method"]) == ["saf", "saf"]
+
+
+@pytest.mark.parametrize("kind", ["curves", "levels", "aggregate"])
+@pytest.mark.parametrize("source", ["evaluation", "training"])
+def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Path) -> None:
+    output = tmp_path / "new" / "figure.png"
+    algos = ["saf", "mappo"]
+    zoo_plot.main([kind, "-f", str(logs), "--algos", *algos, "--source", source, "-o", str(output)])
+    picture = imageio.imread(output)
+    assert picture.shape[0] > 300
+    assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 50
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["curves", "-f", "nowhere", "-o", "a.png"], "there is no folder nowhere"),
+        (["curves", "--env", "TeamSupport-v0", "-o", "a.png"], "there are no runs of TeamSupport-v0"),
+        (["curves", "--algos", "mapo", "-o", "a.png"], "did you mean 'mappo'"),
+        (["curves", "-o", "a.txt"], "--output must end with .png"),
+        (["levels", "--level", "cordination", "-o", "a.png"], "did you mean 'coordination'"),
+        (["aggregate", "-o", "a.png"], "aggregates"),
+        (["bars", "-o", "a.png"], "invalid choice"),
+        (["curves"], "--output"),
+        (["curves", "--algos", "saf", "-o", "/dev/null/new/a.png"], "Not a directory"),
+    ],
+)
+def test_mistakes_in_plot_are_one_line(
+    options: list[str], words: str, logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = [] if "-f" in options else ["-f", str(logs)]
+    assert words in failed(zoo_plot.main, [*options[:1], *folder, *options[1:]], capsys)
+
+
+def test_a_saved_level_can_be_changed(logs: Path) -> None:
+    run = find_runs(logs, ["saf"])[0]
+    assert saved_settings(run.config, {"heterogeneity": 3}).env_kwargs["heterogeneity"] == 3

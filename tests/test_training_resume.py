@@ -1,0 +1,143 @@
+"""``python -m sb3_saf.train --resume``: runs that were ended end as if they had not been."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+import yaml
+
+from sb3_saf.training import train as zoo_train
+from sb3_saf.training.devices import check_device
+
+pytest.importorskip("rl_zoo3.train")
+
+from sb3_saf.export.weights import _entry, _tensors
+from sb3_saf.training.callbacks import ZooEvalCallback
+from sb3_saf.training.settings import load_settings
+
+ENV = "TeamTogether-v0"
+OPTIONS = (
+    "--env",
+    ENV,
+    "--size",
+    "smoke",
+    "--eval-episodes",
+    "2",
+    "--checkpoint-freq",
+    "1",
+    "--inspect-freq",
+    "100000",
+)
+
+
+def train(folder: Path, algo: str, *options: str) -> None:
+    zoo_train.main(["--algo", algo, *OPTIONS, "-f", str(folder), "-tb", str(folder / "tb"), *options])
+
+
+def struck(monkeypatch: pytest.MonkeyPatch, error: type[BaseException], evaluation: int = 8) -> None:
+    """Let evaluations end the run in the middle of a rollout; undone by ``monkeypatch.undo()``."""
+    evaluate = ZooEvalCallback._evaluate
+
+    def strike(self: ZooEvalCallback) -> bool:
+        if self._n_evaluations == evaluation:
+            raise error
+        return evaluate(self)
+
+    monkeypatch.setattr(ZooEvalCallback, "_evaluate", strike)
+
+
+def left(run: Path) -> dict[str, Any]:
+    """What a run leaves."""
+    weights = _tensors(_entry(run / f"{ENV}.zip", 1 << 24), 1 << 24, run)
+    with np.load(run / "evaluations.npz") as arrays:
+        evaluations = {name: arrays[name].tobytes() for name in arrays.files}
+    episodes = [line.rsplit(",", 1)[0] for line in (run / "monitor.csv").read_text().splitlines()[1:]]
+    return {
+        "weights": {name: tensor.numpy().tobytes() for name, tensor in weights.items()},
+        "evaluations": evaluations,
+        "episodes": episodes,
+        "settings": (run / ENV / "config.yml").read_text(),
+    }
+
+
+@pytest.mark.parametrize("algo", ["saf", "qplex"])
+def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(tmp_path / "undisturbed", algo, "--seed", "3", "--resume")
+    assert "unfinished: a new one begins" in capsys.readouterr().out
+    for evaluation in (8, 14):
+        struck(monkeypatch, RuntimeError, evaluation)
+        with pytest.raises(RuntimeError):
+            train(tmp_path / "run", algo, "--seed", "3", "--resume")
+        monkeypatch.undo()
+    train(tmp_path / "run", algo, "--resume")  # the seed is the run's
+    assert f"Going on with {tmp_path}" in capsys.readouterr().out
+    one, other = (tmp_path / name / algo / f"{ENV}_1" for name in ("undisturbed", "run"))
+    assert left(one) == left(other) and not (other / "checkpoints").exists()
+    assert [path.name for path in (tmp_path / "run" / algo).iterdir()] == [f"{ENV}_1"]
+    assert [path.name for path in (tmp_path / "run" / "tb" / ENV).iterdir()] == [f"{algo}_1"]
+
+
+def test_ctrl_c_leaves_model_and_checkpoint_and_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    struck(monkeypatch, KeyboardInterrupt)
+    with pytest.raises(SystemExit) as ended:
+        train(tmp_path, "saf", "--seed", "3")
+    assert ended.value.code == 130
+    monkeypatch.undo()
+    run = tmp_path / "saf" / f"{ENV}_1"
+    assert (run / f"{ENV}.zip").is_file()
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("Stopped."))
+    command = line.partition("go on from there with: ")[2].removesuffix(".")
+    zoo_train.main(shlex.split(command)[3:])
+    train(tmp_path / "undisturbed", "saf", "--seed", "3")
+    assert left(run) == left(tmp_path / "undisturbed" / "saf" / f"{ENV}_1")
+
+
+def test_other_settings_begin_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    struck(monkeypatch, RuntimeError)
+    with pytest.raises(RuntimeError):
+        train(tmp_path, "saf", "--seed", "3")
+    monkeypatch.undo()
+    for number, options in enumerate((["--seed", "4"], ["--env-kwargs", "coordination:2"], ["--eval-freq", "50"]), 2):
+        train(tmp_path, "saf", "--resume", *options)
+        run = tmp_path / "saf" / f"{ENV}_{number}"
+        assert (run / f"{ENV}.zip").is_file()
+    assert yaml.safe_load((run / ENV / "args.yml").read_text())["seed"] is not None
+
+
+def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        train(tmp_path, "saf", "--hyperparams", "learning_rate:1.0e30")
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    # Where it shows first depends on the seed.
+    assert "must be finite, got nan at game step" in line or "invalid values" in line
+    assert "the last good checkpoint is" in line and "checkpoint-0" in line
+
+
+def test_resume_is_for_training(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        train(tmp_path, "saf", "--resume", "-optimize")
+    assert "--resume is for training with settings" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for device, words in (
+        ("cuda", "torch .* sees no CUDA devices"),
+        ("meat", "must be auto, cpu, cuda, .* got 'meat'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            check_device(device)
+    with pytest.raises(SystemExit):
+        train(tmp_path, "saf", "--device", "cuda:1")
+    assert "--device cuda:1 is not there" in capsys.readouterr().err
+    assert load_settings("saf", ENV, "smoke") is not None and check_device("cpu") == "cpu"

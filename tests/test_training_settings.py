@@ -1,0 +1,281 @@
+"""Settings by name: the numbers of the paper, every entry built, and what is refused."""
+
+from __future__ import annotations
+
+import configparser
+import inspect
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from stable_baselines3 import PPO
+from stable_baselines3.common.utils import LinearSchedule
+
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.seeding import game_seeds
+from sb3_saf import LightEncoder, TeamRolloutBuffer
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.seeds import MAX_SEED, evaluation_seed
+from sb3_saf.training.settings import ENV_IDS, SIZES, Settings, load_settings, saved_settings
+from sb3_saf.training.values import algorithm_arguments
+from sb3_saf.training.yaml_files import Size, load_yaml, read_config
+
+ENV = "TeamTogether-v0"
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("algo", ALGOS)
+def test_every_entry_builds_and_smoke_learns_one_rollout(algo: str, env_id: str, size: Size) -> None:
+    settings = load_settings(algo, env_id, size)
+    env = settings.make_env(0)
+    model = settings.make_model(env, 0, device="cpu")
+    assert (env.num_envs, env.n_agents) == (settings.n_envs * settings.n_agents, settings.n_agents)
+    assert type(model) is ALGOS[algo].algorithm
+    assert type(model.policy) is ALGOS[algo].policy_class
+    if size == "smoke":
+        before = [parameter.clone() for parameter in model.policy.parameters()]
+        model.learn(1)  # as many steps as a rollout has
+        assert any(not old.equal(new) for old, new in zip(before, model.policy.parameters(), strict=True))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("algo", "gae_lambda", "max_grad_norm"), [("saf", 1.0, 9.0), ("mappo", 0.95, 10.0), ("ippo", 0.95, 10.0)]
+)
+def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: float) -> None:
+    settings = load_settings(algo, ENV)
+    assert (settings.n_envs, settings.game_steps, settings.total_timesteps) == (128, 10_000_000, 100_000_000)
+    assert asdict(HECOGridParams(observation="tiles")) == settings.env_kwargs
+    assert settings.time_limit == "terminal"
+    # Constructors of the model see exactly this; the rest is their default, which is the paper's.
+    arguments = {**_defaults(PPO), **settings.hyperparams}
+    table: dict[str, Any] = {
+        "learning_rate": 7e-4,
+        "n_steps": 50,
+        "n_epochs": 10,
+        "batch_size": 128 * 50 * 10,
+        "gamma": 0.99,
+    }
+    # The paper clips values by the larger of two losses, SB3 by one of them, which ruins the critic.
+    table |= {"gae_lambda": gae_lambda, "clip_range": 0.2, "clip_range_vf": None, "normalize_advantage": True}
+    table |= {"ent_coef": 0.01, "vf_coef": 0.25, "max_grad_norm": max_grad_norm, "target_kl": None}
+    assert {key: arguments[key] for key in table} == table
+    assert arguments["rollout_buffer_class"] is TeamRolloutBuffer
+
+
+def test_paper_optimizer() -> None:
+    settings = load_settings("saf", ENV, overrides={"n_envs": 1, "n_steps": 2})
+    group = settings.make_model(settings.make_env(0), 0, device="cpu").policy.optimizer.param_groups[0]
+    assert (group["lr"], group["eps"], group["weight_decay"]) == (7e-4, 1e-5, 0)
+
+
+def _defaults(algorithm: type) -> dict[str, Any]:
+    parameters = inspect.signature(algorithm).parameters.values()
+    return {parameter.name: parameter.default for parameter in parameters}
+
+
+@pytest.mark.parametrize("config", sorted({spec.config for spec in ALGOS.values()}))
+def test_files_have_default_first_and_only_what_differs(config: str) -> None:
+    content = read_config(config)
+    assert list(content) == ["default", *ENV_IDS]
+    spec = next(spec for spec in ALGOS.values() if spec.config == config)
+    defaults = _defaults(spec.algorithm)
+    repeated = {key for key, value in content["default"].items() if key in defaults and value == defaults[key]}
+    assert repeated == set()
+
+
+def test_sizes_are_those_of_the_experiments() -> None:
+    small, smoke = (load_settings("saf", ENV, size) for size in ("small", "smoke"))
+    level = {key: small.env_kwargs[key] for key in ("n_agents", "grid_size", "n_treasures", "n_keys")}
+    assert level == {"n_agents": 5, "grid_size": 15, "n_treasures": 25, "n_keys": 8}
+    assert small.game_steps == 1_000_000
+    assert small.hyperparams["policy_kwargs"]["features_extractor_class"] is LightEncoder
+    assert smoke.game_steps <= 1000
+
+
+def test_ablations_are_arguments_of_saf() -> None:
+    saf, no_pool, no_ks = (load_settings(algo, ENV, "smoke") for algo in ("saf", "saf-no-pool", "saf-no-ks"))
+    assert no_pool.hyperparams["policy_kwargs"] == {**saf.hyperparams["policy_kwargs"], "n_policies": 1}
+    assert no_ks.hyperparams["policy_kwargs"] == {**saf.hyperparams["policy_kwargs"], "knowledge_source": False}
+    without = [{**s.hyperparams, "policy_kwargs": None} for s in (saf, no_pool, no_ks)]
+    assert without[0] == without[1] == without[2]
+
+
+def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
+    overrides = {"learning_rate": "lin_7e-4", "n_envs": 8, "n_epochs": "3", "policy_kwargs": {"n_slots": 8}}
+    settings = load_settings("saf", ENV, "small", {"coordination": 2, "n_agents": 4}, overrides)
+    assert settings.n_envs == 8
+    assert settings.hyperparams["n_epochs"] == 3
+    assert settings.hyperparams["batch_size"] == 8 * 4 * 50 // 2  # halves of a rollout, still
+    schedule = settings.hyperparams["learning_rate"]
+    assert isinstance(schedule, LinearSchedule)
+    assert schedule(0.5) == pytest.approx(3.5e-4)
+    assert settings.hyperparams["policy_kwargs"] == {"features_extractor_class": LightEncoder, "n_slots": 8}
+    assert (settings.env_kwargs["coordination"], settings.env_kwargs["grid_size"]) == (2, 15)
+
+
+def test_a_batch_size_replaces_the_number_of_minibatches() -> None:
+    assert load_settings("saf", ENV, "small", overrides={"batch_size": 500}).hyperparams["batch_size"] == 500
+    with pytest.raises(ValueError, match="say the same thing"):
+        load_settings("saf", ENV, overrides={"batch_size": 500, "n_minibatches": 2})
+
+
+def test_minibatches_are_whole_teams() -> None:
+    settings = load_settings("saf", ENV, "smoke", {"n_agents": 3}, {"n_envs": 3, "n_minibatches": 4})
+    assert settings.hyperparams["batch_size"] == 8 * 3  # 30 teams in 4 parts
+    with pytest.warns(UserWarning, match="truncated mini-batch of size 18"):  # SB3 says so, and the buffer takes it
+        model = settings.make_model(settings.make_env(0), 0)
+    model.learn(1)
+
+
+def test_layers_of_a_file(tmp_path: Path) -> None:
+    text = """
+        default: {n_envs: 2, n_steps: 10, batch_size: 40, gamma: 0.9, ent_coef: 0.1, sizes: {smoke: {ent_coef: 0.2}}}
+        TeamTogether-v0: {gamma: 0.8, ent_coef: 0.3}
+        TeamSupport-v0: {sizes: {smoke: {ent_coef: 0.4}}}
+    """
+    (tmp_path / "own.yml").write_text(text, encoding="utf-8")
+
+    def found(env_id: str, size: Size) -> tuple[float, float]:
+        hyperparams = load_settings("ippo", env_id, size, config=tmp_path / "own.yml").hyperparams
+        return hyperparams["gamma"], hyperparams["ent_coef"]
+
+    assert found("TeamTogether-v0", "small") == (0.8, 0.3)
+    assert found("TeamTogether-v0", "smoke") == (0.8, 0.2)  # sizes are the most specific
+    assert found("TeamSupport-v0", "smoke") == (0.9, 0.4)
+    assert found("KeyForTreasure-v0", "smoke") == (0.9, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"algo": "sfa"}, r"unknown algorithm 'sfa' \(did you mean 'saf'\?\)"),
+        ({"env_id": "TeamTogeter-v0"}, r"unknown environment .* \(did you mean 'TeamTogether-v0'\?\)"),
+        ({"size": "smal"}, r"unknown size 'smal' \(did you mean 'small'\?\)"),
+        ({"env_kwargs": {"coordinaton": 2}}, r"unknown parameter .* \(did you mean 'coordination'\?\)"),
+        ({"env_kwargs": {"coordination": 11}}, "coordination must be an integer from 1 to 10"),
+        ({"env_kwargs": {"grid_size": 6}}, "n_treasures must be"),
+        ({"overrides": {"learning_rat": 1}}, r"unknown setting .* \(did you mean 'learning_rate'\?\)"),
+        ({"overrides": {"n_timesteps": 1}}, "use game_steps"),
+        ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),
+        ({"overrides": {"learning_rate": "fast"}}, "learning_rate must be a number or a schedule"),
+        ({"overrides": {"learning_rate": "lin_x"}}, "learning_rate must be a number or a schedule"),
+        ({"overrides": {"gamma": float("nan")}}, "gamma must be a number"),
+        ({"overrides": {"n_steps": 1.5}}, "n_steps must be a whole number, got 1.5"),
+        ({"overrides": {"n_envs": 0}}, "n_envs must be at least 1"),
+        ({"overrides": {"n_envs": True}}, "n_envs must be a whole number"),
+        ({"overrides": {"normalize_advantage": "yes"}}, "normalize_advantage must be true or false"),
+        ({"overrides": {"time_limit": "end"}}, "time_limit must be 'terminal' or 'bootstrap'"),
+        ({"overrides": {"policy_kwargs": "dict(n_slots=8)"}}, "must be a mapping, written {key: value}, got"),
+        ({"overrides": {"policy_kwargs": {"n_policys": 2}}}, r"did you mean 'n_policies'\?"),
+        ({"overrides": {"policy_kwargs": {"selection": "mix"}}}, "selection must be 'mixture' or 'gumbel'"),
+        ({"overrides": {"policy_kwargs": {"activation_fn": "nn.Tanh"}}}, "unknown activation_fn"),
+        ({"overrides": {"rollout_buffer_class": "os.system"}}, "unknown rollout_buffer_class"),
+        (
+            {"algo": "saf-no-pool", "overrides": {"policy_kwargs": {"n_policies": 4}}},
+            "takes back what this algorithm is",
+        ),
+        ({"config": Path("nowhere.yml")}, "cannot read the settings in nowhere.yml"),
+    ],
+)
+def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_settings(**{"algo": "saf", "env_id": ENV, **change})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("default: {n_envs: 2", "not valid YAML"),
+        ("- 1", "must map 'default'"),
+        ("", "must map 'default'"),
+        ("default: 3", "'default' must map names to values"),
+        ("default: {n_envs: 2, n_envs: 3}", "'n_envs' is there twice"),
+        ("default: {sizes: {tiny: {}}}", "unknown size 'tiny'"),
+        ("default: {sizes: 3}", "'sizes' must map"),
+        ("TeamTogeter-v0: {}", "did you mean 'TeamTogether-v0'"),
+        ("default: {n_env: 2}", "did you mean 'n_envs'"),
+        ("default: {n_envs: !!python/object/apply:os.getcwd []}", "not valid YAML"),
+    ],
+)
+def test_bad_files_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.yml").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message) as error:
+        load_settings("saf", ENV, config=tmp_path / "bad.yml")
+    assert "bad.yml" in str(error.value)
+
+
+def test_equal_keys_may_be_in_different_mappings() -> None:
+    assert load_yaml("a: {x: 1}\nb: {x: 2}", "here") == {"a": {"x": 1}, "b": {"x": 2}}
+
+
+def test_settings_survive_a_file() -> None:
+    overrides = {"learning_rate": "lin_7e-4", "policy_kwargs": {"n_slots": 8, "activation_fn": "relu"}}
+    settings = load_settings("saf", ENV, "small", {"coordination": 2}, overrides)
+    again = saved_settings(yaml.safe_load(yaml.safe_dump(settings.as_dict())))
+    assert again.as_dict() == settings.as_dict()
+    assert again.hyperparams["policy_kwargs"] == settings.hyperparams["policy_kwargs"]
+    assert saved_settings(settings.as_dict(), {"coordination": 3}).env_kwargs["coordination"] == 3
+    with pytest.raises(ValueError, match="hyperparams is missing"):
+        saved_settings({key: value for key, value in settings.as_dict().items() if key != "hyperparams"})
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345, MAX_SEED])
+def test_no_run_has_the_seed_of_an_evaluation(seed: int) -> None:
+    evaluation = evaluation_seed(seed)
+    assert MAX_SEED < evaluation < 2**63
+    training = {game for run in (0, 1, seed, 12345) for game in game_seeds(run, 64)}
+    assert training.isdisjoint(game_seeds(evaluation, 64))
+
+
+def test_seeds_of_evaluations_differ_and_repeat() -> None:
+    assert len({evaluation_seed(seed) for seed in range(100)}) == 100
+    assert evaluation_seed(7) == evaluation_seed(7)
+    for bad in (-1, MAX_SEED + 1, True, 0.5):
+        with pytest.raises(ValueError, match="seed must be a whole number"):
+            evaluation_seed(bad)  # type: ignore[arg-type]
+
+
+def _first_views(settings: Settings, seed: int, evaluation: bool) -> np.ndarray:
+    observations = settings.make_env(seed, evaluation=evaluation).reset()
+    assert isinstance(observations, dict)
+    return observations["obs"]
+
+
+def test_evaluation_plays_other_games_than_training() -> None:
+    settings = load_settings("saf", ENV, "smoke")
+    assert np.array_equal(_first_views(settings, 0, False), _first_views(settings, 0, False))
+    assert not np.array_equal(_first_views(settings, 0, False), _first_views(settings, 0, True))
+
+
+def test_monitor_is_left_in_the_folder_and_time_limit_reaches_the_wrapper(tmp_path: Path) -> None:
+    settings = load_settings("saf", ENV, "smoke", overrides={"time_limit": "bootstrap"})
+    env = settings.make_env(0, monitor_dir=tmp_path / "run", n_envs=2)
+    assert (env.num_envs, env.time_limit) == (8, "bootstrap")
+    env.reset()
+    assert (tmp_path / "run" / "monitor.csv").is_file()
+    env.close()
+
+
+def test_runs_decide_what_settings_cannot_name() -> None:
+    assert {"env", "seed", "device", "verbose", "policy", "tensorboard_log"}.isdisjoint(algorithm_arguments(PPO))
+
+
+def test_every_file_is_installed_with_the_packages() -> None:
+    config = configparser.ConfigParser()
+    config.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
+    assert config["options.package_data"]["zoo_configs"] == "*.yml"
+    assert "zoo_configs*" in config["options.packages.find"]["include"].split()
+
+
+def test_settings_need_neither_rl_zoo_nor_optuna() -> None:
+    code = "import sb3_saf.training.settings, sys; print(*{name.partition('.')[0] for name in sys.modules})"
+    root = Path(__file__).parents[1]
+    result = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert {"rl_zoo3", "optuna", "matplotlib", "pandas"}.isdisjoint(result.stdout.split())

@@ -1,0 +1,171 @@
+"""``-optimize``: what is searched, finite values, one storage for several processes, and trials trained again."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3.train")
+
+import optuna
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+
+from sb3_saf import LightEncoder
+from sb3_saf.training import train as zoo_train
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.callbacks import TrialCallback
+from sb3_saf.training.sampling import sample_overrides, to_overrides
+from sb3_saf.training.settings import load_settings
+
+ENV = "TeamTogether-v0"
+SMOKE = ("--algo", "saf", "--env", ENV, "--size", "smoke", "--seed", "3", "--eval-episodes", "4")
+
+
+def tune(folder: Path, *options: str) -> optuna.Study:
+    """Tune in a journal file; one trial of 80 game steps, unless told otherwise."""
+    storage = str(folder / "study.log")
+    given = ("-optimize", "--storage", storage, "--study-name", "s", "-f", str(folder / "logs"))
+    zoo_train.main([*SMOKE, *given, "--n-trials", "1", "-n", "80", *options])
+    return load_study(storage)
+
+
+def load_study(storage: str) -> optuna.Study:
+    if storage.endswith(".log"):
+        journal = JournalFileBackend(storage)
+        return optuna.load_study(study_name="s", storage=optuna.storages.JournalStorage(journal))
+    return optuna.load_study(study_name="s", storage=storage)
+
+
+def config_of(run: Path) -> dict[str, Any]:
+    config: dict[str, Any] = yaml.safe_load((run / ENV / "config.yml").read_text())
+    return config
+
+
+def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path: Path) -> None:
+    storage = f"sqlite:///{tmp_path}/study.db"
+    given = ["-optimize", "--storage", storage, "--study-name", "s", "--n-trials", "2", "-n", "80", "-f", str(tmp_path)]
+    command = [sys.executable, "-m", "sb3_saf.train", *SMOKE, *given]
+    root = Path(__file__).parents[1]
+    workers = [subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for _ in range(2)]
+    outputs = [worker.communicate()[0].decode() for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    study = load_study(storage)
+    complete = study.get_trials(states=[TrialState.COMPLETE])
+    assert len(study.trials) == 4
+    assert complete and all(trial.value is not None and math.isfinite(trial.value) for trial in complete)
+    assert len({trial.params["learning_rate"] for trial in study.trials}) == 4  # equal seeds, other proposals
+
+    trial_options = ["--storage", storage, "--study-name", "s", "--trial-id", str(study.best_trial.number)]
+    zoo_train.main([*SMOKE, *trial_options, "-n", "80", "-f", str(tmp_path / "again")])
+    saved = config_of(tmp_path / "again" / "saf" / f"{ENV}_1")
+    expected = load_settings("saf", ENV, "smoke", overrides={**to_overrides(study.best_params), "game_steps": 80})
+    assert saved == {**expected.as_dict(), "seed": 3}
+
+
+def test_trials_are_evaluated_n_times_in_game_steps(tmp_path: Path) -> None:
+    study = tune(tmp_path, "--n-evaluations", "4", "--pruner", "none", "-n", "160")
+    (trial,) = study.trials
+    assert trial.state is TrialState.COMPLETE
+    assert sorted(trial.intermediate_values) == [1, 2, 3, 4]
+    assert trial.value == trial.intermediate_values[4]
+
+
+def test_tuning_leaves_no_run_behind(tmp_path: Path) -> None:
+    tune(tmp_path)
+    assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))
+    assert list((tmp_path / "logs").glob("saf/report_*.csv"))
+
+
+def test_an_evaluation_that_is_never_due_still_gives_a_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = TrialCallback.__init__
+
+    def never(self: TrialCallback, *args: Any, **kwargs: Any) -> None:
+        original(self, *args, **{**kwargs, "eval_freq": 10**9})
+
+    monkeypatch.setattr(TrialCallback, "__init__", never)
+    (trial,) = tune(tmp_path).trials
+    assert trial.state is TrialState.COMPLETE
+    assert trial.value is not None and math.isfinite(trial.value)
+
+
+@pytest.mark.parametrize("failure", ["unevaluated", "diverged"])
+def test_a_failed_trial_is_never_complete(
+    failure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate(self: TrialCallback) -> bool:
+        if failure == "diverged":
+            raise ValueError("NaN in the logits")
+        return True  # and last_mean_reward stays -inf
+
+    monkeypatch.setattr(TrialCallback, "_evaluate", evaluate)
+    with pytest.raises(SystemExit) as exit_:
+        tune(tmp_path)
+    assert exit_.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("python -m sb3_saf.train: error: ")
+    (trial,) = load_study(str(tmp_path / "study.log")).trials
+    assert (trial.state, trial.value) == (TrialState.PRUNED, None)
+
+
+def test_trial_zero_is_a_trial(tmp_path: Path) -> None:
+    """RL-Zoo3 takes 0 for "none"."""
+    study = tune(tmp_path)
+    options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
+    for number, trial in enumerate(("0", "best"), start=1):
+        zoo_train.main([*SMOKE, *options, "--trial-id", trial])
+        saved = config_of(tmp_path / "logs" / "saf" / f"{ENV}_{number}")["hyperparams"]
+        assert saved["learning_rate"] == study.trials[0].params["learning_rate"]
+
+
+def test_what_the_user_gives_wins_over_a_trial(tmp_path: Path) -> None:
+    tune(tmp_path)
+    options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
+    zoo_train.main([*SMOKE, *options, "--trial-id", "0", "-params", "learning_rate:0.5"])
+    assert config_of(tmp_path / "logs" / "saf" / f"{ENV}_1")["hyperparams"]["learning_rate"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--study-name", "other", "--trial-id", "0"), "there is no study 'other'"),
+        (("--study-name", "s", "--trial-id", "7"), "has no trial 7"),
+    ],
+)
+def test_unknown_studies_and_trials_are_one_line(
+    options: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    storage = str(tmp_path / "study.log")
+    optuna.create_study(study_name="s", storage=optuna.storages.JournalStorage(JournalFileBackend(storage)))
+    with pytest.raises(SystemExit) as exit_:
+        zoo_train.main([*SMOKE, "--storage", storage, "-f", str(tmp_path), *options])
+    assert exit_.value.code == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "[I " not in line]
+    assert words in line
+
+
+def _sampled(algo: str, fixed: dict[str, Any] | None = None) -> dict[str, Any]:
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    return sample_overrides(study.ask(), ALGOS[algo], fixed or {})
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_what_is_sampled_joins_the_other_settings(algo: str) -> None:
+    settings = load_settings(algo, ENV, "small", overrides=_sampled(algo))
+    policy_kwargs = settings.hyperparams["policy_kwargs"]
+    assert policy_kwargs["features_extractor_class"] is LightEncoder
+    assert policy_kwargs.items() >= dict(ALGOS[algo].policy_kwargs).items()
+    assert settings.hyperparams["learning_rate"] != 7e-4
+
+
+def test_what_is_given_is_not_searched() -> None:
+    sampled = _sampled("saf", {"learning_rate": 1e-3, "batch_size": 100, "policy_kwargs": {"n_policies": 2}})
+    assert {"learning_rate", "n_minibatches"}.isdisjoint(sampled)
+    assert list(sampled["policy_kwargs"]) == ["n_slots"]
+    assert "policy_kwargs" not in _sampled("mappo")
+    assert list(_sampled("saf-no-ks")["policy_kwargs"]) == ["n_policies"]
