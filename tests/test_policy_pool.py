@@ -14,7 +14,7 @@ from stable_baselines3.common.distributions import Distribution, make_proba_dist
 from torch import nn
 
 from sb3_saf.networks import distributions
-from sb3_saf.networks.actor import ActionHead, SinglePolicy
+from sb3_saf.networks.actor import ActionHead, ActorNetwork, SinglePolicy
 from sb3_saf.networks.distributions import (
     PoolDistribution,
     SelectedDistribution,
@@ -308,3 +308,32 @@ def test_one_policy_is_sb3s_own_distribution(space: spaces.Space[Any]) -> None:
 def equal_entropies(one: Distribution, other: Distribution) -> bool:
     first, second = one.entropy(), other.entropy()
     return first is not None and second is not None and th.equal(first, second)
+
+
+# --- who acts ---------------------------------------------------------------------------------------------------------
+
+
+def identified(kind: str, action_space: spaces.Space[Any]) -> ActorNetwork:
+    if kind == "single":
+        return SinglePolicy(6, action_space, [8], nn.Tanh, n_identities=3)
+    return PolicyPool(6, action_space, [8], nn.Tanh, 4, "mixture", 8, [8], n_identities=3)
+
+
+@pytest.mark.parametrize("kind", ["single", "pool"])
+def test_the_agents_identity_stands_beside_the_features(kind: str) -> None:
+    th.manual_seed(0)
+    actor = identified(kind, spaces.Discrete(5))
+    wide = identified(kind, spaces.Discrete(5))
+    wide.load_state_dict(actor.state_dict())
+    wide.n_identities = 0
+    features, agent = th.randn(4, 6), th.tensor([0, 2, 2, 1])
+    assert actor.reads_agent
+    assert th.equal(actor(features, agent), wide(th.cat([features, th.eye(3)[agent]], dim=1)))
+    assert not th.allclose(actor(features, agent), actor(features, 2 - agent))
+    with pytest.raises(ValueError, match="reads who acts"):
+        actor(features)
+
+
+def test_policies_of_each_agents_own_need_no_identity() -> None:
+    with pytest.raises(ValueError, match="already knows who acts"):
+        SinglePolicy(6, spaces.Discrete(5), [8], nn.Tanh, n_agents=3, n_identities=3)

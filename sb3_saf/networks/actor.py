@@ -63,18 +63,20 @@ class ActionHead(nn.Module):
         return outputs if self.log_std is None else th.cat([outputs, self.log_std.expand_as(outputs)], dim=1)
 
 
-class Actor(nn.Module, ABC):
+class ActorNetwork(nn.Module, ABC):
     """
-    Base of all actors.
+    Base of all networks that act.
 
     :param action_space: the action space
     :param reads_agent: whether ``forward`` needs the agent's index
+    :param n_identities: N if the network reads who acts, as a one-hot vector beside the features; 0 if it does not
     """
 
-    def __init__(self, action_space: spaces.Space[Any], reads_agent: bool):
+    def __init__(self, action_space: spaces.Space[Any], reads_agent: bool, n_identities: int = 0):
         super().__init__()
         self.action_space = action_space
         self.reads_agent = reads_agent
+        self.n_identities = n_identities
 
     @abstractmethod
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
@@ -93,6 +95,21 @@ class Actor(nn.Module, ABC):
 
         :param parameters: (B, P')
         """
+
+    def with_identity(self, features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
+        """
+        Put who acts beside the features, where the network reads it.
+
+        :param features: (K, d)
+        :param agent: (K,) int64 index of the agent
+        :return: (K, d + N), or the features where ``n_identities`` is 0
+        """
+        if not self.n_identities:
+            return features
+        if agent is None:
+            raise ValueError("this actor reads who acts (actor_identity): expected the agent's index of each row")
+        identity = nn.functional.one_hot(agent, self.n_identities).to(features.dtype)
+        return th.cat([features, identity], dim=1)
 
     def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
@@ -115,7 +132,7 @@ class Actor(nn.Module, ABC):
         return self.distribution(masked_parameters(self.action_space, parameters, masks))
 
 
-class SinglePolicy(Actor):
+class SinglePolicy(ActorNetwork):
     """
     One policy for all agents, or one for each (``n_agents``): the actor of IPPO and MAPPO.
 
@@ -125,6 +142,7 @@ class SinglePolicy(Actor):
     :param activation_fn: activation of the hidden layers
     :param log_std_init: first log standard deviation, Box actions only
     :param n_agents: N for one policy per agent; None for one that all share
+    :param n_identities: N if a shared policy reads who acts, as a one-hot vector beside the features
     """
 
     def __init__(
@@ -135,19 +153,28 @@ class SinglePolicy(Actor):
         activation_fn: type[nn.Module],
         log_std_init: float = 0.0,
         n_agents: int | None = None,
+        n_identities: int = 0,
     ):
-        super().__init__(action_space, reads_agent=n_agents is not None)
+        if n_agents is not None and n_identities:
+            raise ValueError(
+                "one policy per agent already knows who acts; leave the agent's identity out, or let all agents share "
+                "one policy (heads='shared')"
+            )
+        super().__init__(action_space, n_agents is not None or n_identities > 0, n_identities)
 
         def make_head() -> ActionHead:
-            return ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init)
+            return ActionHead(features_dim + n_identities, action_space, hidden, activation_fn, log_std_init)
 
         self.head: ActionHead | AgentHeads = make_head() if n_agents is None else AgentHeads(make_head, n_agents)
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`Actor`; (K, d) to (K, P)."""
-        result: th.Tensor = self.head(features, agent) if self.reads_agent else self.head(features)
+        """See :class:`ActorNetwork`; (K, d) to (K, P)."""
+        if isinstance(self.head, AgentHeads):
+            of_agents: th.Tensor = self.head(features, agent)
+            return of_agents
+        result: th.Tensor = self.head(self.with_identity(features, agent))
         return result
 
     def distribution(self, parameters: th.Tensor) -> Distribution:
-        """See :class:`Actor`; SB3's own distribution for the action space."""
+        """See :class:`ActorNetwork`; SB3's own distribution for the action space."""
         return distribution_of(self.action_space, parameters)

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
-from sb3_saf.networks.actor import ActionHead, Actor
+from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.distributions import (
     SelectedDistribution,
     distribution_of,
@@ -43,7 +43,7 @@ class PoolOutput(NamedTuple):
     actions: th.Tensor
 
 
-class PolicyPool(Actor):
+class PolicyPool(ActorNetwork):
     """
     U policies, of which one is chosen for each observation: weights = softmax(q . k_u / sqrt(d)), q = g_psel(z).
 
@@ -65,6 +65,7 @@ class PolicyPool(Actor):
     :param latent_dim: d, size of queries and signature keys
     :param projection_hidden: sizes of the hidden layers of g_psel
     :param log_std_init: first log standard deviation, Box actions only
+    :param n_identities: N if choice and policies read who acts, as a one-hot vector beside z; 0 if they do not
     """
 
     def __init__(
@@ -78,8 +79,10 @@ class PolicyPool(Actor):
         latent_dim: int,
         projection_hidden: Sequence[int],
         log_std_init: float = 0.0,
+        n_identities: int = 0,
     ):
-        super().__init__(action_space, reads_agent=False)
+        super().__init__(action_space, n_identities > 0, n_identities)
+        features_dim += n_identities
         self.selection = selection
         self.n_policies = n_policies
         self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
@@ -88,41 +91,43 @@ class PolicyPool(Actor):
             ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init) for _ in range(n_policies)
         )
 
-    def evaluate(self, features: th.Tensor) -> PoolOutput:
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """
         Ask every policy and weigh them.
 
         :param features: (K, d)
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
         :return: log weights (K, U) and action parameters (K, U, P)
         """
+        features = self.with_identity(features, agent)
         logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
         return PoolOutput(logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1))
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
-        See :class:`Actor`.
+        See :class:`ActorNetwork`.
 
         :param features: (K, d)
-        :param agent: not read
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
         :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
         """
         if self._is_categorical_mixture:
-            return mixture_log_probs(*self.evaluate(features))
-        return self.unmixed(features)
+            return mixture_log_probs(*self.evaluate(features, agent))
+        return self.unmixed(features, agent)
 
     def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`Actor`; (K, d) to (K, U + U P) weights and parameters."""
-        log_weights, actions = self.evaluate(features)
+        """See :class:`ActorNetwork`; (K, d) to (K, U + U P) weights and parameters."""
+        log_weights, actions = self.evaluate(features, agent)
         return th.cat([log_weights, actions.flatten(1)], dim=1)
 
     def distribution(self, parameters: th.Tensor) -> Distribution:
-        """See :class:`Actor`."""
+        """See :class:`ActorNetwork`."""
         if self._is_categorical_mixture:
             return distribution_of(self.action_space, parameters)
         return self._of_pool(self._split(parameters))
 
     def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
-        """See :class:`Actor`; masked first, then mixed, so that masks leave the choice among policies as it is."""
+        """See :class:`ActorNetwork`; masked before they are mixed, so that masks leave the choice of a policy as it is."""
         log_weights, actions = self._split(parameters)
         return self._of_pool(PoolOutput(log_weights, masked_parameters(self.action_space, actions, masks)))
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.envs.teams import STATE_KEY
-from sb3_saf.networks.actor import ActionHead, Actor
+from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.gather import take_of_agents
@@ -77,7 +77,7 @@ class TeamPolicy(TeamRowsPolicy):
     #: The algorithm: which actor and critic to make.
     parts_class: ClassVar[type[TeamParts]]
 
-    actor: Actor
+    actor: ActorNetwork
     value_net: OwnValueHead | TeamCritic | StateCritic
     value_normalizer: ValueNormalizer | None
     features_dim: int
@@ -149,7 +149,7 @@ class TeamPolicy(TeamRowsPolicy):
         kwargs = _with_fused_steps(self.optimizer_class, self.optimizer_kwargs)
         self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **kwargs)  # type: ignore[call-arg]
 
-    def _make_actor(self) -> Actor:
+    def _make_actor(self) -> ActorNetwork:
         return self.parts.actor(self._network_spec())
 
     def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic:

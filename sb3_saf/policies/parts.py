@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.networks.actor import Actor, SinglePolicy
+from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
 
 #: What a critic may read: the agent's own part, the whole team's, or the state of the game.
@@ -58,7 +58,7 @@ class TeamParts(ABC):
     def __post_init__(self) -> None:
         check_choice("heads", self.heads, get_args(Heads))
 
-    def actor(self, spec: NetworkSpec) -> Actor:
+    def actor(self, spec: NetworkSpec) -> ActorNetwork:
         """Make the actor."""
         return SinglePolicy(
             spec.features_dim,

@@ -18,7 +18,7 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.networks.actor import Actor
+from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.gather import take, take_of_agents
 from sb3_saf.networks.views import OwnViews
@@ -120,7 +120,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         # After this, sb3-contrib makes the actor's LSTM. The critic comes last, see the base class.
         self._build_actor()
 
-    def _make_actor(self) -> Actor:
+    def _make_actor(self) -> ActorNetwork:
         return self.parts.actor(self._network_spec()._replace(features_dim=self.lstm_output_dim))
 
     def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic | RecurrentCritic:  # type: ignore[override]

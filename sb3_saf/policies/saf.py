@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, get_args
 
-from sb3_saf.networks.actor import Actor
+from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.policy_pool import PolicyPool, Selection
 from sb3_saf.policies.base import TeamActorCriticPolicy
@@ -51,7 +51,7 @@ class SAFParts(MAPPOParts):
         # Saved models may bring a list.
         object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
 
-    def actor(self, spec: NetworkSpec) -> Actor:
+    def actor(self, spec: NetworkSpec) -> ActorNetwork:
         """The policy pool; with a single policy there is nothing to select, and the actor is MAPPO's."""
         if self.n_policies == 1:
             return super().actor(spec)

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.networks.actor import Actor
+from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.distributions import policy_parameters
 from sb3_saf.networks.policy_pool import PolicyPool, draw_policy
 
@@ -19,7 +19,7 @@ Memory = tuple[th.Tensor, th.Tensor]
 
 
 def q_values(
-    actor: Actor, latents: th.Tensor, agent: th.Tensor | None, masks: th.Tensor | None = None, draw: bool = False
+    actor: ActorNetwork, latents: th.Tensor, agent: th.Tensor | None, masks: th.Tensor | None = None, draw: bool = False
 ) -> th.Tensor:
     """
     Q_i of every action.

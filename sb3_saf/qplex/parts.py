@@ -9,7 +9,7 @@ from typing import get_args
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.networks.actor import Actor, SinglePolicy
+from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.parts import check_at_least_one, check_choice
@@ -70,7 +70,7 @@ class QPLEXParts:
         action_space: spaces.Discrete,
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
-    ) -> Actor:
+    ) -> ActorNetwork:
         """The Q heads: an actor whose logits are Q values."""
         if self.n_policies == 1:
             heads = n_agents if self.heads == "per_agent" else None

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.envs.teams import Array
-from sb3_saf.networks.actor import Actor
+from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.gather import take
 from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
@@ -42,7 +42,7 @@ class QNetworks(NamedTuple):
 
     encoder: nn.Module
     memory: AgentMemory | None
-    actor: Actor
+    actor: ActorNetwork
     mixer: Mixer
     state_encoder: nn.Module | None
 
@@ -78,7 +78,7 @@ class QPLEXPolicy(TeamRowsPolicy):
 
     action_space: spaces.Discrete
     features_extractor: BaseFeaturesExtractor
-    actor: Actor
+    actor: ActorNetwork
     memory: AgentMemory | None
     state_encoder: nn.Module | None
 
