@@ -8,6 +8,8 @@ JOBS ?= 2
 
 VENV = .venv
 RUN = $(VENV)/bin/python -m
+# What training needs, and everything: linters, Sphinx, Ray, notebooks, ...
+TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
 BASELINES = $(VENV)/.baselines
 
@@ -17,7 +19,7 @@ help: ## this list (the default)
 	@echo "make TARGET, with TARGET one of"
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 16
 
-train: $(INSTALLED) ## train SAF on TeamSupport, compare it with a random team, leave model, curve and GIF
+train: $(TRAINING) ## train SAF on TeamSupport, compare it with a random team, leave model, curve and GIF
 	@$(RUN) sb3_saf.quickstart
 
 test: $(INSTALLED) ## run the tests
@@ -59,18 +61,23 @@ format: $(INSTALLED) ## format the code and repair what ruff can repair
 	@$(RUN) ruff check --fix-only --quiet .
 	@$(RUN) ruff format .
 
-install: $(INSTALLED) ## only set up .venv
+install: $(INSTALLED) ## only set up .venv, with everything
 
 # Repeated when one of these files changes; an interrupted installation leaves no stamp and is continued.
-$(INSTALLED): setup.cfg pyproject.toml constraints.txt
+$(TRAINING): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
 	    echo "'$(PYTHON)' is not Python 3.10 or newer. Name one that is: make PYTHON=python3.12 ..." >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || { \
 	    echo "'$(PYTHON)' cannot make virtual environments. On Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
-	@echo "== install into $(VENV) (some minutes the first time)"
+	@echo "== install what training needs into $(VENV) (about a minute the first time)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
-	@$(RUN) pip install --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,notebooks,dev]'
+	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[render]'
+	@touch $@
+
+$(INSTALLED): $(TRAINING)
+	@echo "== install the rest into $(VENV): tests, types, documentation, notebooks, Ray"
+	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,notebooks,dev]'
 	@touch $@
 
 # What cannot be installed is left out of the benchmarks, which say so.

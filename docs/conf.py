@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import shutil
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -16,9 +17,13 @@ project = "sb3-saf"
 author = "sb3-saf contributors"
 copyright = f"2026, {author}"
 
-extensions = ["docs.mathml", "myst_parser", "sphinx.ext.autodoc"]
+extensions = ["docs.mathml", "myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton"]
 html_math_renderer = "mathml"
-source_suffix = {".md": "markdown"}
+# Notebooks are pages with the outputs that they are stored with; `make notebooks` runs them.
+nb_execution_mode = "off"
+nb_merge_streams = True
+copybutton_prompt_text = ">>> |... |$ "
+copybutton_prompt_is_regexp = False
 exclude_patterns = ["tools"]
 html_theme = "furo"
 html_title = "sb3-saf"
@@ -68,7 +73,18 @@ def _drop_markdown_docstrings(
         lines[:] = [lines[0], "", "Its page is under *Environments*.", ""]
 
 
+def _copy_pages() -> None:
+    """Copy the pages that live outside this folder into it: Sphinx reads no others."""
+    tutorials = ROOT / "docs" / "tutorials"
+    tutorials.mkdir(exist_ok=True)
+    for source in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        shutil.copyfile(source, tutorials / source.name)
+    shutil.copyfile(ROOT / "notebooks" / "README.md", tutorials / "README.md")
+    shutil.copyfile(ROOT / "CHANGELOG.md", ROOT / "docs" / "changelog.md")
+
+
 def setup(app: Sphinx) -> None:
-    """Register the two functions above."""
+    """Copy pages and register the two functions above."""
+    _copy_pages()
     app.connect("source-read", _insert_docstrings)
     app.connect("autodoc-process-docstring", _drop_markdown_docstrings)

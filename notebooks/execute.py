@@ -110,7 +110,7 @@ def tidied(notebook: NotebookNode) -> NotebookNode:
     notebook.metadata = nbformat.from_dict(
         {
             "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-            "language_info": {"name": "python"},
+            "language_info": {"name": "python", "pygments_lexer": "ipython3"},
         }
     )
     for index, cell in enumerate(notebook.cells):
