@@ -360,7 +360,7 @@ def test_values_do_not_depend_on_what_idle_agents_see_and_theirs_are_zero(kind: 
     other["obs"] = th.where(idle.unsqueeze(1), 0.77, obs["obs"])
     th.testing.assert_close(policy.predict_values(other), values, rtol=0, atol=1e-6)
     th.testing.assert_close(policy.forward(other)[1], values, rtol=0, atol=1e-6)
-    slow = make_policy(kind, heads=heads, distinct=False)
+    slow = make_policy(kind, heads=heads, encode_once=False)
     th.testing.assert_close(slow.predict_values(obs), values, rtol=1e-5, atol=1e-6)
 
 

@@ -541,7 +541,7 @@ def test_naive_encoding_gives_the_same_loss_and_gradients(kind: str, family: str
     obs, results = team_rows(VECTOR, n_games=10), []
     weights = th.randn(3, 30, generator=th.Generator().manual_seed(5))
     actions = th.randint(3, (30,), generator=th.Generator().manual_seed(6))
-    for settings in ({"chunk_size": 3}, {"chunk_size": None, "distinct": False}):
+    for settings in ({"chunk_size": 3}, {"chunk_size": None, "encode_once": False}):
         policy = make_policy(f"{family}{kind}Policy", **settings, **kwargs)
         th.manual_seed(5)
         values, log_prob, entropy = evaluate(policy, obs, actions)

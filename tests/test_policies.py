@@ -193,7 +193,7 @@ def test_naive_encoding_gives_the_same_loss_and_gradients(
     policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], own: spaces.Space[Any]
 ) -> None:
     policy = make_policy(policy_class, own, chunk_size=3, **kwargs)
-    naive = make_policy(policy_class, own, chunk_size=None, distinct=False, **kwargs)
+    naive = make_policy(policy_class, own, chunk_size=None, encode_once=False, **kwargs)
     naive.load_state_dict(policy.state_dict())
     obs = team_rows(own, n_games=10)
     for rows in (th.arange(30), th.randperm(30)[:17], th.tensor([4])):
@@ -684,11 +684,11 @@ def test_model_saves_loads_and_continues(tmp_path: Path) -> None:
 def test_policy_saves_and_loads(
     policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], tmp_path: Path
 ) -> None:
-    policy = make_policy(policy_class, CodeSpace(), distinct=False, chunk_size=5, **kwargs)
+    policy = make_policy(policy_class, CodeSpace(), encode_once=False, chunk_size=5, **kwargs)
     policy.save(str(tmp_path / "policy"))
     loaded = policy_class.load(str(tmp_path / "policy"), device="cpu")
     assert equal_weights(policy, loaded)
-    assert (loaded.parts, loaded.distinct, loaded.chunk_size) == (policy.parts, False, 5)
+    assert (loaded.parts, loaded.encode_once, loaded.chunk_size) == (policy.parts, False, 5)
     obs = team_rows(CodeSpace())
     assert th.equal(loaded.predict_values(obs), policy.predict_values(obs))
 

@@ -144,9 +144,9 @@ def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
 @pytest.mark.parametrize("kind", ["features", "all"])
 def test_distinct_views_give_the_numbers_of_every_row(policy: str, kind: str) -> None:
     errors = []
-    for distinct in (True, False):
+    for encode_once in (True, False):
         env = telling_env() if kind == "all" else ToyTeams()
-        model = make_model(env, policy, policy_kwargs={"distinct": distinct})
+        model = make_model(env, policy, policy_kwargs={"encode_once": encode_once})
         model.learn(30 * 3)
         th.manual_seed(5)
         np.random.seed(5)  # noqa: NPY002

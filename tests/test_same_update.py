@@ -34,12 +34,12 @@ def updated(
     own: spaces.Space[Any],
     action_space: spaces.Space[Any],
     buffer_class: type[DictRolloutBuffer] | None,
-    distinct: bool,
+    encode_once: bool,
 ) -> PPO:
     """A model that collected one rollout of 120 rows and took one step on all of it."""
     sizes: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}, "chunk_size": 7}
-    if not distinct:
-        sizes |= {"distinct": False, "chunk_size": None}
+    if not encode_once:
+        sizes |= {"encode_once": False, "chunk_size": None}
     model = PPO(
         policy_class,
         ToyTeams(own, action_space),

@@ -14,7 +14,7 @@ from typing import Literal, cast
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.gather import take
+from sb3_saf.networks.gather import gather
 from sb3_saf.networks.layers import AgentHeads, mlp
 
 #: One head for all agents, or one for each.
@@ -76,7 +76,7 @@ class JointStates(TeamStates):
 
     def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`; agents that take no part are read as zeros."""
-        members = take(features, teams) if self.members is None else self.members.states(features, teams, active)
+        members = gather(features, teams) if self.members is None else self.members.states(features, teams, active)
         return self.join(members, active)
 
     def join(self, members: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 
 
-def take(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
+def gather(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
     """
     ``x[rows]``, with a gradient that is the same every time.
 
@@ -19,13 +19,13 @@ def take(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
     return x.index_select(0, rows.flatten()).view(*rows.shape, *x.shape[1:])
 
 
-def take_of_agents(x: th.Tensor, teams: th.Tensor, agent: th.Tensor) -> th.Tensor:
+def gather_agents(x: th.Tensor, teams: th.Tensor, agent: th.Tensor) -> th.Tensor:
     """
-    ``x[teams, agent]``, see :func:`take`.
+    ``x[teams, agent]``, see :func:`gather`.
 
     :param x: (G, N, *shape)
     :param teams: (B,) int64
     :param agent: (B,) int64
     :return: (B, *shape)
     """
-    return take(x.flatten(0, 1), teams * x.shape[1] + agent)
+    return gather(x.flatten(0, 1), teams * x.shape[1] + agent)

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.gather import take
+from sb3_saf.networks.gather import gather
 
 HIDDEN_GAIN: Final = math.sqrt(2)
 
@@ -112,11 +112,11 @@ class AgentHeads(nn.Module):
         """
         order = agent.argsort(stable=True)
         counts = th.bincount(agent, minlength=len(self.heads)).tolist()
-        parts = th.split(take(x, order), counts)
+        parts = th.split(gather(x, order), counts)
         by_agent = th.cat([head(part) for head, part in zip(self.heads, parts, strict=True)])
         position = th.empty_like(order)
         position[order] = th.arange(len(order), device=order.device)
-        return take(by_agent, position)
+        return gather(by_agent, position)
 
 
 class Attended(NamedTuple):

@@ -20,7 +20,7 @@ _WORD: Final = 8  # bytes in a machine word
 _HASH_CHUNK_BYTES: Final = 1 << 26
 
 
-class Distinct(NamedTuple):
+class UniqueRows(NamedTuple):
     """
     The distinct rows of a batch, in order of first appearance: ``x[index][inverse]`` equals ``x``.
 
@@ -32,7 +32,7 @@ class Distinct(NamedTuple):
     inverse: th.Tensor
 
 
-def distinct_rows(x: th.Tensor) -> Distinct:
+def unique_rows(x: th.Tensor) -> UniqueRows:
     """
     Find the distinct rows of a batch. Exact: hashes only propose what bytes then confirm.
 
@@ -41,19 +41,19 @@ def distinct_rows(x: th.Tensor) -> Distinct:
     """
     x = x.detach()
     if x.device.type == "cpu":
-        return _distinct_on_cpu(_bytes_of_rows(x))
-    return _distinct_on_device(_bytes_of_rows(x))
+        return _unique_on_cpu(_bytes_of_rows(x))
+    return _unique_on_device(_bytes_of_rows(x))
 
 
-def every_row(x: th.Tensor) -> Distinct:
+def every_row(x: th.Tensor) -> UniqueRows:
     """
-    Take every row for a distinct one: the naive counterpart of :func:`distinct_rows`.
+    Take every row for a distinct one: the naive counterpart of :func:`unique_rows`.
 
     :param x: (B, ...)
     :return: index and inverse 0..B-1
     """
     rows = th.arange(len(x), device=x.device)
-    return Distinct(rows, rows)
+    return UniqueRows(rows, rows)
 
 
 def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
@@ -71,14 +71,14 @@ def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
 # --- CPU: one pass with an open-addressing hash table -----------------------------------------------------------------
 
 
-def _distinct_on_cpu(rows: th.Tensor) -> Distinct:
+def _unique_on_cpu(rows: th.Tensor) -> UniqueRows:
     words = np.require(rows.numpy(), requirements="A").view(np.uint64)
     index = np.empty(len(words), dtype=np.int64)
     inverse = np.empty(len(words), dtype=np.int64)
     # At most half full, so that probing stays short; a power of two, so that masking replaces the remainder.
     table = np.full(1 << max(2, 2 * len(words) - 1).bit_length(), -1, dtype=np.int32)
-    count = _find_distinct(words, table, np.empty(len(words), dtype=np.uint64), index, inverse)
-    return Distinct(th.from_numpy(index[:count].copy()), th.from_numpy(inverse))
+    count = _find_unique(words, table, np.empty(len(words), dtype=np.uint64), index, inverse)
+    return UniqueRows(th.from_numpy(index[:count].copy()), th.from_numpy(inverse))
 
 
 @njit(cache=True, nogil=True)
@@ -129,7 +129,7 @@ def _equal_rows(words: npt.NDArray[np.uint64], row: int, other: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _find_distinct(
+def _find_unique(
     words: npt.NDArray[np.uint64],
     table: npt.NDArray[np.int32],
     hashes: npt.NDArray[np.uint64],
@@ -165,7 +165,7 @@ def _find_distinct(
 # --- other devices: 64-bit hashes, sorted, then every row compared with the one that stands for it ------------------
 
 
-def _distinct_on_device(rows: th.Tensor) -> Distinct:
+def _unique_on_device(rows: th.Tensor) -> UniqueRows:
     """Works on any device, the CPU included."""
     words = rows.view(th.int64)
     proposal = _in_order_of_appearance(*th.unique(_hash_words(words), return_inverse=True))
@@ -190,7 +190,7 @@ def _mix(x: th.Tensor) -> th.Tensor:
     return x ^ (x >> 32)
 
 
-def _in_order_of_appearance(values: th.Tensor, inverse: th.Tensor) -> Distinct:
+def _in_order_of_appearance(values: th.Tensor, inverse: th.Tensor) -> UniqueRows:
     """Renumber the sorted groups of ``th.unique`` by their first member."""
     inverse = inverse.reshape(-1)
     rows = th.arange(len(inverse), device=inverse.device)
@@ -198,10 +198,10 @@ def _in_order_of_appearance(values: th.Tensor, inverse: th.Tensor) -> Distinct:
     index, order = first.sort()
     rank = th.empty_like(order)
     rank[order] = th.arange(len(order), device=order.device)
-    return Distinct(index, rank[inverse])
+    return UniqueRows(index, rank[inverse])
 
 
-def _confirmed(words: th.Tensor, proposal: Distinct) -> bool:
+def _confirmed(words: th.Tensor, proposal: UniqueRows) -> bool:
     rows_at_once = max(1, _HASH_CHUNK_BYTES // (words.shape[1] * _WORD))
     stands_for = proposal.index[proposal.inverse]
     same: Any = words.new_ones((), dtype=th.bool)

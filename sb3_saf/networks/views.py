@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import torch as th
 
-from sb3_saf.networks.gather import take
-from sb3_saf.networks.unique import distinct_rows, every_row
+from sb3_saf.networks.gather import gather
+from sb3_saf.networks.unique import every_row, unique_rows
 
 
 class OwnViews(NamedTuple):
@@ -53,12 +53,12 @@ class ViewEncoder:
     Encodes the views of a batch, each distinct one once.
 
     :param encode: (K, *shape) observations to (K, d) features
-    :param distinct: False takes every row for a distinct one, which gives the same numbers slowly
+    :param encode_once: False takes every row for a distinct one, which gives the same numbers slowly
     """
 
-    def __init__(self, encode: Callable[[th.Tensor], th.Tensor], distinct: bool = True):
+    def __init__(self, encode: Callable[[th.Tensor], th.Tensor], encode_once: bool = True):
         self.encode = encode
-        self.find = distinct_rows if distinct else every_row
+        self.find = unique_rows if encode_once else every_row
 
     def own(self, observations: th.Tensor) -> OwnViews:
         """
@@ -110,7 +110,7 @@ class ViewEncoder:
         :return: (B, ...)
         """
         if agent is None:
-            return take(module(views.features, None), views.rows)
+            return gather(module(views.features, None), views.rows)
         pairs = self.find(th.stack([views.rows, agent], dim=1))
-        of_pairs = module(take(views.features, views.rows[pairs.index]), agent[pairs.index])
-        return take(of_pairs, pairs.inverse)
+        of_pairs = module(gather(views.features, views.rows[pairs.index]), agent[pairs.index])
+        return gather(of_pairs, pairs.inverse)

@@ -27,12 +27,12 @@ from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.encoders import ObservationEncoder
-from sb3_saf.networks.gather import take_of_agents
+from sb3_saf.networks.gather import gather_agents
 from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.networks.views import OwnViews
 from sb3_saf.policies.parts import NetworkSpec, TeamParts
-from sb3_saf.policies.rows import TeamRowsPolicy, entry_of, take_named
+from sb3_saf.policies.rows import TeamRowsPolicy, entry_of, pop_named
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -60,7 +60,7 @@ class TeamPolicy(TeamRowsPolicy):
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
-    :param distinct: False encodes every row, which gives the same numbers slowly
+    :param encode_once: False encodes every row, which gives the same numbers slowly
     :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
         ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. Values that the policy
@@ -95,7 +95,7 @@ class TeamPolicy(TeamRowsPolicy):
         lr_schedule: Schedule,
         net_arch: NetArch | None = None,
         *,
-        distinct: bool = True,
+        encode_once: bool = True,
         chunk_size: int | None = 512,
         normalize_values: bool = False,
         use_sde: bool = False,
@@ -105,9 +105,9 @@ class TeamPolicy(TeamRowsPolicy):
         **kwargs: Any,
     ):
         _refuse(use_sde=use_sde, share_features_extractor=share_features_extractor)
-        self._read_rows_of(observation_space, action_space, distinct, chunk_size)
+        self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
         self._warned_of_idle_rows = False
-        self.parts = self.parts_class(**take_named(kwargs, {field.name for field in fields(self.parts_class)}))
+        self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
         if normalize_values and not self.normalizes_values:
             raise ValueError(
                 f"normalize_values=True needs TeamRolloutBuffer, which the algorithms of {type(self).__name__} do not "
@@ -172,7 +172,7 @@ class TeamPolicy(TeamRowsPolicy):
         data = super()._get_constructor_parameters()
         for name in _SDE_ARGUMENTS:
             data.pop(name, None)
-        own = {name: getattr(self, name) for name in ("distinct", "chunk_size", "normalize_values")}
+        own = {name: getattr(self, name) for name in ("encode_once", "chunk_size", "normalize_values")}
         return data | asdict(self.parts) | own
 
     @property
@@ -237,7 +237,7 @@ class TeamPolicy(TeamRowsPolicy):
         if isinstance(critic, TeamCritic):
             views = self.views.teams(self._team(obs), own, active)
             of_teams = critic(views.features, views.teams, views.active)
-            values = take_of_agents(of_teams, views.rows, self._agent(obs))
+            values = gather_agents(of_teams, views.rows, self._agent(obs))
         elif isinstance(critic, StateCritic):
             values = self._values_of_states(obs, critic)
         else:
@@ -261,7 +261,7 @@ class TeamPolicy(TeamRowsPolicy):
         states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
         found = self.views.find(states)
         values = self._in_chunks(critic, states[found.index], space)
-        return take_of_agents(values, found.inverse, self._agent(obs))
+        return gather_agents(values, found.inverse, self._agent(obs))
 
 
 def _with_fused_steps(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any]) -> dict[str, Any]:

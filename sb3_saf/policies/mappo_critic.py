@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_saf.networks.critic import Heads, JointValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.encoders import ObservationEncoder
-from sb3_saf.networks.gather import take
+from sb3_saf.networks.gather import gather
 
 
 class JointCritic(TeamCritic):
@@ -40,7 +40,7 @@ class JointCritic(TeamCritic):
 
     def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; features of agents that take no part are read as zeros."""
-        members = take(features, teams)
+        members = gather(features, teams)
         if active is not None:
             members = members * active.unsqueeze(2)
         values: th.Tensor = self.value_head(members)

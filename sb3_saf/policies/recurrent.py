@@ -20,7 +20,7 @@ from torch import nn
 
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
-from sb3_saf.networks.gather import take, take_of_agents
+from sb3_saf.networks.gather import gather, gather_agents
 from sb3_saf.networks.views import OwnViews
 from sb3_saf.policies.base import NetArch, TeamPolicy
 from sb3_saf.policies.ippo import IPPOParts
@@ -227,7 +227,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     def _recall_distribution(
         self, obs: PyTorchObs, own: OwnViews, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> tuple[Distribution, LstmStates]:
-        latent, states = self._process(take(own.features, own.rows), lstm_states, episode_starts, self.lstm_actor)
+        latent, states = self._process(gather(own.features, own.rows), lstm_states, episode_starts, self.lstm_actor)
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs, padded=True)
         if masks is None:
@@ -248,9 +248,9 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         """(B, S)"""
         if critic.team_states is None:
             own = self.views.own(self._own(obs)) if own is None else own
-            return take(own.features, own.rows)
+            return gather(own.features, own.rows)
         views = self.views.teams(self._team(obs), own, self._active(obs))
-        return take_of_agents(
+        return gather_agents(
             critic.team_states.states(views.features, views.teams, views.active), views.rows, self._agent(obs)
         )
 

@@ -21,7 +21,7 @@ from sb3_saf.envs.teams import (
     TEAM_KEY,
     TeamSpaces,
 )
-from sb3_saf.networks.gather import take
+from sb3_saf.networks.gather import gather
 from sb3_saf.networks.views import ViewEncoder
 from sb3_saf.policies.parts import check_at_least_one
 
@@ -45,14 +45,14 @@ class TeamRowsPolicy(BasePolicy):
 
     team_spaces: TeamSpaces
     views: ViewEncoder
-    distinct: bool
+    encode_once: bool
     chunk_size: int | None
 
     def _read_rows_of(
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        distinct: bool,
+        encode_once: bool,
         chunk_size: int | None,
     ) -> None:
         """
@@ -61,7 +61,7 @@ class TeamRowsPolicy(BasePolicy):
         :param observation_space: Dict of ``obs``, ``team``, ``agent``, and perhaps ``active``, ``action_mask``,
             ``state``
         :param action_space: one agent's action space
-        :param distinct: False encodes every row, which gives the same numbers slowly
+        :param encode_once: False encodes every row, which gives the same numbers slowly
         :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
         :raises ValueError: if the space is not that of a team
         """
@@ -70,8 +70,8 @@ class TeamRowsPolicy(BasePolicy):
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
         _check_masks(self.team_spaces, action_space)
         self.chunk_size = chunk_size
-        self.distinct = distinct
-        self.views = ViewEncoder(self._encode, distinct)
+        self.encode_once = encode_once
+        self.views = ViewEncoder(self._encode, encode_once)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Make the encoder, for the observations of one agent."""
@@ -88,7 +88,7 @@ class TeamRowsPolicy(BasePolicy):
         if features_extractor is not None and features_extractor is not self.features_extractor:
             raise ValueError("a team policy encodes with its own features_extractor; call the other extractor directly")
         own = self.views.own(self._own(obs))
-        return take(own.features, own.rows)
+        return gather(own.features, own.rows)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
@@ -199,6 +199,6 @@ def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
     return obs[key]
 
 
-def take_named(kwargs: dict[str, Any], names: set[str]) -> dict[str, Any]:
+def pop_named(kwargs: dict[str, Any], names: set[str]) -> dict[str, Any]:
     """Take named entries out of ``kwargs``."""
     return {name: kwargs.pop(name) for name in list(kwargs) if name in names}

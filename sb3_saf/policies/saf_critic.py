@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_saf.networks.critic import Heads, JointValueHead, OwnValueHead, TeamCritic, TeamStates
-from sb3_saf.networks.gather import take
+from sb3_saf.networks.gather import gather
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
 from sb3_saf.networks.layers import mlp
 from sb3_saf.policies.parts import CriticInput
@@ -70,7 +70,7 @@ class SAFStates(TeamStates):
         :param active: (G, N) bool, agents that take part; all if None
         """
         # g_theta and g_omega depend on one view only: once per view, then gathered.
-        messages, states = take(self.message_net(features), teams), take(self.state_net(features), teams)
+        messages, states = gather(self.message_net(features), teams), gather(self.state_net(features), teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
 
     def combine(self, states: th.Tensor, read: th.Tensor) -> th.Tensor:

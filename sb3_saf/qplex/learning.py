@@ -14,8 +14,8 @@ import torch as th
 from torch import nn
 
 from sb3_saf.buffers.replay import Sequences, TeamReplaySamples, TeamSteps
-from sb3_saf.networks.gather import take
-from sb3_saf.networks.unique import Distinct
+from sb3_saf.networks.gather import gather
+from sb3_saf.networks.unique import UniqueRows
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.mixers import JointChoice, Mixed
 from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
@@ -72,7 +72,7 @@ class _Views(NamedTuple):
         """Find them."""
         shape = samples.now.own.shape[:2]
         both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
-        found: Distinct = policy.views.find(both)
+        found: UniqueRows = policy.views.find(both)
         now, after = found.inverse.view(2, *shape)
         return cls(both[found.index], now, after, int(now.max()) + 1)
 
@@ -123,7 +123,7 @@ def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
     with th.no_grad():
         new = views.views[views.n_now :]
         every = known.detach() if not len(new) else th.cat([known.detach(), policy.encode_with(encoder, new)])
-    features = Features(take(known, views.now), take(every, views.after))
+    features = Features(gather(known, views.now), gather(every, views.after))
     return features, _recall(policy.online, features, samples)
 
 
@@ -132,10 +132,10 @@ def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
     networks = policy.target
     if networks.memory is not None:
         every = policy.encode_with(networks.encoder, views.views)
-        features = Features(take(every, views.now), take(every, views.after))
+        features = Features(gather(every, views.now), gather(every, views.after))
         return features, _recall(networks, features, samples)
     seen, rows = views.after.unique(return_inverse=True)
-    after = take(policy.encode_with(networks.encoder, views.views[seen]), rows)
+    after = gather(policy.encode_with(networks.encoder, views.views[seen]), rows)
     features = Features(after, after)  # nobody reads the target's features of before
     return features, features
 

@@ -18,9 +18,9 @@ from torch import nn
 from sb3_saf.envs.teams import Array
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.encoders import ObservationEncoder
-from sb3_saf.networks.gather import take
+from sb3_saf.networks.gather import gather
 from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
-from sb3_saf.policies.rows import TeamRowsPolicy, take_named
+from sb3_saf.policies.rows import TeamRowsPolicy, pop_named
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
 from sb3_saf.qplex.parts import QPLEXLstmParts, QPLEXParts, QPLEXPoolParts
@@ -63,7 +63,7 @@ class QPLEXPolicy(TeamRowsPolicy):
     :param net_arch: hidden sizes of the Q heads
     :param activation_fn: activation of hidden layers
     :param ortho_init: whether encoder and heads start orthogonal, as those of SAF
-    :param distinct: False encodes every row, which gives the same numbers slowly
+    :param encode_once: False encodes every row, which gives the same numbers slowly
     :param chunk_size: views encoded at once on the CPU; None for all
     :param features_extractor_class: encoder, built on the space of ``obs``
     :param features_extractor_kwargs: its further arguments
@@ -91,7 +91,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = True,
         *,
-        distinct: bool = True,
+        encode_once: bool = True,
         chunk_size: int | None = 512,
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
@@ -100,8 +100,8 @@ class QPLEXPolicy(TeamRowsPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
-        self._read_rows_of(observation_space, action_space, distinct, chunk_size)
-        self.parts = self.parts_class(**take_named(kwargs, {field.name for field in fields(self.parts_class)}))
+        self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
+        self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
         if kwargs:
             raise TypeError(f"{type(self).__name__} takes no argument {next(iter(kwargs))!r}")
         super().__init__(
@@ -158,7 +158,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         return online, list(self.target_networks.parameters())
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ["net_arch", "activation_fn", "ortho_init", "distinct", "chunk_size"]
+        names = ["net_arch", "activation_fn", "ortho_init", "encode_once", "chunk_size"]
         names += ["features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs"]
         own = {name: getattr(self, name) for name in names}
         data = super()._get_constructor_parameters() | own | asdict(self.parts)
@@ -174,7 +174,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         """(G, d) features of states (G, *state), each distinct one encoded once."""
         assert self.team_spaces.state is not None
         found = self.views.find(states)
-        return take(self._in_chunks(encoder, states[found.index], self.team_spaces.state), found.inverse)
+        return gather(self._in_chunks(encoder, states[found.index], self.team_spaces.state), found.inverse)
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
@@ -229,7 +229,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         self, memory: AgentMemory, obs: PyTorchObs, state: State | None, episode_start: np.ndarray | None
     ) -> tuple[np.ndarray, State]:
         own = self.views.own(self._own(obs))
-        features = take(own.features, own.rows)
+        features = gather(own.features, own.rows)
         last = th.full((len(features),), -1, dtype=th.long, device=features.device)
         remembered = memory.empty(len(features), features)
         if state is not None:

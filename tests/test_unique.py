@@ -10,19 +10,19 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_saf.networks import unique as distinct
-from sb3_saf.networks.unique import Distinct, distinct_rows, every_row
+from sb3_saf.networks import unique
+from sb3_saf.networks.unique import UniqueRows, every_row, unique_rows
 from sb3_saf.networks.views import ViewEncoder
 
-Finder = Callable[[th.Tensor], Distinct]
+Finder = Callable[[th.Tensor], UniqueRows]
 
 
-def on_cpu(x: th.Tensor) -> Distinct:
-    return distinct._distinct_on_cpu(distinct._bytes_of_rows(x))
+def on_cpu(x: th.Tensor) -> UniqueRows:
+    return unique._unique_on_cpu(unique._bytes_of_rows(x))
 
 
-def on_device(x: th.Tensor) -> Distinct:
-    return distinct._distinct_on_device(distinct._bytes_of_rows(x))
+def on_device(x: th.Tensor) -> UniqueRows:
+    return unique._unique_on_device(unique._bytes_of_rows(x))
 
 
 FINDERS = pytest.mark.parametrize("find", [on_cpu, on_device])
@@ -42,7 +42,7 @@ def reference(x: th.Tensor) -> tuple[list[int], list[int]]:
     return index, inverse
 
 
-def assert_matches_reference(x: th.Tensor, found: Distinct) -> None:
+def assert_matches_reference(x: th.Tensor, found: UniqueRows) -> None:
     index, inverse = reference(x)
     assert found.index.tolist() == index
     assert found.inverse.tolist() == inverse
@@ -103,23 +103,23 @@ def test_edges(find: Finder) -> None:
 
 def test_exact_although_every_hash_collides(monkeypatch: pytest.MonkeyPatch) -> None:
     x = th.randint(0, 4, (60, 2))
-    monkeypatch.setattr(distinct, "_hash_row", lambda words, row: np.uint64(7))
-    monkeypatch.setattr(distinct, "_find_distinct", distinct._find_distinct.py_func)
+    monkeypatch.setattr(unique, "_hash_row", lambda words, row: np.uint64(7))
+    monkeypatch.setattr(unique, "_find_unique", unique._find_unique.py_func)
     assert_matches_reference(x, on_cpu(x))
-    monkeypatch.setattr(distinct, "_hash_words", lambda words: words.new_zeros(len(words)))
+    monkeypatch.setattr(unique, "_hash_words", lambda words: words.new_zeros(len(words)))
     assert_matches_reference(x, on_device(x))
 
 
 def test_hashes_are_computed_in_parts_of_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     x = th.randint(0, 4, (60, 2))
-    monkeypatch.setattr(distinct, "_HASH_CHUNK_BYTES", 100)
+    monkeypatch.setattr(unique, "_HASH_CHUNK_BYTES", 100)
     assert_matches_reference(x, on_device(x))
 
 
 def test_input_is_left_alone_and_may_need_gradients() -> None:
     x = th.randint(0, 2, (20, 3)).float().requires_grad_()
     before = x.detach().clone()
-    found = distinct_rows(x)
+    found = unique_rows(x)
     x[found.index][found.inverse].sum().backward()
     assert th.equal(x, before)
     assert x.grad is not None and x.grad.sum() == 60
@@ -175,7 +175,7 @@ def test_teams_without_known_views_and_with_all_known() -> None:
 
 def test_naive_encoder_encodes_every_row_and_every_member() -> None:
     counter = Counter()
-    encoder = ViewEncoder(counter, distinct=False)
+    encoder = ViewEncoder(counter, encode_once=False)
     own = encoder.own(th.tensor([[1], [1], [1]]))
     views = encoder.teams(a_b_teams(), own)
     assert [len(call) for call in counter.calls] == [3, 6]

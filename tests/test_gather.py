@@ -11,7 +11,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, LightEncoder, TeamRolloutBuffer, make_team_env
-from sb3_saf.networks.gather import take, take_of_agents
+from sb3_saf.networks.gather import gather, gather_agents
 
 
 @pytest.fixture
@@ -27,11 +27,11 @@ def two_threads() -> Iterator[None]:
 def test_taking_is_indexing(shape: tuple[int, ...]) -> None:
     x = th.randn(4, *shape, dtype=th.float64, requires_grad=True)
     rows = th.tensor([[0, 3, 3], [1, 0, 3]])
-    assert th.equal(take(x, rows), x[rows])
-    assert th.autograd.gradcheck(lambda x: take(x, rows), (x,))
+    assert th.equal(gather(x, rows), x[rows])
+    assert th.autograd.gradcheck(lambda x: gather(x, rows), (x,))
     of_agents = th.randn(3, 4, *shape, dtype=th.float64)
     teams, agent = th.tensor([2, 0, 2]), th.tensor([3, 1, 3])
-    assert th.equal(take_of_agents(of_agents, teams, agent), of_agents[teams, agent])
+    assert th.equal(gather_agents(of_agents, teams, agent), of_agents[teams, agent])
 
 
 @pytest.mark.usefixtures("two_threads")
@@ -40,7 +40,7 @@ def test_the_gradient_repeats() -> None:
 
     def gradient() -> th.Tensor:
         leaf = x.clone().requires_grad_()
-        return th.autograd.grad((take(leaf, rows) * weights).sum(), leaf)[0]
+        return th.autograd.grad((gather(leaf, rows) * weights).sum(), leaf)[0]
 
     assert all(th.equal(gradient(), gradient()) for _ in range(10))
 
