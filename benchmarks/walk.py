@@ -1,9 +1,9 @@
 """
 Count what a reader has to follow: the files of this project whose functions one short training runs.
 
-``python -m benchmarks.walk`` trains ``PPO("SAFPolicy", env)`` for two rollouts under ``sys.setprofile`` and prints every
-file of ``hecogrid_envs`` and ``sb3_saf`` in which a function ran, in the order of the first call, with its lines; then
-the lines of both packages and of the tests. Compiled kernels do not show; their files count when Python calls into them.
+``python -m benchmarks.walk`` trains ``PPO("SAFPolicy", env)`` for two rollouts under ``sys.setprofile``. It prints
+every file of ``hecogrid_envs`` and ``sb3_saf`` in which a function ran, in the order of the first call, with its
+lines, then the lines of packages and tests. Compiled kernels do not show; their files count when Python calls them.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def walk(policy: str = "SAFPolicy", game_steps: int = 40) -> list[Path]:
         model.learn(game_steps * env.n_agents)
     finally:
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]  # typeshed forgets that None ends it
+        threading.setprofile(None)
     folders = tuple(str(ROOT / package) for package in PACKAGES)
     return [Path(name) for name in seen if name.startswith(folders)]
 

@@ -127,7 +127,7 @@ class PolicyPool(ActorNetwork):
         return self._of_pool(self._split(parameters))
 
     def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
-        """See :class:`ActorNetwork`; masked before they are mixed, so that masks leave the choice of a policy as it is."""
+        """See :class:`ActorNetwork`; masked before mixing: masks leave the choice of a policy as it is."""
         log_weights, actions = self._split(parameters)
         return self._of_pool(PoolOutput(log_weights, masked_parameters(self.action_space, actions, masks)))
 
