@@ -17,7 +17,7 @@ from sb3_saf.training.devices import check_device
 pytest.importorskip("rl_zoo3.train")
 
 from sb3_saf.export.weights import _entry, _tensors
-from sb3_saf.training.callbacks import ZooEvalCallback
+from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.settings import load_settings
 
 ENV = "TeamTogether-v0"
@@ -41,14 +41,14 @@ def train(folder: Path, algo: str, *options: str) -> None:
 
 def struck(monkeypatch: pytest.MonkeyPatch, error: type[BaseException], evaluation: int = 8) -> None:
     """Let evaluations end the run in the middle of a rollout; undone by ``monkeypatch.undo()``."""
-    evaluate = ZooEvalCallback._evaluate
+    evaluate = SeededEvalCallback._evaluate
 
-    def strike(self: ZooEvalCallback) -> bool:
+    def strike(self: SeededEvalCallback) -> bool:
         if self._n_evaluations == evaluation:
             raise error
         return evaluate(self)
 
-    monkeypatch.setattr(ZooEvalCallback, "_evaluate", strike)
+    monkeypatch.setattr(SeededEvalCallback, "_evaluate", strike)
 
 
 def left(run: Path) -> dict[str, Any]:

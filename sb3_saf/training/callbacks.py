@@ -20,7 +20,7 @@ from sb3_saf.randomness import own_randomness
 from sb3_saf.training.seeds import evaluation_seed
 
 
-class ZooEvalCallback(TeamEvalCallback):
+class SeededEvalCallback(TeamEvalCallback):
     """
     ``TeamEvalCallback`` that leaves training as it would be without it, and evaluates the final policy too.
 
@@ -64,13 +64,13 @@ class ZooEvalCallback(TeamEvalCallback):
             self._evaluate()
 
 
-class TrialCallback(ZooEvalCallback):
+class TrialCallback(SeededEvalCallback):
     """
     Evaluation of an Optuna trial: reports every evaluation, and stops what the pruner gives up.
 
-    :param args: as ``ZooEvalCallback``
+    :param args: as ``SeededEvalCallback``
     :param trial: the trial
-    :param kwargs: as ``ZooEvalCallback``
+    :param kwargs: as ``SeededEvalCallback``
     """
 
     def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
@@ -104,9 +104,12 @@ class GameStepsProgressBar(ProgressBarCallback):
         return True
 
     def _on_training_end(self) -> None:
-        # RL-Zoo3 ends its first callback even if training never began, which would hide why.
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bar as it is; also if training never began, or has ended by an error."""
         if hasattr(self, "pbar"):
-            super()._on_training_end()
+            self.pbar.close()
 
 
 class CheckpointInGameSteps(BaseCallback):

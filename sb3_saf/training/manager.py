@@ -32,8 +32,8 @@ from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.callbacks import (
     CheckpointInGameSteps,
     GameStepsProgressBar,
+    SeededEvalCallback,
     TrialCallback,
-    ZooEvalCallback,
 )
 from sb3_saf.training.commands import CommandError, replaced, user_errors
 from sb3_saf.training.inspection import inspection
@@ -177,7 +177,7 @@ class TeamExperimentManager(ExperimentManager):
         finally:
             for callback in self.callbacks:
                 if isinstance(callback, GameStepsProgressBar):
-                    callback.on_training_end()
+                    callback.close()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
@@ -242,8 +242,8 @@ class TeamExperimentManager(ExperimentManager):
         if self.tensorboard_log is not None and (inspect_freq is None or inspect_freq > 0):
             self.callbacks.append(self._inspection(inspect_freq))
 
-    def _evaluation(self, eval_freq: int) -> ZooEvalCallback:
-        return ZooEvalCallback(
+    def _evaluation(self, eval_freq: int) -> SeededEvalCallback:
+        return SeededEvalCallback(
             self.create_envs(self.n_eval_envs, eval_env=True),
             seed=self.seed,
             best_model_save_path=self.save_path,

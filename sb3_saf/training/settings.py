@@ -140,16 +140,20 @@ class Settings:
         :param device: as SB3 takes it
         :param tensorboard_log: folder, None for none
         :param verbose: as SB3 takes it
+        :raises ValueError: if the algorithm refuses its arguments
         """
-        return self.spec.algorithm(
-            self.spec.policy,
-            env,
-            seed=check_seed(seed),
-            device=device,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            **self.hyperparams,
-        )
+        try:
+            return self.spec.algorithm(
+                self.spec.policy,
+                env,
+                seed=check_seed(seed),
+                device=device,
+                tensorboard_log=tensorboard_log,
+                verbose=verbose,
+                **self.hyperparams,
+            )
+        except (AssertionError, TypeError) as error:  # SB3's checks of what it is given
+            raise ValueError(str(error)) from error
 
     def as_dict(self) -> dict[str, Any]:
         """Everything as plain data, for a file beside the results."""

@@ -1,0 +1,267 @@
+"""
+The one way from settings to a trained model: make the games, make the model, learn, save.
+
+Commands, tuning, experiments and scripts call :func:`train`. :class:`Training` is the same in two steps, for callers
+that tell errors of the preparation from errors of the training.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_saf.callbacks.finite import FiniteCallback
+from sb3_saf.checkpoints.learning import resumable_learn
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback
+from sb3_saf.training.inspection import inspection
+from sb3_saf.training.settings import Settings
+
+CHECKPOINTS: Final = "checkpoints"
+#: Evaluations, inspections and checkpoints of a run, unless a frequency is given.
+EVALUATIONS_PER_RUN: Final = 20
+INSPECTIONS_PER_RUN: Final = 10
+CHECKPOINTS_PER_RUN: Final = 10
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """
+    How a run is carried out. None of this changes what is learned, except ``device``, ``num_threads`` (by rounding)
+    and ``initial_model``.
+
+    Frequencies are in game steps, summed over all parallel games: 0 or less for never, None for the default number of
+    times per run.
+
+    :param eval_freq: game steps between evaluations (None: 20 per run), and one after the last step
+    :param eval_episodes: team episodes of an evaluation
+    :param n_eval_envs: parallel games of an evaluation
+    :param eval_settings: settings of the evaluation games; None for those of training
+    :param deterministic_eval: whether evaluation takes the most likely actions; value-based algorithms always do
+    :param save_freq: game steps between saved models
+    :param inspect_freq: game steps between inspections of the policy, which are only made with ``tensorboard_log``
+        (None: 10 per run)
+    :param checkpoint_freq: game steps between checkpoints in ``FOLDER/checkpoints``, from which a run of the same
+        settings goes on (None: 10 per run); they are removed at the end of the run
+    :param tensorboard_log: folder of the run's TensorBoard logs, which are named by algorithm; None for none
+    :param model_name: the trained model is saved as ``FOLDER/MODEL_NAME.zip``
+    :param initial_model: a saved model whose weights and optimiser the run begins with; None for fresh ones
+    :param log_interval: rollouts between log entries; None for SB3's default, 0 for no log
+    :param device: as SB3 takes it
+    :param num_threads: of torch; None for its own choice
+    :param progress: whether to draw a progress bar in game steps
+    :param verbose: 0 or 1, as SB3 takes it
+    :param resume_hint: what a message after Ctrl-C or SIGTERM tells to do
+    """
+
+    eval_freq: int | None = 0
+    eval_episodes: int = 32
+    n_eval_envs: int = 32
+    eval_settings: Settings | None = None
+    deterministic_eval: bool = False
+    save_freq: int = 0
+    inspect_freq: int | None = None
+    checkpoint_freq: int | None = 0
+    tensorboard_log: Path | None = None
+    model_name: str = "model"
+    initial_model: Path | None = None
+    log_interval: int | None = None
+    device: str = "auto"
+    num_threads: int | None = None
+    progress: bool = False
+    verbose: int = 0
+    resume_hint: str = "start the same command again to go on from there"
+
+
+def train(
+    settings: Settings,
+    seed: int,
+    folder: Path | None = None,
+    options: RunOptions | None = None,
+    callbacks: Sequence[BaseCallback] = (),
+) -> BaseAlgorithm:
+    """
+    Train a model; if the folder has checkpoints of the same run, go on from the newest.
+
+    :param settings: everything that decides the result but the seed
+    :param seed: of the run
+    :param folder: for ``monitor.csv``, models, evaluations and checkpoints; None writes none of them
+    :param options: how the run is carried out
+    :param callbacks: further callbacks, called before those of the options
+    :return: the trained model; its games are closed
+    :raises ValueError: if the games or the model cannot be made
+    :raises CheckpointError: if a checkpoint cannot be written or read
+    :raises NonFiniteError: at NaN or infinity
+    """
+    with Training(settings, seed, folder, options, callbacks) as training:
+        return training.learn()
+
+
+class Training:
+    """
+    Games, model and callbacks of one run, ready to learn. A context manager that closes the games.
+
+    :param settings: as :func:`train`
+    :param seed: as :func:`train`
+    :param folder: as :func:`train`
+    :param options: as :func:`train`
+    :param callbacks: as :func:`train`
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        seed: int,
+        folder: Path | None = None,
+        options: RunOptions | None = None,
+        callbacks: Sequence[BaseCallback] = (),
+    ) -> None:
+        self.settings = settings
+        self.seed = seed
+        self.folder = folder
+        self.options = options or RunOptions()
+        if self.options.num_threads is not None:
+            th.set_num_threads(self.options.num_threads)
+        with ExitStack() as self._open:  # which closes what is open already if the rest cannot be made
+            self.model = self._make_model(self._games(settings))
+            self.callbacks = [*callbacks, *self._make_callbacks()]
+            self._open = self._open.pop_all()
+
+    def __enter__(self) -> Training:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all games."""
+        self._open.close()
+
+    def learn(self) -> BaseAlgorithm:
+        """
+        Train and save. If Ctrl-C or SIGTERM end the training, the model is saved as it is.
+
+        :return: the model
+        """
+        try:
+            self._learn()
+        except (KeyboardInterrupt, SystemExit):
+            self._save()
+            raise
+        self._save()
+        if self.folder is not None:
+            shutil.rmtree(self.folder / CHECKPOINTS, ignore_errors=True)
+        return self.model
+
+    def _learn(self) -> None:
+        options, total = self.options, self.settings.total_timesteps
+        arguments: dict[str, Any] = {"tb_log_name": self.settings.algo}
+        if options.log_interval is not None:
+            arguments["log_interval"] = options.log_interval or None
+        checkpoint_freq = self._every(options.checkpoint_freq, CHECKPOINTS_PER_RUN)
+        if self.folder is None or checkpoint_freq == 0:
+            self.model.learn(total, [FiniteCallback(), *self.callbacks], **arguments)
+            return
+        resumable_learn(
+            self.model,
+            total,
+            self.folder / CHECKPOINTS,
+            self.callbacks,
+            every_game_steps=checkpoint_freq,
+            keep=2,
+            again=options.resume_hint,
+            **arguments,
+        )
+
+    def _save(self) -> None:
+        if self.folder is not None:
+            self.model.save(self.folder / f"{self.options.model_name}.zip")
+
+    def _games(self, settings: Settings, **kwargs: Any) -> CentralizedValueWrapper:
+        """Games that are closed with the training."""
+        games = settings.make_env(self.seed, monitor_dir=None if kwargs else self.folder, **kwargs)
+        self._open.callback(games.close)
+        return games
+
+    def _make_model(self, games: CentralizedValueWrapper) -> BaseAlgorithm:
+        options = self.options
+        log = None if options.tensorboard_log is None else str(options.tensorboard_log)
+        model = self.settings.make_model(
+            games, self.seed, device=options.device, tensorboard_log=log, verbose=options.verbose
+        )
+        if options.initial_model is not None:
+            load_parameters(model, options.initial_model)
+        return model
+
+    def _make_callbacks(self) -> list[BaseCallback]:
+        options = self.options
+        callbacks: list[BaseCallback] = []
+        if options.progress:
+            bar = GameStepsProgressBar()
+            self._open.callback(bar.close)
+            callbacks.append(bar)
+        if self.folder is not None and options.save_freq > 0:
+            callbacks.append(CheckpointInGameSteps(options.save_freq, self.folder, options.verbose))
+        if eval_freq := self._every(options.eval_freq, EVALUATIONS_PER_RUN):
+            callbacks.append(self._evaluation(eval_freq))
+        inspect_freq = self._every(options.inspect_freq, INSPECTIONS_PER_RUN)
+        if options.tensorboard_log is not None and inspect_freq:
+            look = inspection(self.settings, self.seed, inspect_freq)
+            self._open.callback(look.eval_env.close)
+            callbacks.append(look)
+        return callbacks
+
+    def _evaluation(self, eval_freq: int) -> SeededEvalCallback:
+        options = self.options
+        settings = options.eval_settings or self.settings
+        if settings.n_agents != self.settings.n_agents:
+            raise ValueError(
+                f"evaluation needs the {self.settings.n_agents} agents of training, got n_agents={settings.n_agents}"
+            )
+        n_envs = min(options.n_eval_envs, options.eval_episodes)
+        folder = None if self.folder is None else str(self.folder)
+        return SeededEvalCallback(
+            self._games(settings, evaluation=True, n_envs=n_envs),
+            seed=self.seed,
+            best_model_save_path=folder,
+            log_path=folder,
+            n_eval_episodes=options.eval_episodes,
+            eval_freq=eval_freq,
+            deterministic=options.deterministic_eval or not settings.spec.draws_actions,
+            verbose=options.verbose,
+        )
+
+    def _every(self, frequency: int | None, times_per_run: int) -> int:
+        """Game steps between two events; 0 for never."""
+        if frequency is None:
+            return max(1, self.settings.game_steps // times_per_run)
+        return max(0, frequency)
+
+
+def load_parameters(model: BaseAlgorithm, path: Path) -> None:
+    """
+    Take weights and optimiser of a saved model. Only tensors are read: nothing of the file is run as code.
+
+    :param model: made with the policy and the ``policy_kwargs`` of the saved one
+    :param path: a ``.zip`` that ``save`` has written
+    :raises ValueError: if the file does not fit
+    """
+    try:
+        model.set_parameters(str(path), device=model.device)
+    except Exception as error:  # zipfile's, the unpickler's and torch's errors have no common class
+        reason = " ".join(str(error).split())[:300]
+        raise ValueError(
+            f"the parameters in {path} do not fit {model.policy.__class__.__name__} with these settings; give the "
+            f"algorithm and the policy_kwargs that it was trained with ({reason})"
+        ) from error
