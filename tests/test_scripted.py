@@ -1,0 +1,154 @@
+"""Scripted teams on levels whose right answer is known."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import scripted
+from benchmarks.scripted_teams import PATIENCE, TEAMS, cost_to_go
+from hecogrid_envs.batch import GameBatch
+from hecogrid_envs.constants import Command, Direction
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.state import StateMapping
+
+EAST, SOUTH, WEST, NORTH = Direction
+SCRIPTED = ("7 x 7 views", "full sight")
+
+
+def level(*rows: str, agents: list[tuple[int, int, Direction]]) -> StateMapping:
+    """Draw a level: ``#`` wall, ``T`` treasure, ``K`` key; agents as x, y and direction."""
+    cells = np.array([list(row) for row in rows]).T
+    return StateMapping(
+        walls=cells == "#",
+        treasures=(cells == "T").astype(np.uint8),
+        keys=cells == "K",
+        agent_pos=np.array([agent[:2] for agent in agents], dtype=np.int64),
+        agent_dir=np.array([agent[2] for agent in agents], dtype=np.int64),
+        agent_has_key=np.zeros(len(agents), dtype=np.bool_),
+    )
+
+
+def collected(name: str, task: str, state: StateMapping, max_cycles: int, **params: Any) -> int:
+    """What a team has collected after some steps."""
+    size, n_agents = len(state["walls"]), len(state["agent_pos"])
+    params |= {"n_agents": n_agents, "grid_size": size, "max_cycles": max_cycles}
+    batch = GameBatch(task, HECOGridParams(n_treasures=0, n_keys=0, clutter_density=0.0, **params))
+    batch.reset(seeds=[0])
+    batch.set_state(state)
+    return scripted.play(name, batch, seed=0)
+
+
+def first_return(name: str, task: str, state: StateMapping, **params: Any) -> int:
+    """Steps after which a team has the first treasure."""
+    return next(steps for steps in range(1, 50) if collected(name, task, state, steps, **params))
+
+
+ALONE = level(
+    "######",
+    "#    #",
+    "#    #",
+    "#  #T#",
+    "#    #",
+    "######",
+    agents=[(2, 3, WEST)],
+)
+
+
+def test_costs_count_turns_steps_and_the_target() -> None:
+    """Beside a wall: from (2, 3) facing west one turn, one step, one turn, two steps, one turn, one step."""
+    costs = np.full((6, 6), np.inf)
+    costs[4, 3] = 0.5
+    field = cost_to_go(~ALONE["walls"], costs)
+    assert field[4, 3].tolist() == [0.5] * 4
+    assert field[2, 3, WEST] == 7.5
+    assert field[2, 3, NORTH] == 6.5
+    assert np.isinf(field[3, 3]).all()
+
+
+@pytest.mark.parametrize("heterogeneity", [1, 3])
+def test_full_sight_takes_the_shortest_path(heterogeneity: int) -> None:
+    """Zones change what actions do, not how many are needed."""
+    assert first_return("full sight", "TeamSupport", ALONE, heterogeneity=heterogeneity) == 7
+
+
+def test_views_do_not_reach_behind_the_agent() -> None:
+    """Two cells behind, a treasure is not seen; two cells ahead it is, and reached at once."""
+    rows = ["#######", "#######", "#######", "#T   T#", "#######", "#######", "#######"]
+    seen = level(*rows, agents=[(3, 3, EAST)])
+    batch = GameBatch("TeamSupport", HECOGridParams(1, 7, n_treasures=0, clutter_density=0.0))
+    batch.reset(seeds=[0])
+    batch.set_state(seen)
+    assert batch.fields_of_view()[0, [1, 5], 3].tolist() == [False, True]
+    assert first_return("7 x 7 views", "TeamSupport", seen) == 2
+    one_left = level(*[row.replace("T#", " #") for row in rows], agents=[(3, 3, EAST)])
+    assert first_return("full sight", "TeamSupport", one_left) == 4
+    assert first_return("7 x 7 views", "TeamSupport", one_left) > 4
+
+
+def beside_a_treasure(other: list[tuple[int, int, Direction]], key: str = " ") -> StateMapping:
+    """A level with an agent that faces a treasure, perhaps others, and perhaps a key behind it."""
+    row, empty = f"#{key} T   #", "#      #"
+    return level("########", empty, empty, row, empty, empty, empty, "########", agents=[(2, 3, EAST), *other])
+
+
+@pytest.mark.parametrize(
+    ("task", "coordination", "others", "steps"),
+    [
+        ("TeamSupport", 1, [], 1),
+        ("TeamSupport", 2, [(5, 3, WEST)], 1),
+        ("TeamSupport", 3, [(5, 3, WEST), (6, 4, WEST)], 2),
+        ("TeamTogether", 2, [(6, 3, WEST)], 3),
+        ("TeamTogether", 3, [(6, 3, WEST), (6, 4, WEST)], 5),
+    ],
+)
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_agents_meet_at_a_treasure(
+    name: str, task: str, coordination: int, others: list[tuple[int, int, Direction]], steps: int
+) -> None:
+    """The one beside it waits for those who have further to go: onto it, or within two cells of it."""
+    state = beside_a_treasure(others)
+    assert first_return(name, task, state, coordination=coordination, agent_order="index") == steps
+
+
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_a_key_comes_first(name: str) -> None:
+    """Two turns to the key, pickup, two turns back, one step; views reach one row behind the agent."""
+    assert first_return(name, "KeyForTreasure", beside_a_treasure([], key="K")) == 6
+
+
+def test_views_do_not_wait_for_ever() -> None:
+    """Alone on a treasure that needs two, an agent leaves after some steps; with full sight it would stay."""
+    state = level("#####", "#   #", "# T #", "#   #", "#####", agents=[(2, 2, EAST)])
+    batch = GameBatch("TeamSupport", HECOGridParams(2, 5, 2, n_treasures=0, clutter_density=0.0))
+    batch.reset(seeds=[0])
+    state["agent_pos"], state["agent_dir"] = np.array([(2, 2), (1, 1)]), np.array([EAST, NORTH])
+    state["agent_has_key"] = np.zeros(2, dtype=np.bool_)
+    batch.set_state(state)
+    team = TEAMS["7 x 7 views"](batch.params, np.random.default_rng(0))
+    commands = [int(team(batch)[0]) for _ in range(20)]
+    assert commands[: PATIENCE + 1] == [Command.PICKUP] * (PATIENCE + 1)
+    assert Command.FORWARD in commands
+
+
+def test_the_command_writes_its_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows for every level and team, printed and in a file; who sees more collects more."""
+    path = tmp_path / "scale.csv"
+    line = f"scripted --tasks TeamSupport --coordination 1 --games 4 --csv {path}"
+    monkeypatch.setattr(sys, "argv", line.split())
+    scripted.main()
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * len(TEAMS)
+    assert len(capsys.readouterr().out.splitlines()) == 2 + len(rows)
+    for n_agents in ("5", "10"):
+        means = [float(row["mean"]) for row in rows if row["n_agents"] == n_agents]
+        assert means == sorted(means)
+        assert means[0] < means[1] / 2
