@@ -45,7 +45,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.export.writer import export_actors
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
-    from sb3_saf.networks.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
+    from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.policies.ippo import IPPOPolicy
     from sb3_saf.policies.mappo import MAPPOPolicy
     from sb3_saf.policies.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy

@@ -22,9 +22,10 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 import sb3_saf
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy, evaluate_team, make_team_env
 from sb3_saf.envs.teams import TeamSpaces
-from sb3_saf.networks.distributions import distribution_of, masked_parameters, mixture_of
+from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.distributions import actor_distribution, distribution_of, mixture_of
 from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from tests.contrib_teams import CueTeams, MaskedTeams, choices_of, is_allowed, random_masks
@@ -333,7 +334,9 @@ def test_memory_against_an_independent_loop(family: str, kwargs: dict[str, Any])
         steps = take(sequences, slice(number * n_steps, (number + 1) * n_steps))  # type: ignore[arg-type]
         latent = lstm_by_hand(policy.lstm_actor, policy.features_extractor(steps["obs"]), starts[number])
         agents = th.full((n_steps,), agent)
-        expected = policy.actor.distribution(policy.actor(latent, agents)).log_prob(th.zeros(n_steps).long())
+        expected = actor_distribution(policy.actor, policy.action_space, policy.actor(latent, agents)).log_prob(
+            th.zeros(n_steps).long()
+        )
         th.testing.assert_close(log_prob.view(2, -1)[number], expected)
         known = [policy.features_extractor(team) for team in steps["team"]]  # z of each step's team
         if policy.value_net.team_states is None:

@@ -35,7 +35,8 @@ from sb3_saf.inspection.calibration import calibrate, lambda_returns
 from sb3_saf.inspection.doors import zone_function
 from sb3_saf.inspection.episodes import Played, Player
 from sb3_saf.inspection.report import critic_scalars, message_scalars, pool_scalars
-from sb3_saf.networks.policy_pool import PolicyPool, PoolOutput
+from sb3_saf.networks.actor import PoolOutput
+from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.ippo import IPPOPolicy
 from sb3_saf.policies.saf import SAFPolicy
@@ -383,7 +384,7 @@ class ZonedProbe(Probe):
 class PoolByZone(PolicyPool):
     """Weights 0.2 and 0.8 in zone 0, 0.9 and 0.1 in zone 1."""
 
-    def evaluate(self, features: th.Tensor) -> PoolOutput:
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         weights = th.tensor([[0.2, 0.8], [0.9, 0.1]])[(features[:, 0] > 0).long()]
         return PoolOutput(weights.log(), super().evaluate(features).actions)
 

@@ -35,17 +35,10 @@ from sb3_saf.export.manifest import (
 )
 from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor, make_memory
 from sb3_saf.networks.actor import ActionHead, SinglePolicy
-from sb3_saf.networks.encoders import (
-    LightEncoder,
-    MLPEncoder,
-    NatureEncoder,
-    ObservationEncoder,
-    PaperCNN,
-    is_tile_space,
-)
 from sb3_saf.networks.layers import AgentHeads
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
@@ -277,7 +270,7 @@ def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
 def _encoder_tensors(policy: ExportablePolicy) -> dict[str, th.Tensor]:
     tensors = dict(_inner_encoder(policy).state_dict())
     own: Any = policy.team_spaces.own
-    if is_tile_space(own) and type(_inner_encoder(policy)) is not MLPEncoder:
+    if hasattr(own, "atlas") and type(_inner_encoder(policy)) is not MLPEncoder:
         # What codes look like belongs to the space, not to the weights, and an actor has no space but this.
         tensors["pixels.atlas"] = th.tensor(np.asarray(own.atlas))
     return tensors

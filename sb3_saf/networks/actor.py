@@ -7,19 +7,28 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_saf.networks.distributions import distribution_of, masked_parameters, n_action_parameters
 from sb3_saf.networks.layers import AgentHeads, mlp
+from sb3_saf.networks.spaces import AnySpace, spec_of
 
 #: Orthogonal gain of the last layer: first policies are close to uniform.
 ACTION_GAIN = 0.01
+
+
+class PoolOutput(NamedTuple):
+    """
+    What each policy of a pool would do, and how likely each is to be chosen.
+
+    :param log_weights: (K, U), normalised
+    :param actions: (K, U, P), parameters of each policy's action distribution
+    """
+
+    log_weights: th.Tensor
+    actions: th.Tensor
 
 
 class ActionHead(nn.Module):
@@ -38,15 +47,15 @@ class ActionHead(nn.Module):
     def __init__(
         self,
         features_dim: int,
-        action_space: spaces.Space[Any],
+        action_space: AnySpace,
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
         log_std_init: float,
     ):
         super().__init__()
-        n_outputs = n_action_parameters(action_space)
-        if isinstance(action_space, spaces.Box):
-            n_outputs = get_action_dim(action_space)
+        space = spec_of(action_space)
+        n_outputs = space.n_outputs
+        if space.kind == "box":
             self.log_std = nn.Parameter(th.full((n_outputs,), log_std_init))
         else:
             self.register_parameter("log_std", None)
@@ -72,9 +81,9 @@ class ActorNetwork(nn.Module, ABC):
     :param n_identities: N if the network reads who acts, as a one-hot vector beside the features; 0 if it does not
     """
 
-    def __init__(self, action_space: spaces.Space[Any], reads_agent: bool, n_identities: int = 0):
+    def __init__(self, action_space: AnySpace, reads_agent: bool, n_identities: int = 0):
         super().__init__()
-        self.action_space = action_space
+        self.space = spec_of(action_space)
         self.reads_agent = reads_agent
         self.n_identities = n_identities
 
@@ -89,11 +98,13 @@ class ActorNetwork(nn.Module, ABC):
         """
 
     @abstractmethod
-    def distribution(self, parameters: th.Tensor) -> Distribution:
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """
-        Make the distribution of what ``forward`` gave.
+        Ask every policy and weigh them; a single policy has the weight 1.
 
-        :param parameters: (B, P')
+        :param features: (K, d) features of own observations
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: log weights (K, U) and action parameters (K, U, P)
         """
 
     def with_identity(self, features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
@@ -122,15 +133,6 @@ class ActorNetwork(nn.Module, ABC):
         result: th.Tensor = self(features, agent)
         return result
 
-    def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
-        """
-        Make the distribution over allowed actions of what ``unmixed`` gave.
-
-        :param parameters: (B, P'')
-        :param masks: (B, M) bool, the choices that are allowed (see ``masked_parameters``)
-        """
-        return self.distribution(masked_parameters(self.action_space, parameters, masks))
-
 
 class SinglePolicy(ActorNetwork):
     """
@@ -148,7 +150,7 @@ class SinglePolicy(ActorNetwork):
     def __init__(
         self,
         features_dim: int,
-        action_space: spaces.Space[Any],
+        action_space: AnySpace,
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
         log_std_init: float = 0.0,
@@ -175,6 +177,6 @@ class SinglePolicy(ActorNetwork):
         result: th.Tensor = self.head(self.with_identity(features, agent))
         return result
 
-    def distribution(self, parameters: th.Tensor) -> Distribution:
-        """See :class:`ActorNetwork`; SB3's own distribution for the action space."""
-        return distribution_of(self.action_space, parameters)
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
+        """See :class:`ActorNetwork`; (K, 1) log weights of zero and (K, 1, P) parameters."""
+        return PoolOutput(th.zeros_like(features[:, :1]), self(features, agent).unsqueeze(1))

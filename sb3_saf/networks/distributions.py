@@ -1,33 +1,24 @@
 """
-Action distributions: a single policy's, and those of a pool of policies.
+Action distributions of single policies and of pools of policies: likelihoods, masks and decisions, in torch alone.
 
 A policy's parameters are one vector per row: logits (Discrete, MultiDiscrete, MultiBinary), or means and then log
-standard deviations (Box). Letters: B rows, U policies, P parameters, D action dimensions, J joint actions.
+standard deviations (Box). A pool is given by log weights (B, U), normalised, and the parameters of all its policies
+(B, U, P). Letters: B rows, U policies, P parameters, D action dimensions, M choices of all dimensions, J joint actions.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from itertools import product
 from math import prod
-from typing import Any, ClassVar, Final, cast
+from typing import Final
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.distributions import (
-    CategoricalDistribution,
-    DiagGaussianDistribution,
-    Distribution,
-    kl_divergence,
-    make_proba_distribution,
-)
-from stable_baselines3.common.preprocessing import get_action_dim
-from torch import nn
-from torch.distributions import Distribution as TorchDistribution
-from torch.distributions import register_kl
+from torch.distributions import Bernoulli, Categorical, Distribution, Normal
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
+
+from sb3_saf.networks.spaces import AnySpace, SpaceSpec, spec_of
 
 #: Up to this many joint actions, a pool's entropy and most likely action are found by enumeration.
 MAX_ENUMERATED_ACTIONS: Final = 4096
@@ -37,39 +28,20 @@ _ENUMERATED_AT_ONCE: Final = 1 << 22
 _FORBIDDEN: Final = -1e8
 
 
-def n_action_parameters(action_space: spaces.Space[Any]) -> int:
+def n_action_parameters(action_space: AnySpace) -> int:
     """
-    P, the number of parameters of one policy's distribution.
+    Count P, the parameters of one policy's distribution.
 
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :raises ValueError: for any other space
     """
-    if isinstance(action_space, spaces.Box):
-        return 2 * get_action_dim(action_space)
-    if isinstance(action_space, spaces.MultiBinary):
-        return get_action_dim(action_space)
-    return sum(_choices(action_space))
+    space = spec_of(action_space)
+    return space.n_outputs * (2 if space.kind == "box" else 1)
 
 
-def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> Distribution:
+def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.Tensor) -> th.Tensor:
     """
-    SB3's distribution of a single policy.
-
-    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
-    :param parameters: (B, P)
-    """
-    distribution: Any = make_proba_distribution(action_space)
-    if isinstance(distribution, DiagGaussianDistribution):
-        mean, log_std = parameters.chunk(2, dim=1)
-        distribution.proba_distribution(mean, log_std)
-    else:
-        distribution.proba_distribution(action_logits=parameters)
-    return cast(Distribution, distribution)
-
-
-def masked_parameters(action_space: spaces.Space[Any], parameters: th.Tensor, masks: th.Tensor) -> th.Tensor:
-    """
-    Parameters of the policies with forbidden choices taken out.
+    Take forbidden choices out of the parameters of policies.
 
     A mask that allows none of the choices of an action dimension leaves them equally likely: such rows (agents that
     are out of the game) act, but teach nothing.
@@ -81,233 +53,95 @@ def masked_parameters(action_space: spaces.Space[Any], parameters: th.Tensor, ma
     :return: as ``parameters``
     :raises ValueError: if the masks do not fit, or the actions are of a Box
     """
-    if isinstance(action_space, spaces.Box):
+    space = spec_of(action_space)
+    if space.kind == "box":
         raise ValueError(f"continuous actions cannot be masked, got {action_space}")
-    n_choices = sum(_choices(action_space))
-    if masks.shape != (len(parameters), n_choices):
+    if masks.shape != (len(parameters), sum(space.choices)):
         raise ValueError(
-            f"expected action masks of shape {(len(parameters), n_choices)}, one flag for each choice of "
+            f"expected action masks of shape {(len(parameters), sum(space.choices))}, one flag for each choice of "
             f"{action_space}, got {tuple(masks.shape)}; let the environment's action_masks give that"
         )
-    if isinstance(action_space, spaces.MultiBinary):
+    if space.kind == "multi_binary":
         off, on = masks.unflatten(1, (-1, 2)).unbind(dim=2)
         kept, otherwise = off & on, _FORBIDDEN * (off.to(parameters.dtype) - on.to(parameters.dtype))
     else:
-        some = [
-            part.any(dim=1, keepdim=True).expand_as(part) for part in th.split(masks, _choices(action_space), dim=1)
-        ]
+        some = [part.any(dim=1, keepdim=True).expand_as(part) for part in th.split(masks, list(space.choices), dim=1)]
         kept, otherwise = masks, _FORBIDDEN * th.cat(some, dim=1).to(parameters.dtype)
     if parameters.dim() == 3:
         kept, otherwise = kept.unsqueeze(1), otherwise.unsqueeze(1)
     return parameters.where(kept, otherwise)
 
 
-def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
+# --- one policy -------------------------------------------------------------------------------------------------------
+
+
+def sample_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
     """
-    Log-probabilities of a mixture of categorical policies: log sum_u w_u pi_u(a).
+    Draw an action of one policy per row, with the random numbers that SB3's distributions would use.
 
-    :param log_weights: (B, U), normalised
-    :param logits: (B, U, A)
-    :return: (B, A), normalised
+    :param action_space: the action space
+    :param parameters: (B, P)
+    :return: (B, D)
     """
-    return (log_weights.unsqueeze(2) + logits.log_softmax(dim=2)).logsumexp(dim=1)
+    space = spec_of(action_space)
+    factors = _factors(space, parameters)
+    if space.is_one_hot:
+        return th.stack([factor.sample() for factor in factors], dim=1)
+    (joint,) = factors
+    return joint.rsample() if space.kind == "box" else joint.sample()
 
 
-def mixture_of(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> Distribution:
+def likeliest_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
     """
-    Exact mixture of a pool of policies: pi(a|o) = sum_u w_u(o) pi_u(a|o).
+    Find the most likely action of one policy per row.
 
-    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
-    :param log_weights: (B, U), normalised
+    :param action_space: the action space
+    :param parameters: (B, P)
+    :return: (B, D)
+    """
+    space = spec_of(action_space)
+    if space.kind == "box":
+        return parameters.chunk(2, dim=-1)[0]
+    if space.kind == "multi_binary":
+        return parameters.sigmoid().round()
+    return th.stack([part.softmax(dim=1).argmax(dim=1) for part in _split(space, parameters)], dim=1)
+
+
+def policy_log_probs(action_space: AnySpace, parameters: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Compute log-likelihoods under every policy of a pool.
+
+    :param action_space: the action space
     :param parameters: (B, U, P)
+    :param actions: (B, D)
+    :return: (B, U)
     """
-    if isinstance(action_space, spaces.Discrete):
-        logits = mixture_log_probs(log_weights, parameters)
-        return CategoricalDistribution(int(action_space.n)).proba_distribution(logits)
-    return PoolDistribution(action_space).proba_distribution(log_weights, parameters)
+    space = spec_of(action_space)
+    factors = _factors(space, parameters)
+    actions = actions.reshape(len(parameters), 1, -1)
+    if not space.is_one_hot:
+        (joint,) = factors
+        return joint.log_prob(actions).sum(dim=2)
+    chosen = zip(factors, actions.unbind(dim=2), strict=True)
+    return th.stack([factor.log_prob(action) for factor, action in chosen], dim=2).sum(dim=2)
 
 
-class _FromPool(Distribution):
-    """What SB3 asks of a distribution beside its mathematics."""
-
-    def __init__(self) -> None:
-        super().__init__()
-
-    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
-        """Not here: the networks are those of ``sb3_saf.networks.policy_pool.PolicyPool``."""
-        raise NotImplementedError(
-            "the parameters of a pool's distribution come from sb3_saf.networks.policy_pool.PolicyPool"
-        )
-
-    @abstractmethod
-    def proba_distribution(self, *args: Any, **kwargs: Any) -> Any:
-        """Set the parameters."""
-
-    def actions_from_params(self, *args: Any, deterministic: bool = False, **kwargs: Any) -> th.Tensor:
-        """Set the parameters (see ``proba_distribution``) and act."""
-        self.proba_distribution(*args, **kwargs)
-        return self.get_actions(deterministic=deterministic)
-
-    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Set the parameters (see ``proba_distribution``), sample, and give the sample's log-likelihood too."""
-        actions = self.actions_from_params(*args, **kwargs)
-        return actions, self.log_prob(actions)
+def _factors(space: SpaceSpec, parameters: th.Tensor) -> list[Distribution]:
+    """Torch's distributions: one of all dimensions (Box, MultiBinary), or one of each."""
+    if space.kind == "box":
+        mean, log_std = parameters.chunk(2, dim=-1)
+        return [Normal(mean, log_std.exp(), validate_args=False)]
+    if space.kind == "multi_binary":
+        return [Bernoulli(logits=parameters, validate_args=False)]
+    return [Categorical(logits=part, validate_args=False) for part in _split(space, parameters)]
 
 
-class PoolDistribution(_FromPool):
-    """
-    Mixture of a pool of policies over actions of several dimensions.
-
-    ``log_prob`` is exact. ``entropy`` and ``mode`` are exact while there are at most ``MAX_ENUMERATED_ACTIONS`` joint
-    actions. Beyond, and for Box actions, the entropy is None (no closed form; SB3 then estimates it by -log_prob),
-    and the mode is that of the likeliest policy.
-
-    :param action_space: MultiDiscrete, MultiBinary or Box
-    """
-
-    log_weights: th.Tensor
-    parameters: th.Tensor
-
-    def __init__(self, action_space: spaces.Space[Any]):
-        super().__init__()
-        self.action_space = action_space
-        self._choices = None if isinstance(action_space, spaces.Box) else _choices(action_space)
-        self.enumerable = self._choices is not None and prod(self._choices) <= MAX_ENUMERATED_ACTIONS
-
-    def proba_distribution(self, log_weights: th.Tensor, parameters: th.Tensor) -> PoolDistribution:
-        """
-        Set the parameters.
-
-        :param log_weights: (B, U), normalised
-        :param parameters: (B, U, P)
-        """
-        self.log_weights, self.parameters = log_weights, parameters
-        return self
-
-    @property
-    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # read-only
-        """What TRPO compares: the distribution of policy and action together."""
-        return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
-
-    def log_prob(self, actions: th.Tensor) -> th.Tensor:
-        """
-        Log-likelihood by logsumexp over policies.
-
-        :param actions: (B, D)
-        :return: (B,)
-        """
-        n_rows, n_policies = self.log_weights.shape
-        policies = distribution_of(self.action_space, self.parameters.flatten(0, 1))
-        by_policy = policies.log_prob(actions.repeat_interleave(n_policies, dim=0)).view(n_rows, n_policies)
-        return (self.log_weights + by_policy).logsumexp(dim=1)
-
-    def entropy(self) -> th.Tensor | None:
-        """(B,) exact by enumeration, or None."""
-        return self._over_joint_actions(_entropy) if self.enumerable else None
-
-    def sample(self) -> th.Tensor:
-        """(B, D): draw a policy, then its action."""
-        drawn = th.multinomial(self.log_weights.exp(), 1).squeeze(1)
-        return distribution_of(self.action_space, policy_parameters(self.parameters, drawn)).sample()
-
-    def mode(self) -> th.Tensor:
-        """(B, D): the most likely joint action, or the mode of the likeliest policy where they cannot be enumerated."""
-        if self._choices is None or not self.enumerable:
-            likeliest = self.log_weights.argmax(dim=1)
-            return distribution_of(self.action_space, policy_parameters(self.parameters, likeliest)).mode()
-        best = self._over_joint_actions(_argmax)
-        joint_actions = th.tensor(list(product(*map(range, self._choices))), device=best.device)
-        # SB3's MultiBinary actions are floats.
-        return joint_actions[best].to(
-            self.parameters.dtype if isinstance(self.action_space, spaces.MultiBinary) else th.int64
-        )
-
-    def _over_joint_actions(self, reduce: Callable[[th.Tensor], th.Tensor]) -> th.Tensor:
-        """(B,) of a function of the mixture's joint log-probabilities (rows, J), in parts of bounded memory."""
-        assert self._choices is not None
-
-        def part(log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-            joint = _joint_log_probs(self.action_space, parameters)
-            return reduce((log_weights.unsqueeze(2) + joint).logsumexp(dim=1))
-
-        rows_at_once = max(1, _ENUMERATED_AT_ONCE // (self.log_weights.shape[1] * prod(self._choices)))
-        parts = list(
-            zip(th.split(self.log_weights, rows_at_once), th.split(self.parameters, rows_at_once), strict=True)
-        )
-        if len(parts) == 1:
-            return part(*parts[0])
-        return th.cat([checkpoint(part, *arguments, use_reentrant=False) for arguments in parts])
+def _split(space: SpaceSpec, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
+    """The logits of each action dimension."""
+    return th.split(parameters, list(space.choices), dim=-1)
 
 
-class PolicyAndAction(TorchDistribution):
-    """
-    Which policy is drawn, and what it does: here for its divergence, KL(w || w') + sum_u w_u KL(pi_u || pi'_u).
-
-    That is never less than the divergence of the mixtures, which has no closed form (the policy is one more thing to
-    tell them apart by), and zero where nothing differs: who stays within it, as TRPO does, stays within the other.
-
-    :param log_weights: (B, U), normalised
-    :param policies: distribution of B * U rows, those of a mixture's policies consecutive
-    """
-
-    arg_constraints: ClassVar[dict[str, Any]] = {}
-
-    def __init__(self, log_weights: th.Tensor, policies: Distribution):
-        super().__init__(log_weights.shape[:1], validate_args=False)
-        self.log_weights = log_weights
-        self.policies = policies
-
-
-@register_kl(PolicyAndAction, PolicyAndAction)
-def _divergence(one: PolicyAndAction, other: PolicyAndAction) -> th.Tensor:
-    """(B,) see :class:`PolicyAndAction`."""
-    weights = one.log_weights.exp()
-    # SB3 gives one number per row, or one per action dimension.
-    of_actions = kl_divergence(one.policies, other.policies).reshape(*weights.shape, -1).sum(dim=2)
-    return (weights * (one.log_weights - other.log_weights + of_actions)).sum(dim=1)
-
-
-class SelectedDistribution(_FromPool):
-    """
-    The distribution of the one policy that was drawn; deterministic actions are those of the favourite policy.
-
-    :param drawn: distribution of the policy drawn for each row
-    :param favourite: distribution of the policy with the highest selection logit of each row
-    """
-
-    def __init__(self, drawn: Distribution, favourite: Distribution):
-        super().__init__()
-        self.drawn = drawn
-        self.favourite = favourite
-
-    @property
-    def distribution(self) -> TorchDistribution:  # type: ignore[override]  # read-only
-        """Not there: TRPO would compare policies drawn at different times."""
-        raise ValueError(
-            "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
-            "(TRPO's KL divergence) says nothing; use selection='mixture'"
-        )
-
-    def proba_distribution(self, *args: Any, **kwargs: Any) -> SelectedDistribution:
-        """Set the parameters of the drawn policy."""
-        self.drawn.proba_distribution(*args, **kwargs)
-        return self
-
-    def log_prob(self, actions: th.Tensor) -> th.Tensor:
-        """(B,) log-likelihood under the drawn policy."""
-        return self.drawn.log_prob(actions)
-
-    def entropy(self) -> th.Tensor | None:
-        """(B,) entropy of the drawn policy."""
-        return self.drawn.entropy()
-
-    def sample(self) -> th.Tensor:
-        """Sample from the drawn policy."""
-        return self.drawn.sample()
-
-    def mode(self) -> th.Tensor:
-        """Most likely action of the favourite policy."""
-        return self.favourite.mode()
+# --- a pool of policies -----------------------------------------------------------------------------------------------
 
 
 def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
@@ -321,26 +155,106 @@ def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
     return parameters[th.arange(len(policy), device=policy.device), policy]
 
 
-def _choices(action_space: spaces.Space[Any]) -> list[int]:
-    """Number of choices of each action dimension."""
-    if isinstance(action_space, spaces.Discrete):
-        return [int(action_space.n)]
-    if isinstance(action_space, spaces.MultiDiscrete) and action_space.nvec.ndim == 1:
-        return [int(n) for n in action_space.nvec]
-    if isinstance(action_space, spaces.MultiBinary):
-        return [2] * get_action_dim(action_space)
-    raise ValueError(
-        f"expected a Discrete, MultiDiscrete (of one axis), MultiBinary or Box action space, got {action_space}; "
-        "flatten the actions in a wrapper of the environment"
-    )
+def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
+    """
+    Log-probabilities of a mixture of categorical policies: log sum_u w_u pi_u(a).
+
+    :param log_weights: (B, U), normalised
+    :param logits: (B, U, A)
+    :return: (B, A), normalised
+    """
+    return (log_weights.unsqueeze(2) + logits.log_softmax(dim=2)).logsumexp(dim=1)
 
 
-def _joint_log_probs(action_space: spaces.Space[Any], parameters: th.Tensor) -> th.Tensor:
+def mixture_log_prob(
+    action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor, actions: th.Tensor
+) -> th.Tensor:
+    """
+    Log-likelihood of a mixture, exactly: log sum_u w_u pi_u(a).
+
+    :param action_space: the action space
+    :param log_weights: (B, U)
+    :param parameters: (B, U, P)
+    :param actions: (B, D)
+    :return: (B,)
+    """
+    return (log_weights + policy_log_probs(action_space, parameters, actions)).logsumexp(dim=1)
+
+
+def mixture_sample(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+    """
+    Draw a policy by its weight, then its action.
+
+    :param action_space: the action space
+    :param log_weights: (B, U)
+    :param parameters: (B, U, P)
+    :return: (B, D)
+    """
+    drawn = th.multinomial(log_weights.exp(), 1).squeeze(1)
+    return sample_action(action_space, policy_parameters(parameters, drawn))
+
+
+def is_enumerable(action_space: AnySpace) -> bool:
+    """Whether a mixture's entropy and most likely action are found by trying all joint actions."""
+    space = spec_of(action_space)
+    return space.kind != "box" and prod(space.choices) <= MAX_ENUMERATED_ACTIONS
+
+
+def mixture_mode(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+    """
+    Find a mixture's most likely action, or that of its likeliest policy where actions cannot be enumerated.
+
+    :param action_space: the action space
+    :param log_weights: (B, U)
+    :param parameters: (B, U, P)
+    :return: (B, D)
+    """
+    space = spec_of(action_space)
+    if not is_enumerable(space):
+        return likeliest_action(space, policy_parameters(parameters, log_weights.argmax(dim=1)))
+    best = _over_joint_actions(space, log_weights, parameters, _argmax)
+    joint_actions = th.tensor(list(product(*map(range, space.choices))), device=best.device)
+    # SB3's MultiBinary actions are floats.
+    return joint_actions[best].to(parameters.dtype if space.kind == "multi_binary" else th.int64)
+
+
+def mixture_entropy(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor | None:
+    """
+    Entropy of a mixture by enumeration; None where actions cannot be enumerated.
+
+    :param action_space: the action space
+    :param log_weights: (B, U)
+    :param parameters: (B, U, P)
+    :return: (B,) or None
+    """
+    space = spec_of(action_space)
+    return _over_joint_actions(space, log_weights, parameters, _entropy) if is_enumerable(space) else None
+
+
+def _over_joint_actions(
+    space: SpaceSpec, log_weights: th.Tensor, parameters: th.Tensor, reduce: Callable[[th.Tensor], th.Tensor]
+) -> th.Tensor:
+    """(B,) of a function of the mixture's joint log-probabilities (rows, J), in parts of bounded memory."""
+
+    def part(log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        joint = _joint_log_probs(space, parameters)
+        return reduce((log_weights.unsqueeze(2) + joint).logsumexp(dim=1))
+
+    if th.compiler.is_compiling():
+        return part(log_weights, parameters)
+    rows_at_once = max(1, _ENUMERATED_AT_ONCE // (log_weights.shape[1] * prod(space.choices)))
+    parts = list(zip(th.split(log_weights, rows_at_once), th.split(parameters, rows_at_once), strict=True))
+    if len(parts) == 1:
+        return part(*parts[0])
+    return th.cat([checkpoint(part, *arguments, use_reentrant=False) for arguments in parts])
+
+
+def _joint_log_probs(space: SpaceSpec, parameters: th.Tensor) -> th.Tensor:
     """(B, U, J) log-probabilities of every joint action under every policy, the last action dimension fastest."""
-    if isinstance(action_space, spaces.MultiBinary):
+    if space.kind == "multi_binary":
         factors = list(th.stack([F.logsigmoid(-parameters), F.logsigmoid(parameters)], dim=3).unbind(dim=2))
     else:
-        factors = [logits.log_softmax(dim=2) for logits in th.split(parameters, _choices(action_space), dim=2)]
+        factors = [logits.log_softmax(dim=2) for logits in _split(space, parameters)]
     joint = factors[0]
     for factor in factors[1:]:
         joint = (joint.unsqueeze(3) + factor.unsqueeze(2)).flatten(2)

@@ -1,51 +1,55 @@
 """
-Encoders: features extractors for one agent's own observation. Letters: K views, C channels, H x W pixels, t pixels
-per tile.
+Encoders: networks that read one agent's own observation. Letters: K observations, C channels, H x W pixels, t pixels
+per tile, d features.
 
-Each takes raw observations (uint8 pictures, tile codes, indices) as well as what SB3 makes of them before it calls a
-features extractor (floats in [0, 1], one-hot vectors), so each also serves plain SB3 policies. A *tile-code space* is
-any Box of whole numbers with an attribute ``atlas`` (n_codes, t, t, C) that holds the pixels of every code; its codes
-become pixels on the training device. Encoders of tiles and of the same pictures have the same weights and give the
-same features; on the CPU, those whose first layer allows it look up what tiles add to it instead of making pixels
-(``sb3_saf.networks.tile_sums``).
+Each takes raw observations (uint8 pictures, tile codes, indices) as well as what :func:`preprocess` makes of them
+(floats in [0, 1], one-hot vectors). *Tile codes* are whole numbers that come with an atlas (n_codes, t, t, C) of the
+pixels of every code; they become pixels on the device of the network. Encoders of tiles and of the same pictures have
+the same weights and give the same features. Policies use them through ``sb3_saf.policies.extractors``, exported actors
+as they are.
 """
 
 from __future__ import annotations
 
-import warnings
-from typing import Any, Final, Literal
+from math import prod
+from typing import Final, Literal
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
 from sb3_saf.networks.layers import HIDDEN_GAIN, Linear, mlp
-from sb3_saf.networks.tile_sums import (
-    Places,
-    places_of_convolution,
-    places_of_linear,
-    rectified_sums,
-    table_of_convolution,
-    used_codes,
-)
+from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec
 
 #: The least side of a picture from which NatureCNN's convolutions leave something.
 NATURE_PIXELS: Final = 36
-#: Up to this many pixels the paper's encoder is the default; from there on it grows beyond 7 million weights.
-_PAPERS_PIXELS: Final = 64 * 64
-#: More pixels, or more weights, than anybody wants to train on without being asked.
-_MANY_PIXELS: Final = 128 * 128
-_MANY_WEIGHTS: Final = 10_000_000
 #: A one-hot code is as long as the pixels of a tile, roughly.
 _ONE_HOT_SCALE: Final = 2.0
 
 
-def is_tile_space(space: spaces.Space[Any]) -> bool:
-    """Whether the observations of a space are tile codes (see the module's docstring)."""
-    return isinstance(space, spaces.Box) and hasattr(space, "atlas")
+def preprocess(observations: th.Tensor, space: SpaceSpec, normalize_images: bool = True) -> th.Tensor:
+    """
+    Make floats of raw observations, as SB3 does before it calls a features extractor.
+
+    :param observations: (K, *shape)
+    :param space: of one observation
+    :param normalize_images: whether pictures of bytes are scaled to [0, 1]
+    :return: (K, *shape) float, or (K, n) one-hot vectors of Discrete and MultiDiscrete
+    """
+    if space.is_one_hot:
+        columns = observations.reshape(-1, len(space.choices)).long()
+        hot = [columns[:, i : i + 1] == th.arange(n, device=columns.device) for i, n in enumerate(space.choices)]
+        return th.cat(hot, dim=1).float()
+    floats = observations.float()
+    return floats / 255.0 if space.picture and normalize_images else floats
+
+
+class Encoder(nn.Module):
+    """Base of all encoders."""
+
+    def __init__(self) -> None:
+        # Not super(): between this and SB3's extractors that inherit from it stands a class that needs arguments.
+        nn.Module.__init__(self)
 
 
 class PixelInput(nn.Module):
@@ -54,34 +58,28 @@ class PixelInput(nn.Module):
 
     The result is a channels-first tensor whose memory is channels-last, which is what convolutions are fastest on.
 
-    :param observation_space: a Box of shape (C, H, W) or (H, W, C), or a tile-code space of shape (rows, columns)
+    :param observation: a Box of shape (C, H, W) or (H, W, C), or of tile codes (rows, columns)
     """
 
     atlas: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space[Any]):
+    def __init__(self, observation: ObservationSpec | AnySpace):
         super().__init__()
+        space, atlas = observation_spec(observation)
         self.layout: Literal["codes", "channels_first", "channels_last"]
-        if is_tile_space(observation_space):
+        if atlas is not None:
             self.layout = "codes"
-            atlas = _checked_atlas(observation_space)
             # Not part of the state dict: what codes look like belongs to the space, and weights fit pictures as well.
-            self.register_buffer("atlas", atlas.float() / 255.0, persistent=False)
-            _, tile, _, channels = atlas.shape
-            rows, columns = observation_space.shape or ()
-            self.shape = (channels, rows * tile, columns * tile)
-            return
-        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 3:
+            # from_numpy, because it makes numbers even where networks are made without (on the device "meta").
+            self.register_buffer("atlas", th.from_numpy(np.array(atlas)).float() / 255.0, persistent=False)
+        elif space.kind != "box" or len(space.shape) != 3:
             raise ValueError(
-                f"expected pictures, a Box of three axes, or tile codes with an atlas, got {observation_space}; "
+                f"expected pictures, a Box of three axes, or tile codes with an atlas, got {space}; "
                 "use MLPEncoder or a features_extractor_class of your own"
             )
-        height, width, channels = shape = observation_space.shape
-        self.layout = "channels_last"
-        if int(np.argmin(shape)) == 0:  # as SB3 tells the two layouts apart
-            self.layout = "channels_first"
-            channels, height, width = shape
-        self.shape = (channels, height, width)
+        else:
+            self.layout = "channels_first" if space.shape == space.picture_shape else "channels_last"
+        self.shape = space.picture_shape
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
@@ -99,25 +97,9 @@ class PixelInput(nn.Module):
             pictures = pictures.permute(0, 3, 1, 2)
         return pictures.contiguous(memory_format=th.channels_last)
 
-    def looks_up(self, observations: th.Tensor) -> bool:
-        """Whether a first layer may look up what tiles add to it: codes on the CPU. Elsewhere products are cheaper."""
-        return self.layout == "codes" and observations.device.type == "cpu"
-
     def tiles(self, codes: th.Tensor) -> th.Tensor:
         """(U, C, t, t) pictures of single tiles: (U,) codes."""
         return self.atlas[codes].permute(0, 3, 1, 2)
-
-
-def _checked_atlas(space: Any) -> th.Tensor:
-    """(n_codes, t, t, C) uint8 pixels of every code."""
-    atlas = np.asarray(space.atlas)
-    square = atlas.ndim == 4 and atlas.shape[1] == atlas.shape[2]
-    if not square or atlas.dtype != np.uint8 or len(space.shape) != 2 or int(space.high.max()) >= len(atlas):
-        raise ValueError(
-            "expected tile codes of shape (rows, columns) with an atlas (n_codes, tile, tile, channels) of uint8 that "
-            f"has every code, got {space} with an atlas of shape {atlas.shape} and dtype {atlas.dtype}"
-        )
-    return th.tensor(atlas)
 
 
 class _FlattenPictures(nn.Flatten):
@@ -134,19 +116,19 @@ def _channels_last(gradient: th.Tensor) -> th.Tensor:
     return gradient.contiguous(memory_format=th.channels_last)
 
 
-class PaperCNN(BaseFeaturesExtractor):
+class PaperCNN(Encoder):
     """
     The paper's encoder: convolutions 4x4/2 -> 32 and 3x3/2 -> 64, linear 512, linear ``features_dim``, ReLU between.
 
     A 28 x 28 x 3 view gives 2,304 numbers after the convolutions, and the encoder has 1,233,056 parameters.
 
-    :param observation_space: pictures (either layout) or tile codes
+    :param observation: pictures (either layout) or tile codes
     :param features_dim: size of the features
     """
 
-    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
-        super().__init__(observation_space, features_dim)
-        self.pixels = PixelInput(observation_space)
+    def __init__(self, observation: ObservationSpec | AnySpace, features_dim: int = 64):
+        super().__init__()
+        self.pixels = PixelInput(observation)
         channels, height, width = self.pixels.shape
         out_height, out_width = _after_convolutions(height), _after_convolutions(width)
         if min(out_height, out_width) < 1:
@@ -164,32 +146,18 @@ class PaperCNN(BaseFeaturesExtractor):
             nn.ReLU(inplace=True),
             Linear(512, features_dim, gain=HIDDEN_GAIN),
         )
-        self._places: Places | None = None
-        if self.pixels.layout == "codes" and (tile := self.pixels.atlas.shape[1]) % 2 == 0:
-            self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) views to (K, features_dim)."""
-        if self._places is None or not self.pixels.looks_up(observations):
-            features: th.Tensor = self.net(self.pixels(observations))
-            return features
-        looked_up: th.Tensor = self.net[2:](self._first_layer(observations, self._places))
-        return looked_up
-
-    def _first_layer(self, codes: th.Tensor, places: Places) -> th.Tensor:
-        """(K, 32, h, w) outputs of the first convolution and its ReLU: (K, rows, columns)."""
-        first = self.net[0]
-        assert isinstance(first, nn.Conv2d) and first.bias is not None
-        used = used_codes(codes.flatten(1))
-        table = table_of_convolution(self.pixels.tiles(used.codes), first.weight, stride=2)
-        return rectified_sums(used.views, table, first.bias, places)
+        """(K, *shape) observations to (K, features_dim)."""
+        features: th.Tensor = self.net(self.pixels(observations))
+        return features
 
 
 def _after_convolutions(size: int) -> int:
     return ((size - 4) // 2 + 1 - 3) // 2 + 1 if size >= 4 else 0
 
 
-class NatureEncoder(BaseFeaturesExtractor):
+class NatureEncoder(Encoder):
     """
     The encoder for larger pictures: SB3's ``NatureCNN`` (convolutions 8x8/4 -> 32, 4x4/2 -> 64, 3x3/1 -> 64, linear
     ``features_dim``, ReLU after each).
@@ -197,28 +165,52 @@ class NatureEncoder(BaseFeaturesExtractor):
     Its steps are larger than the paper's and nothing wide follows them: at 84 x 84 x 3 it has 0.3 million weights where
     ``PaperCNN`` has 13 million, and is six times faster; at 280 x 480 it has 7 million instead of 269 million.
 
-    :param observation_space: pictures (either layout) or tile codes, 36 x 36 pixels or more
+    :param observation: pictures (either layout) or tile codes, 36 x 36 pixels or more
     :param features_dim: size of the features
     """
 
-    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
-        super().__init__(observation_space, features_dim)
-        self.pixels = PixelInput(observation_space)
+    def __init__(self, observation: ObservationSpec | AnySpace, features_dim: int = 64):
+        super().__init__()
+        self.pixels = PixelInput(observation)
         _, height, width = self.pixels.shape
         if min(height, width) < NATURE_PIXELS:
             raise ValueError(
                 f"NatureEncoder needs pictures of at least {NATURE_PIXELS} x {NATURE_PIXELS} pixels, got {height} x "
                 f"{width}; use features_extractor_class=sb3_saf.PaperCNN"
             )
-        self.nature = NatureCNN(spaces.Box(0, 255, self.pixels.shape, np.uint8), features_dim)
+        self.nature = _NatureCNN(self.pixels.shape, features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) views to (K, features_dim)."""
+        """(K, *shape) observations to (K, features_dim)."""
         features: th.Tensor = self.nature(self.pixels(observations))
         return features
 
 
-class LightEncoder(BaseFeaturesExtractor):
+class _NatureCNN(nn.Module):
+    """SB3's ``NatureCNN``, with the same names and the same first weights, without SB3."""
+
+    def __init__(self, shape: tuple[int, int, int], features_dim: int):
+        super().__init__()
+        channels, height, width = shape
+        out = [(((size - 8) // 4 + 1 - 4) // 2 + 1 - 3) + 1 for size in (height, width)]
+        self.cnn = nn.Sequential(
+            nn.Conv2d(channels, 32, kernel_size=8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, kernel_size=3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        self.linear = nn.Sequential(nn.Linear(64 * prod(out), features_dim), nn.ReLU())
+
+    def forward(self, pictures: th.Tensor) -> th.Tensor:
+        """(K, C, H, W) to (K, d)."""
+        features: th.Tensor = self.linear(self.cnn(pictures))
+        return features
+
+
+class LightEncoder(Encoder):
     """
     An encoder for small computers: one linear embedding for every tile, linear 128, ReLU, linear ``features_dim``.
 
@@ -228,7 +220,7 @@ class LightEncoder(BaseFeaturesExtractor):
     is in the way: an agent in orange means other actions than one in red. ``one_hot_codes`` tells them apart, but then
     what was learned of one tile helps less with its likes (measured: ``results/README.md``).
 
-    :param observation_space: pictures (either layout) or tile codes
+    :param observation: pictures (either layout) or tile codes
     :param features_dim: size of the features
     :param tile_size: t, pixels per tile of pictures; tile codes bring their own
     :param embedding_dim: size of a tile's embedding
@@ -242,15 +234,15 @@ class LightEncoder(BaseFeaturesExtractor):
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
+        observation: ObservationSpec | AnySpace,
         features_dim: int = 64,
         tile_size: int = 4,
         embedding_dim: int = 16,
         hidden: int = 128,
         one_hot_codes: bool = False,
     ):
-        super().__init__(observation_space, features_dim)
-        self.pixels = PixelInput(observation_space)
+        super().__init__()
+        self.pixels = PixelInput(observation)
         self.tile_size = self.pixels.atlas.shape[1] if self.pixels.layout == "codes" else tile_size
         channels, height, width = self.pixels.shape
         if height % self.tile_size or width % self.tile_size:
@@ -259,7 +251,7 @@ class LightEncoder(BaseFeaturesExtractor):
                 f"tile_size={tile_size}; "
                 'pass features_extractor_kwargs={"tile_size": ...}'
             )
-        n_tiles = height * width // self.tile_size**2
+        self.n_tiles = height * width // self.tile_size**2
         n_inputs = self.tile_size**2 * channels
         if self.pixels.layout == "codes":
             self.register_buffer("tile_inputs", self._inputs_of_codes(one_hot_codes), persistent=False)
@@ -267,17 +259,13 @@ class LightEncoder(BaseFeaturesExtractor):
         elif one_hot_codes:
             raise ValueError(
                 'one_hot_codes=True needs tile codes, as make_team_env(..., observation="tiles") gives them (a Box of '
-                f"whole numbers with an atlas), got pictures {observation_space.shape}; leave it False"
+                f"whole numbers with an atlas), got pictures {self.pixels.shape}; leave it False"
             )
         self.embed = Linear(n_inputs, embedding_dim, gain=HIDDEN_GAIN)
-        self.net = mlp([n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
-        self._places = places_of_linear(n_tiles)
+        self.net = mlp([self.n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) views to (K, features_dim)."""
-        if self.pixels.looks_up(observations):
-            looked_up: th.Tensor = self.net[2:](self._first_layer(observations))
-            return looked_up
+        """(K, *shape) observations to (K, features_dim)."""
         if self.pixels.layout == "codes":
             by_code = self.embed(self.tile_inputs)
             tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
@@ -286,21 +274,14 @@ class LightEncoder(BaseFeaturesExtractor):
         features: th.Tensor = self.net(tiles.flatten(1))
         return features
 
-    def _first_layer(self, codes: th.Tensor) -> th.Tensor:
-        """(K, hidden) outputs of the first linear layer and its ReLU: (K, rows, columns)."""
-        first = self.net[0]
-        assert isinstance(first, nn.Linear)
-        used = used_codes(codes.flatten(1))
-        embedded = self.embed(self.tile_inputs[used.codes])
-        # Weights are (hidden, T * e): what a code adds at each of the T places, (U, T, hidden).
-        by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
-        table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
-        return rectified_sums(used.views, table, first.bias, self._places)
-
     def _inputs_of_codes(self, one_hot: bool) -> th.Tensor:
         """(n_codes, inputs) what the embedding reads of every tile."""
         pixels = self.pixels.atlas.flatten(1)
-        return th.cat([pixels, _ONE_HOT_SCALE * th.eye(len(pixels))], dim=1) if one_hot else pixels
+        return (
+            th.cat([pixels, _ONE_HOT_SCALE * th.from_numpy(np.eye(len(pixels), dtype=np.float32))], dim=1)
+            if one_hot
+            else pixels
+        )
 
     def _cut(self, pictures: th.Tensor) -> th.Tensor:
         """(K, tiles, t * t * C) pixels of each tile, in the order of an atlas: (K, C, H, W)."""
@@ -310,89 +291,23 @@ class LightEncoder(BaseFeaturesExtractor):
         return tiles.reshape(len(pictures), -1, t * t * channels)
 
 
-class MLPEncoder(BaseFeaturesExtractor):
+class MLPEncoder(Encoder):
     """
     An encoder for vectors: linear 128, tanh, linear ``features_dim``. Whole-number spaces are read as one-hot vectors.
 
-    :param observation_space: Box (flattened), Discrete, MultiDiscrete or MultiBinary
+    :param observation: Box (flattened), Discrete, MultiDiscrete or MultiBinary
     :param features_dim: size of the features
     :param hidden: size of the hidden layer
     """
 
-    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64, hidden: int = 128):
-        super().__init__(observation_space, features_dim)
-        self.net = mlp(
-            [get_flattened_obs_dim(observation_space), hidden, features_dim], nn.Tanh, output_gain=HIDDEN_GAIN
-        )
+    def __init__(self, observation: ObservationSpec | AnySpace, features_dim: int = 64, hidden: int = 128):
+        super().__init__()
+        self.space = observation_spec(observation).space
+        self.net = mlp([self.space.n_inputs, hidden, features_dim], nn.Tanh, output_gain=HIDDEN_GAIN)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations, raw or made one-hot by SB3, to (K, features_dim)."""
+        """(K, *shape) observations, raw or preprocessed, to (K, features_dim)."""
         if not observations.is_floating_point():
-            observations = _as_floats(observations, self._observation_space)
+            observations = preprocess(observations, self.space, normalize_images=False)
         features: th.Tensor = self.net(observations.flatten(1))
         return features
-
-
-def _as_floats(observations: th.Tensor, space: spaces.Space[Any]) -> th.Tensor:
-    result = preprocess_obs(observations, space, normalize_images=False)
-    assert isinstance(result, th.Tensor)
-    return result
-
-
-class ObservationEncoder(BaseFeaturesExtractor):
-    """
-    The default encoder, chosen by space: for pictures (uint8, 0..255) and tile codes :class:`PaperCNN`, or
-    :class:`NatureEncoder` if they have more than 64 x 64 pixels; for all else :class:`MLPEncoder`.
-
-    Warns of pictures that make training slow whatever encodes them.
-
-    :param observation_space: one agent's own observation space
-    :param features_dim: size of the features
-    """
-
-    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
-        super().__init__(observation_space, features_dim)
-        self.encoder: BaseFeaturesExtractor = _encoder_class(observation_space)(observation_space, features_dim)
-        if not isinstance(self.encoder, MLPEncoder):
-            _warn_if_large(self.encoder, observation_space)
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
-        features: th.Tensor = self.encoder(observations)
-        return features
-
-
-def _encoder_class(space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:
-    if not (is_tile_space(space) or is_image_space(space)):
-        return MLPEncoder
-    _, height, width = PixelInput(space).shape
-    if height * width <= _PAPERS_PIXELS or min(height, width) < NATURE_PIXELS:
-        return PaperCNN
-    return NatureEncoder
-
-
-def _warn_if_large(encoder: BaseFeaturesExtractor, space: spaces.Space[Any]) -> None:
-    _, height, width = PixelInput(space).shape
-    n_weights = sum(parameter.numel() for parameter in encoder.parameters())
-    if height * width <= _MANY_PIXELS and n_weights <= _MANY_WEIGHTS:
-        return
-    warnings.warn(
-        f"observations of {space} have {height} x {width} pixels, for which {type(encoder).__name__} has "
-        f"{n_weights:,} weights and is slow. Shrink them in the environment (supersuit.resize_v1(env, 84, 84), "
-        'supersuit.color_reduction_v0(env, "B")), or choose another encoder, policy_kwargs={"features_extractor_class":'
-        ' ...}: sb3_saf.LightEncoder with features_extractor_kwargs={"tile_size": ...} for pictures made of tiles, or '
-        "one of your own",
-        UserWarning,
-        stacklevel=3,
-    )
-
-
-__all__ = [
-    "LightEncoder",
-    "MLPEncoder",
-    "NatureEncoder",
-    "ObservationEncoder",
-    "PaperCNN",
-    "PixelInput",
-    "is_tile_space",
-]

@@ -8,39 +8,18 @@ Letters: K rows, U policies, d features, P parameters of one policy's action dis
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
-from sb3_saf.networks.actor import ActionHead, ActorNetwork
-from sb3_saf.networks.distributions import (
-    SelectedDistribution,
-    distribution_of,
-    masked_parameters,
-    mixture_log_probs,
-    mixture_of,
-    n_action_parameters,
-    policy_parameters,
-)
+from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
+from sb3_saf.networks.distributions import mixture_log_probs, n_action_parameters, policy_parameters
 from sb3_saf.networks.layers import mlp
+from sb3_saf.networks.spaces import AnySpace
 
 #: How the pool acts: as the exact mixture of its policies, or through one policy drawn anew at every evaluation.
 Selection = Literal["mixture", "gumbel"]
-
-
-class PoolOutput(NamedTuple):
-    """
-    What each policy of the pool would do, and how likely each is to be chosen.
-
-    :param log_weights: (K, U), normalised
-    :param actions: (K, U, P), parameters of each policy's action distribution
-    """
-
-    log_weights: th.Tensor
-    actions: th.Tensor
 
 
 class PolicyPool(ActorNetwork):
@@ -71,7 +50,7 @@ class PolicyPool(ActorNetwork):
     def __init__(
         self,
         features_dim: int,
-        action_space: spaces.Space[Any],
+        action_space: AnySpace,
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
         n_policies: int,
@@ -92,13 +71,7 @@ class PolicyPool(ActorNetwork):
         )
 
     def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
-        """
-        Ask every policy and weigh them.
-
-        :param features: (K, d)
-        :param agent: (K,) int64 index of the agent, where ``reads_agent``
-        :return: log weights (K, U) and action parameters (K, U, P)
-        """
+        """See :class:`ActorNetwork`."""
         features = self.with_identity(features, agent)
         logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
         return PoolOutput(logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1))
@@ -111,7 +84,7 @@ class PolicyPool(ActorNetwork):
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
         :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
         """
-        if self._is_categorical_mixture:
+        if self.is_categorical_mixture:
             return mixture_log_probs(*self.evaluate(features, agent))
         return self.unmixed(features, agent)
 
@@ -120,37 +93,19 @@ class PolicyPool(ActorNetwork):
         log_weights, actions = self.evaluate(features, agent)
         return th.cat([log_weights, actions.flatten(1)], dim=1)
 
-    def distribution(self, parameters: th.Tensor) -> Distribution:
-        """See :class:`ActorNetwork`."""
-        if self._is_categorical_mixture:
-            return distribution_of(self.action_space, parameters)
-        return self._of_pool(self._split(parameters))
+    def split(self, parameters: th.Tensor) -> PoolOutput:
+        """
+        Take what :meth:`unmixed` gave apart.
 
-    def masked_distribution(self, parameters: th.Tensor, masks: th.Tensor) -> Distribution:
-        """See :class:`ActorNetwork`; masked before mixing: masks leave the choice of a policy as it is."""
-        log_weights, actions = self._split(parameters)
-        return self._of_pool(PoolOutput(log_weights, masked_parameters(self.action_space, actions, masks)))
-
-    def _split(self, parameters: th.Tensor) -> PoolOutput:
-        """Weights and parameters of B rows, out of (B, U + U P)."""
+        :param parameters: (B, U + U P)
+        """
         log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
-        shape = (-1, self.n_policies, n_action_parameters(self.action_space))
-        return PoolOutput(log_weights, flat.reshape(shape))
-
-    def _of_pool(self, output: PoolOutput) -> Distribution:
-        log_weights, actions = output
-        if self.selection == "mixture":
-            return mixture_of(self.action_space, log_weights, actions)
-        favourite = policy_parameters(actions, log_weights.argmax(dim=1))
-        return SelectedDistribution(
-            drawn=distribution_of(self.action_space, draw_policy(log_weights, actions)),
-            favourite=distribution_of(self.action_space, favourite),
-        )
+        return PoolOutput(log_weights, flat.reshape(-1, self.n_policies, n_action_parameters(self.space)))
 
     @property
-    def _is_categorical_mixture(self) -> bool:
+    def is_categorical_mixture(self) -> bool:
         """Whether the pool's distribution is one categorical: the mixture is then computed before rows are gathered."""
-        return self.selection == "mixture" and isinstance(self.action_space, spaces.Discrete)
+        return self.selection == "mixture" and self.space.kind == "discrete"
 
 
 def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:

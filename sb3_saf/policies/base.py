@@ -26,11 +26,12 @@ from torch import nn
 from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
-from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.gather import gather_agents
 from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
 from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.networks.views import OwnViews
+from sb3_saf.policies.distributions import actor_distribution
+from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import NetworkSpec, TeamParts
 from sb3_saf.policies.rows import TeamRowsPolicy, entry_of, pop_named
 
@@ -228,8 +229,9 @@ class TeamPolicy(TeamRowsPolicy):
         if action_masks is not None:
             masks = action_masks if masks is None else masks & action_masks
         if masks is None:
-            return self.actor.distribution(self.views.per_agent(self.actor, own, agent))
-        return self.actor.masked_distribution(self.views.per_agent(self.actor.unmixed, own, agent), masks)
+            return actor_distribution(self.actor, self.action_space, self.views.per_agent(self.actor, own, agent))
+        unmixed = self.views.per_agent(self.actor.unmixed, own, agent)
+        return actor_distribution(self.actor, self.action_space, unmixed, masks)
 
     def _values(self, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
         """(B, 1) values; ``own`` are the rows' own views if they were encoded before."""

@@ -10,8 +10,8 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_saf.networks.critic import Heads, JointValueHead, StateCritic, TeamCritic
-from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.gather import gather
+from sb3_saf.policies.extractors import ObservationEncoder
 
 
 class JointCritic(TeamCritic):

@@ -23,6 +23,7 @@ from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamS
 from sb3_saf.networks.gather import gather, gather_agents
 from sb3_saf.networks.views import OwnViews
 from sb3_saf.policies.base import NetArch, TeamPolicy
+from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.ippo import IPPOParts
 from sb3_saf.policies.mappo import MAPPOParts
 from sb3_saf.policies.parts import TeamParts, check_at_least_one
@@ -231,8 +232,9 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs, padded=True)
         if masks is None:
-            return self.actor.distribution(self.actor(latent, agent)), states
-        return self.actor.masked_distribution(self.actor.unmixed(latent, agent), masks), states
+            return actor_distribution(self.actor, self.action_space, self.actor(latent, agent)), states
+        unmixed = self.actor.unmixed(latent, agent)
+        return actor_distribution(self.actor, self.action_space, unmixed, masks), states
 
     def _recall_values(
         self, obs: PyTorchObs, own: OwnViews | None, lstm_states: LstmStates, episode_starts: th.Tensor

@@ -1,0 +1,168 @@
+"""
+The encoders of ``sb3_saf.networks`` as SB3's features extractors, and the default choice among them.
+
+On the CPU, extractors of tile codes look up what tiles add to their first layer instead of making pixels
+(``sb3_saf.networks.tile_sums``): the same features, up to the order of summation.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Final
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_saf.networks import encoders
+from sb3_saf.networks.encoders import NATURE_PIXELS, PixelInput
+from sb3_saf.networks.spaces import observation_spec
+from sb3_saf.networks.tile_sums import (
+    Places,
+    places_of_convolution,
+    places_of_linear,
+    rectified_sums,
+    table_of_convolution,
+    used_codes,
+)
+
+#: Up to this many pixels the paper's encoder is the default; from there on it grows beyond 7 million weights.
+_PAPERS_PIXELS: Final = 64 * 64
+#: More pixels, or more weights, than anybody wants to train on without being asked.
+_MANY_PIXELS: Final = 128 * 128
+_MANY_WEIGHTS: Final = 10_000_000
+
+
+def looks_up(pixels: PixelInput, observations: th.Tensor) -> bool:
+    """Whether a first layer looks up what tiles add to it: codes on the CPU. Elsewhere products are cheaper."""
+    return pixels.layout == "codes" and observations.device.type == "cpu"
+
+
+class PaperCNN(encoders.PaperCNN, BaseFeaturesExtractor):
+    """SB3's features extractor of :class:`sb3_saf.networks.encoders.PaperCNN`, with its parameters."""
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
+        encoders.PaperCNN.__init__(self, observation_space, features_dim)
+        self._places: Places | None = None
+        if self.pixels.layout == "codes" and (tile := self.pixels.atlas.shape[1]) % 2 == 0:
+            _, height, width = self.pixels.shape
+            self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) observations to (K, features_dim)."""
+        if self._places is None or not looks_up(self.pixels, observations):
+            return super().forward(observations)
+        features: th.Tensor = self.net[2:](self._first_layer(observations, self._places))
+        return features
+
+    def _first_layer(self, codes: th.Tensor, places: Places) -> th.Tensor:
+        """(K, 32, h, w) outputs of the first convolution and its ReLU: (K, rows, columns)."""
+        first = self.net[0]
+        assert isinstance(first, nn.Conv2d) and first.bias is not None
+        used = used_codes(codes.flatten(1))
+        table = table_of_convolution(self.pixels.tiles(used.codes), first.weight, stride=2)
+        return rectified_sums(used.views, table, first.bias, places)
+
+
+class NatureEncoder(encoders.NatureEncoder, BaseFeaturesExtractor):
+    """SB3's features extractor of :class:`sb3_saf.networks.encoders.NatureEncoder`, with its parameters."""
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
+        encoders.NatureEncoder.__init__(self, observation_space, features_dim)
+
+
+class LightEncoder(encoders.LightEncoder, BaseFeaturesExtractor):
+    """SB3's features extractor of :class:`sb3_saf.networks.encoders.LightEncoder`, with its parameters."""
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        features_dim: int = 64,
+        tile_size: int = 4,
+        embedding_dim: int = 16,
+        hidden: int = 128,
+        one_hot_codes: bool = False,
+    ):
+        BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
+        encoders.LightEncoder.__init__(
+            self, observation_space, features_dim, tile_size, embedding_dim, hidden, one_hot_codes
+        )
+        self._places = places_of_linear(self.n_tiles)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) observations to (K, features_dim)."""
+        if not looks_up(self.pixels, observations):
+            return super().forward(observations)
+        features: th.Tensor = self.net[2:](self._first_layer(observations))
+        return features
+
+    def _first_layer(self, codes: th.Tensor) -> th.Tensor:
+        """(K, hidden) outputs of the first linear layer and its ReLU: (K, rows, columns)."""
+        first = self.net[0]
+        assert isinstance(first, nn.Linear)
+        used = used_codes(codes.flatten(1))
+        embedded = self.embed(self.tile_inputs[used.codes])
+        # Weights are (hidden, T * e): what a code adds at each of the T places, (U, T, hidden).
+        by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
+        table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
+        return rectified_sums(used.views, table, first.bias, self._places)
+
+
+class MLPEncoder(encoders.MLPEncoder, BaseFeaturesExtractor):
+    """SB3's features extractor of :class:`sb3_saf.networks.encoders.MLPEncoder`, with its parameters."""
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64, hidden: int = 128):
+        BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
+        encoders.MLPEncoder.__init__(self, observation_space, features_dim, hidden)
+
+
+class ObservationEncoder(BaseFeaturesExtractor):
+    """
+    The default encoder, chosen by space: for pictures (uint8, 0..255) and tile codes :class:`PaperCNN`, or
+    :class:`NatureEncoder` if they have more than 64 x 64 pixels; for all else :class:`MLPEncoder`.
+
+    Warns of pictures that make training slow whatever encodes them.
+
+    :param observation_space: one agent's own observation space
+    :param features_dim: size of the features
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        super().__init__(observation_space, features_dim)
+        self.encoder: BaseFeaturesExtractor = _encoder_class(observation_space)(observation_space, features_dim)
+        if not isinstance(self.encoder, MLPEncoder):
+            _warn_if_large(self.encoder, observation_space)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, *shape) observations to (K, features_dim)."""
+        features: th.Tensor = self.encoder(observations)
+        return features
+
+
+def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:
+    space = observation_spec(observation_space).space
+    if space.atlas is None and not space.picture:
+        return MLPEncoder
+    _, height, width = space.picture_shape
+    if height * width <= _PAPERS_PIXELS or min(height, width) < NATURE_PIXELS:
+        return PaperCNN
+    return NatureEncoder
+
+
+def _warn_if_large(encoder: BaseFeaturesExtractor, space: spaces.Space[Any]) -> None:
+    _, height, width = observation_spec(space).space.picture_shape
+    n_weights = sum(parameter.numel() for parameter in encoder.parameters())
+    if height * width <= _MANY_PIXELS and n_weights <= _MANY_WEIGHTS:
+        return
+    warnings.warn(
+        f"observations of {space} have {height} x {width} pixels, for which {type(encoder).__name__} has "
+        f"{n_weights:,} weights and is slow. Shrink them in the environment (supersuit.resize_v1(env, 84, 84), "
+        'supersuit.color_reduction_v0(env, "B")), or choose another encoder, policy_kwargs={"features_extractor_class":'
+        ' ...}: sb3_saf.LightEncoder with features_extractor_kwargs={"tile_size": ...} for pictures made of tiles, or '
+        "one of your own",
+        UserWarning,
+        stacklevel=3,
+    )
