@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -19,7 +20,6 @@ from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.seeding import game_seeds
 from hecogrid_envs.state import state_option
-from hecogrid_envs.supersuit_bridge import supersuit_vec_env
 from hecogrid_envs.tasks import TASKS
 from hecogrid_envs.tiles import observation_space
 
@@ -254,5 +254,7 @@ def make_vec_env(
     batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
     if backend == "native":
         return NativeVecEnv(batch, seed, render_mode)
-    env_class = TASKS[batch.task]
-    return supersuit_vec_env(lambda: env_class(render_mode=render_mode, **params), n_envs, seed=seed, n_cpus=n_cpus)
+    # Games do not need the package that learns; this route through SuperSuit is the only one that does.
+    from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
+
+    return SuperSuitVecEnv(partial(TASKS[batch.task], render_mode=render_mode, **params), n_envs, seed, n_cpus)

@@ -14,11 +14,11 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from hecogrid_envs.supersuit_bridge import SuperSuitVecEnv
 from hecogrid_envs.vec_env import NativeVecEnv
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.make import make_team_env
 from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import RandomPolicy, evaluate_team
 from tests.team_venv import Array, TeamVenv
 from tests.toy_envs import CounterEnv

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.teams import check_count
+from sb3_saf.envs.teams import check_count, check_seed
 
 Backend = Literal["native", "supersuit"]
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
@@ -74,6 +74,7 @@ def make_team_env(
     """
     check_count("n_envs", n_envs)
     check_count("n_cpus", n_cpus)
+    check_seed(seed)
     _check_backend(backend)
     if isinstance(env, str):
         _refuse_signals(active, action_masks, state)
@@ -136,14 +137,14 @@ def _foreign(
     signals: dict[str, Any],
 ) -> VecEnv:
     """Any ParallelEnv, through SuperSuit."""
-    from hecogrid_envs.supersuit_bridge import supersuit_vec_env
+    from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 
     if backend == "native":
         raise ValueError(
             f"backend='native' is the compiled core of HECOGrid, got it with {_name(env)}; leave backend out or use "
             "backend='supersuit'"
         )
-    return supersuit_vec_env(_bound(env, params), n_envs, seed, n_cpus, **signals)
+    return SuperSuitVecEnv(_bound(env, params), n_envs, seed, n_cpus, **signals)
 
 
 def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:

@@ -67,6 +67,19 @@ class RowSpaces(NamedTuple):
         n_masked = None if action_mask is None else int((action_mask.shape or ())[0])
         return cls(space.spaces[OBS_KEY], active is not None, n_masked, state, is_dict=True)
 
+    def to_space(self) -> spaces.Space[Any]:
+        """Return the observation space of a row."""
+        if not self.is_dict:
+            return self.own
+        row: dict[str, spaces.Space[Any]] = {OBS_KEY: self.own}
+        if self.active:
+            row[ACTIVE_KEY] = spaces.Discrete(2)
+        if self.n_masked_actions is not None:
+            row[ACTION_MASK_KEY] = spaces.MultiBinary(self.n_masked_actions)
+        if self.state is not None:
+            row[STATE_KEY] = self.state
+        return spaces.Dict(row)
+
     def entries(self, obs: Any, what: str) -> Mapping[str, Any]:
         """
         The parts of rows.

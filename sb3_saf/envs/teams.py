@@ -246,6 +246,16 @@ def check_count(name: str, value: object) -> int:
     return int(value)
 
 
+def check_seed(seed: object) -> None:
+    """
+    Check that a value is a seed of a run.
+
+    :raises ValueError: unless it is None or an integer of at least 0
+    """
+    if seed is not None and (isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0):
+        raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
+
+
 def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:
     """
     Check that rows make whole teams.

@@ -1,10 +1,12 @@
-"""Calls of a game's ``reset`` and ``step``, with a clear word where they are not PettingZoo's."""
+"""Calls of a game's ``reset`` and ``step``, with a clear error where the results are not PettingZoo's."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 _RESET: Final = "(observations, infos)"
 _STEP: Final = "(observations, rewards, terminations, truncations, infos)"
@@ -77,6 +79,96 @@ def step(env: Any, actions: dict[Any, Any]) -> Step:
             )
         raise ValueError(f"expected step of {env} to return {_STEP}, {_SINCE}, got {_described(result)}{hint}")
     return Step(*result)
+
+
+def playing_agents(env: Any, possible_agents: Sequence[Any], place: str) -> set[Any]:
+    """
+    Return the agents that a game lists in ``agents``.
+
+    :param env: the game
+    :param possible_agents: the names that it may list
+    :param place: game and step, for the message
+    :raises ValueError: if it lists something else
+    """
+    agents = env.agents
+    if isinstance(agents, (str, bytes)) or not isinstance(agents, Iterable):
+        raise ValueError(f"expected agents of {env} to be a list of names in {place}, got {agents!r}")
+    present = set(agents)
+    unknown = present.difference(possible_agents)
+    if unknown:
+        raise ValueError(
+            f"expected names from possible_agents ({list(possible_agents)}) in agents of {env} in {place}, got "
+            f"{next(agent for agent in agents if agent in unknown)!r}"
+        )
+    return present
+
+
+def number(rewards: Mapping[Any, Any], agent: Any, place: str) -> float:
+    """
+    Return the reward of an agent that acted.
+
+    :param rewards: by agent
+    :param agent: its name
+    :param place: game and step, for the message
+    :raises ValueError: if there is none, or it is no number
+    """
+    if agent not in rewards:
+        raise ValueError(
+            f"expected a reward for {agent}, which acted, in {place}, got rewards for {list(rewards)}; give every "
+            "agent that acts a reward, 0.0 for none"
+        )
+    reward = rewards[agent]
+    if isinstance(reward, (float, int)):
+        return reward
+    array = _single(reward, "biuf")
+    if array is None:
+        raise ValueError(f"expected a number as the reward of {agent} in {place}, got {reward!r}")
+    return float(array)
+
+
+def flag(name: str, flags: Mapping[Any, Any], agent: Any, place: str) -> bool:
+    """
+    Return whether an agent was terminated or truncated; one that is not mentioned was not.
+
+    :param name: of the flags, for the message
+    :param flags: by agent
+    :param agent: its name
+    :param place: game and step, for the message
+    :raises ValueError: if it is neither true nor false
+    """
+    value = flags.get(agent, False)
+    if value is True or value is False:
+        return value
+    array = _single(value, "biuf")
+    if array is None or array not in (0, 1):
+        raise ValueError(f"expected True or False for {agent} in {name} in {place}, got {value!r}")
+    return bool(array)
+
+
+def info(infos: Mapping[Any, Any], agent: Any, place: str) -> Mapping[str, Any]:
+    """
+    Return the info of an agent, an empty one if there is none.
+
+    :param infos: by agent
+    :param agent: its name
+    :param place: game and step, for the message
+    :raises ValueError: if it is no dict
+    """
+    found = infos.get(agent)
+    if found is None:
+        return {}
+    if type(found) is not dict and not isinstance(found, Mapping):
+        raise ValueError(f"expected a dict as the info of {agent} in {place}, got {found!r}")
+    return found
+
+
+def _single(value: Any, kinds: str) -> Any:
+    """Return the one number of a scalar or an array of one entry, None for anything else."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        return None
+    return array.item() if array.size == 1 and array.dtype.kind in kinds else None
 
 
 def _takes(function: Any, *names: str) -> bool:

@@ -1,0 +1,219 @@
+"""What is known of a PettingZoo game before it is played: agents, spaces, and which signals it gives beside rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
+
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+
+from sb3_saf.envs import parallel_calls
+from sb3_saf.envs.row_spaces import RowSpaces
+from sb3_saf.envs.space_reader import (
+    FIXED_SHAPE,
+    FlatReader,
+    SpaceReader,
+    can_be_flattened,
+    counted_from_zero,
+    leaves_of,
+)
+from sb3_saf.envs.teams import ACTION_MASK_KEY
+
+AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
+MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
+
+#: Where a game tells legal actions: in observations of the form {"observation", "action_mask"}, or in infos.
+MaskSource = Literal["observation", "info"]
+#: Whether to look for action masks: where there are any, always, never.
+AskMasks: TypeAlias = Literal["auto"] | bool
+
+#: Where an agent's own observation is in observations of PettingZoo's form for masks.
+OBSERVATION: Final = "observation"
+
+
+class GameForm(NamedTuple):
+    """
+    What all copies of a game share.
+
+    :param agents: N names, in the order of the rows
+    :param own: space of an agent's own observation as the game gives it, without masks
+    :param action_space: of every agent
+    :param rows: parts of a row's observation
+    :param has_masks_inside: whether observations have the form {"observation", "action_mask"}, to be taken apart
+    :param masks: where masks come from, None for no masks
+    :param state: space of ``state()`` as the game gives it, None where rows have no state
+    :param is_flattened: whether a Dict or Tuple becomes a vector
+    """
+
+    agents: tuple[Any, ...]
+    own: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    rows: RowSpaces
+    has_masks_inside: bool = False
+    masks: MaskSource | None = None
+    state: spaces.Space[Any] | None = None
+    is_flattened: bool = False
+
+    def own_reader(self, notes: list[str]) -> SpaceReader:
+        """Return what checks own observations."""
+        return (FlatReader if self.is_flattened else SpaceReader)(self.own, notes)
+
+
+def game_form(
+    example: Any,
+    first_infos: Callable[[], Mapping[Any, Any]],
+    active: bool = False,
+    action_masks: AskMasks | None = None,
+    state: bool = False,
+) -> GameForm:
+    """
+    Find out the form of a game.
+
+    :param example: the game
+    :param first_infos: returns the infos of a reset of a copy; called if it may tell of masks
+    :param active: whether rows tell if their agent takes part
+    :param action_masks: ``"auto"`` for masks where there are any, True to insist on them, False for none; None for
+        observations as they are
+    :param state: whether rows have the game's state
+    :raises ValueError: if agents differ in their spaces, a space cannot be in rows, or a signal is not there
+    """
+    agents = tuple(example.possible_agents)
+    observation_space = _common_space("observation", agents, example.observation_space)
+    action_space = _common_space("action", agents, example.action_space)
+    own, inside = observation_space, action_masks is not None and _has_masks_inside(observation_space)
+    if inside:
+        own = observation_space[OBSERVATION]  # type: ignore[index]
+    masks = _mask_source(inside, action_masks, action_space, first_infos)
+    state_space = _state_space(example) if state else None
+    is_flattened = action_masks is not None and can_be_flattened(own)
+    rows = RowSpaces(
+        (FlatReader if is_flattened else SpaceReader)(own, []).rows,
+        active,
+        _n_actions(action_space) if masks else None,
+        None if state_space is None else counted_from_zero(state_space),
+        is_dict=active or masks is not None or state,
+    )
+    return GameForm(agents, own, action_space, rows, inside, masks, state_space, is_flattened)
+
+
+def check_is_parallel(env: Any, is_factory: bool) -> None:
+    """
+    Check that something is a ParallelEnv with named agents.
+
+    :param env: what was given, or what a factory returned
+    :param is_factory: whether a factory returned it
+    :raises ValueError: with what to do
+    """
+    origin = "a function that returned " if is_factory else ""
+    if isinstance(env, AECEnv):
+        raise ValueError(
+            f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
+            "convert it with pettingzoo.utils.conversions.aec_to_parallel, or, where agents take turns, with "
+            "sb3_saf.TurnsInParallel"
+        )
+    if not isinstance(env, ParallelEnv):
+        hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""
+        raise ValueError(
+            "expected a PettingZoo ParallelEnv or a function that makes one, "
+            f"got {origin}an object of type {type(env).__name__}{hint}"
+        )
+    agents = getattr(env, "possible_agents", None)
+    if not agents:
+        raise ValueError(f"expected {env} to list its agents in possible_agents (each gets a row), got none")
+    doubles = [agent for i, agent in enumerate(agents) if agent in agents[:i]]
+    if doubles:
+        raise ValueError(
+            f"expected different names in possible_agents of {env}, got {doubles[0]!r} more than once in {list(agents)}"
+        )
+
+
+def _common_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], spaces.Space[Any]]) -> spaces.Space[Any]:
+    """Return the one space of all agents."""
+    if not callable(space_of):
+        raise ValueError(
+            f"expected {kind}_space(agent) to be a method that gives an agent's space, got {type(space_of).__name__}; "
+            f"write it as: def {kind}_space(self, agent): return self.{kind}_spaces[agent]"
+        )
+    space_by_agent = {agent: space_of(agent) for agent in agents}
+    first = space_by_agent[agents[0]]
+    others = [f"{agent} has {space}" for agent, space in space_by_agent.items() if space != first]
+    if others:
+        repair = "with supersuit." + ("pad_observations_v0" if kind == "observation" else "pad_action_space_v0")
+        if not all(isinstance(space, (spaces.Box, spaces.Discrete)) for space in space_by_agent.values()):
+            repair = "in a wrapper of your own (SuperSuit pads Box and Discrete only)"
+        raise ValueError(
+            f"expected one {kind} space for all agents, got: {agents[0]} has {first}, {', '.join(others)}; "
+            f"make them equal {repair}"
+        )
+    parts = leaves_of(first) if kind == "observation" else [first]
+    if not all(isinstance(part, FIXED_SHAPE) for part in parts):
+        names = ", ".join(part.__name__ for part in FIXED_SHAPE)
+        containers = ", or a Dict or Tuple of those" if kind == "observation" else ""
+        raise ValueError(f"expected an {kind} space that is one of {names}{containers}, got {first}")
+    if not parts or any(0 in (part.shape or ()) for part in parts):
+        raise ValueError(
+            f"expected an {kind} space with at least one entry, got {first}; give agents without "
+            f"{'anything to see' if kind == 'observation' else 'a choice'} one constant entry"
+        )
+    return first
+
+
+def _has_masks_inside(space: spaces.Space[Any]) -> bool:
+    """Return whether observations have PettingZoo's form for masks."""
+    return isinstance(space, spaces.Dict) and set(space.spaces) == {OBSERVATION, ACTION_MASK_KEY}
+
+
+def _mask_source(
+    inside: bool,
+    action_masks: AskMasks | None,
+    action_space: spaces.Space[Any],
+    first_infos: Callable[[], Mapping[Any, Any]],
+) -> MaskSource | None:
+    if not action_masks:
+        return None
+    if inside:
+        return "observation"
+    if action_masks is True:
+        return "info"
+    if not isinstance(action_space, spaces.Discrete):
+        return None
+    infos = first_infos().values()
+    return "info" if any(isinstance(info, Mapping) and ACTION_MASK_KEY in info for info in infos) else None
+
+
+def _n_actions(action_space: spaces.Space[Any]) -> int:
+    if not isinstance(action_space, spaces.Discrete):
+        raise ValueError(
+            f"action masks are for Discrete actions, got the action space {action_space}; pass action_masks=False, or "
+            "make the actions Discrete in a wrapper of the environment"
+        )
+    return int(action_space.n)
+
+
+def _state_space(example: Any) -> spaces.Space[Any]:
+    for env in (example, getattr(example, "unwrapped", None)):
+        space = None
+        with suppress(AttributeError, NotImplementedError):
+            space = env.state_space  # type: ignore[union-attr]
+        if isinstance(space, FIXED_SHAPE):
+            return space
+    raise ValueError(
+        f"state=True needs an environment with state() and a state_space of Box, Discrete, MultiDiscrete or "
+        f"MultiBinary, got {example} with {getattr(example, 'state_space', 'no state_space')}; leave state out, or "
+        "give the environment both"
+    )
+
+
+def first_infos_of(build: Callable[[], Any]) -> Mapping[Any, Any]:
+    """
+    Return the infos of a reset, of a copy that is closed again.
+
+    :param build: makes the copy
+    """
+    env = build()
+    try:
+        return parallel_calls.reset(env, seed=0, options=None)[1]
+    finally:
+        env.close()

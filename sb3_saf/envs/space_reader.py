@@ -1,0 +1,205 @@
+"""Observations of a game, checked against their space and brought into the form that rows have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_saf.envs.teams import Array
+
+#: Spaces whose samples have one shape and dtype.
+FIXED_SHAPE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+
+
+def parts_of(space: spaces.Space[Any]) -> dict[Any, spaces.Space[Any]]:
+    """Return the parts of a Dict or a Tuple by key or index; nothing for other spaces."""
+    if isinstance(space, spaces.Dict):
+        return dict(space.spaces)
+    if isinstance(space, spaces.Tuple):
+        return dict(enumerate(space.spaces))
+    return {}
+
+
+def leaves_of(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
+    """Return the spaces that a space is built of, without Dicts and Tuples."""
+    if not isinstance(space, (spaces.Dict, spaces.Tuple)):
+        return [space]
+    return [leaf for part in parts_of(space).values() for leaf in leaves_of(part)]
+
+
+def counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """
+    Return the space with every ``start`` at 0, the same object if it is so already.
+
+    Stable-Baselines3 encodes and samples Discrete and MultiDiscrete from 0, whatever their start.
+    """
+    if isinstance(space, spaces.Discrete) and space.start != 0:
+        return spaces.Discrete(int(space.n))
+    if isinstance(space, spaces.MultiDiscrete) and np.any(space.start != 0):
+        return spaces.MultiDiscrete(space.nvec, dtype=space.dtype.type)
+    parts = parts_of(space)
+    shifted = {key: counted_from_zero(part) for key, part in parts.items()}
+    if all(shifted[key] is part for key, part in parts.items()):
+        return space
+    return spaces.Dict(shifted) if isinstance(space, spaces.Dict) else spaces.Tuple(tuple(shifted.values()))
+
+
+def first_value(space: spaces.Space[Any]) -> Any:
+    """Return the ``start`` of Discrete and MultiDiscrete, 0 for other spaces."""
+    return space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else 0
+
+
+def bounds_of(space: spaces.Space[Any]) -> tuple[Any, Any]:
+    """Return the smallest and the largest value of each entry, both included; the space has a fixed shape."""
+    if isinstance(space, spaces.Discrete):
+        return space.start, space.start + space.n - 1
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.start, space.start + space.nvec - 1
+    if isinstance(space, spaces.MultiBinary):
+        return 0, 1
+    assert isinstance(space, spaces.Box)
+    return space.low, space.high
+
+
+class SpaceReader:
+    """
+    Read what a game gives for one space.
+
+    Shape and kind of the numbers must be those of the space. Integers outside the bounds are refused; floats outside
+    them are noted once in ``notes``, for the caller to warn of.
+
+    :param space: as the game declares it: of fixed shape, or a Dict or Tuple of such spaces
+    :param notes: gets the first note
+    """
+
+    def __init__(self, space: spaces.Space[Any], notes: list[str]) -> None:
+        self.space = space
+        #: Space of what :meth:`read` returns.
+        self.rows: spaces.Space[Any] = counted_from_zero(space)
+        self._notes = notes
+        self._parts = {key: SpaceReader(part, notes) for key, part in parts_of(space).items()}
+        if not self._parts and isinstance(space, FIXED_SHAPE):
+            self._start = first_value(space)
+            self._is_shifted = bool(np.any(self._start != 0))
+            self._shape, self._dtype = space.shape, np.dtype(space.dtype)
+            self._is_float = self._dtype.kind == "f"
+            self._low, self._high = self._bounds()
+
+    def _bounds(self) -> tuple[Any, Any]:
+        """Return the bounds, None where the dtype allows nothing else."""
+        low, high = bounds_of(self.space)
+        limits = (-np.inf, np.inf) if self._is_float else _limits(self._dtype)
+        return _unless_always(low, limits[0]), _unless_always(high, limits[1])
+
+    def blank(self) -> Any:
+        """Return an observation of zeros."""
+        return _zeros(self.rows)
+
+    def read(self, value: Any, owner: str) -> Any:
+        """
+        Check a value and bring it into shape and dtype, counted from 0.
+
+        :param value: as the game gave it
+        :param owner: whose it is, for the message
+        :raises ValueError: if it does not lie in the space
+        """
+        if not self._parts:
+            return self._read_array(value, owner)
+        if isinstance(self.space, spaces.Dict):
+            if not isinstance(value, Mapping) or set(value) != set(self._parts):
+                got = list(value) if isinstance(value, Mapping) else type(value).__name__
+                raise ValueError(f"observation of {owner}: expected a dict with {list(self._parts)}, got {got}")
+            return {key: part.read(value[key], f"{owner}, {key!r}") for key, part in self._parts.items()}
+        if not isinstance(value, (tuple, list)) or len(value) != len(self._parts):
+            raise ValueError(f"observation of {owner}: expected {len(self._parts)} parts, got {value!r}")
+        return tuple(part.read(value[i], f"{owner}, part {i}") for i, part in self._parts.items())
+
+    def _read_array(self, value: Any, owner: str) -> Array:
+        array = value if type(value) is np.ndarray else _as_array(value)
+        if array.dtype != self._dtype or array.shape != self._shape:
+            if array.shape != self._shape or not np.can_cast(array.dtype, self._dtype, "same_kind"):
+                raise ValueError(
+                    f"observation of {owner}: expected {self._dtype} of shape {self._shape}, "
+                    f"got {array.dtype} of shape {array.shape}"
+                )
+            if self._is_float:  # bounds are rounded to the dtype, so values must be before they are compared
+                array = array.astype(self._dtype)
+        if self._high is not None and _any_above(array, self._high):
+            self._report(array, array > self._high, owner)
+        if self._low is not None and (array < self._low).any():
+            self._report(array, array < self._low, owner)
+        if self._is_shifted:
+            array = array - self._start
+        return array.astype(self._dtype, copy=False)
+
+    def _report(self, array: Array, outside: Any, owner: str) -> None:
+        """Refuse integers, and note floats, outside the bounds."""
+        low, high = bounds_of(self.space)
+        message = (
+            f"observation of {owner}: expected values from {np.min(low)} to {np.max(high)} as in {self.space}, got "
+            f"{array[outside].reshape(-1)[0]}"
+        )
+        if not self._is_float:
+            raise ValueError(f"{message}; make the space as wide as what the game gives")
+        if not self._notes:
+            self._notes.append(message)
+
+
+class FlatReader(SpaceReader):
+    """
+    Read a Dict or Tuple of scalars and vectors as one vector, as ``gymnasium.spaces.flatten`` makes it.
+
+    :param space: see :class:`SpaceReader`
+    :param notes: see :class:`SpaceReader`
+    """
+
+    def __init__(self, space: spaces.Space[Any], notes: list[str]) -> None:
+        super().__init__(space, notes)
+        self._structured = self.rows
+        self.rows = spaces.flatten_space(self._structured)
+
+    def read(self, value: Any, owner: str) -> Any:
+        """Check a value and flatten it (see the base class)."""
+        return spaces.flatten(self._structured, super().read(value, owner))
+
+
+def can_be_flattened(space: spaces.Space[Any]) -> bool:
+    """Return whether a space is a Dict or a Tuple of scalars and vectors."""
+    leaves = leaves_of(space)
+    return space not in leaves and all(isinstance(leaf, FIXED_SHAPE) and len(leaf.shape or ()) <= 1 for leaf in leaves)
+
+
+def _as_array(value: Any) -> Array:
+    try:
+        return np.asarray(value)
+    except ValueError:  # lists of unequal lengths
+        return np.asarray(None)
+
+
+def _limits(dtype: np.dtype[Any]) -> tuple[int, int]:
+    return (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+
+
+def _unless_always(bound: Any, limit: float) -> Any:
+    """Return a bound, as one number if all entries have the same; None if it is the limit of the dtype."""
+    if np.all(bound == limit):
+        return None
+    first = np.asarray(bound).reshape(-1)[0]
+    return first if np.all(bound == first) else bound
+
+
+def _any_above(array: Array, high: Any) -> bool:
+    # One pass over the array where one number bounds all entries: codes of tiles are checked at every step.
+    return bool((array.max() > high) if np.ndim(high) == 0 else (array > high).any())
+
+
+def _zeros(space: spaces.Space[Any]) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: _zeros(part) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_zeros(part) for part in space.spaces)
+    assert space.shape is not None
+    return np.zeros(space.shape, space.dtype)

@@ -1,0 +1,291 @@
+"""One PettingZoo game as rows: SuperSuit's ``MarkovVectorEnv`` with its faults repaired."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping
+from copy import deepcopy
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector.utils import iterate
+from supersuit.vector import MarkovVectorEnv
+
+from sb3_saf.envs import game_layers, parallel_calls
+from sb3_saf.envs.game_form import OBSERVATION, AnyParallelEnv, GameForm
+from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.envs.space_reader import SpaceReader
+from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
+
+Info: TypeAlias = "dict[str, Any]"
+Infos: TypeAlias = "list[Info]"
+
+#: Keys of infos that have a meaning for Stable-Baselines3 or here. A game's own entries of these names are renamed.
+RESERVED_KEYS: Final = frozenset({TERMINAL_OBSERVATION, TRUNCATED, ACTIVE_KEY, "episode"})
+
+_UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
+
+
+class TeamMarkovVectorEnv(MarkovVectorEnv):
+    """
+    The agents of one game as rows that end together.
+
+    Repairs of :class:`supersuit.vector.MarkovVectorEnv`:
+
+    - an agent that has ended or not joined yet keeps its row, which shows zeros and gets no reward;
+    - the last step's infos are its own: those of the next episode's reset are in ``reset_infos``;
+    - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
+    - on request rows show signals: who is active, action masks, the game's state;
+    - whatever the game returns is checked, and errors name agent, game and step.
+
+    :param env: the game
+    :param form: its form
+    :param index: of the game, for messages
+    :param notes: gets a note if observations leave their bounds
+    """
+
+    def __init__(self, env: AnyParallelEnv, form: GameForm, index: int, notes: list[str]) -> None:
+        _add_missing_attributes(env)
+        super().__init__(env, black_death=True)
+        self.observation_space = form.rows.to_space()
+        self.agents = form.agents
+        self.index = index
+        self._is_closed = False
+        #: Infos of the last reset, one per row.
+        self.reset_infos: Infos = []
+        self._form = form
+        self._own_reader = form.own_reader(notes)
+        self._state_reader = None if form.state is None else SpaceReader(form.state, notes)
+        self._blank = self._own_reader.blank()
+        self._count_step(0)
+        self._ended: set[Any] = set()
+        #: Agents that take part, in the order of the rows: a set with an order.
+        self._playing: dict[Any, None] = {}
+
+    def _count_step(self, number: int) -> None:
+        self._n_steps = number
+        #: Where an error is, for messages.
+        self._place = f"game {self.index} at step {number}"
+
+    # ---- episodes
+
+    def reset(self, seed: int | None = None, options: Info | None = None) -> tuple[Any, Infos]:
+        """
+        Begin an episode.
+
+        :param seed: of the game, None to go on with its random stream
+        :param options: for the game
+        :return: observations and infos of the N rows
+        :raises ValueError: if the game breaks PettingZoo's rules
+        """
+        observations, infos = parallel_calls.reset(self.par_env, seed, options)
+        self._count_step(0)
+        self._ended.clear()
+        self._playing = self._find_playing()
+        if not self._playing:
+            raise ValueError(f"expected at least one name in agents after reset of game {self.index}, got none")
+        self.reset_infos = [
+            _copied(parallel_calls.info(infos, agent, self._place), agent) if agent in self._playing else _inactive()
+            for agent in self.agents
+        ]
+        return self._rows(observations, infos, self._playing), self.reset_infos
+
+    def step(self, actions: npt.NDArray[Any]) -> tuple[Any, Any, Any, Any, Infos]:
+        """
+        Step the game; the next episode begins by itself.
+
+        :param actions: of the N rows, those of agents that take no part are ignored
+        :return: observations, rewards, terminations, truncations and infos of the N rows
+        :raises ValueError: if the game breaks PettingZoo's rules
+        """
+        acted = self._playing
+        chosen = dict(zip(self.agents, iterate(self.action_space, actions), strict=True))
+        self._count_step(self._n_steps + 1)
+        place = self._place
+        step = parallel_calls.step(self.par_env, {agent: chosen[agent] for agent in acted})
+        rewards = {agent: parallel_calls.number(step.rewards, agent, place) for agent in acted}
+        terminated = {agent for agent in acted if parallel_calls.flag("terminations", step.terminations, agent, place)}
+        truncated = {agent for agent in acted if parallel_calls.flag("truncations", step.truncations, agent, place)}
+        truncated -= terminated
+        self._ended |= terminated | truncated
+        self._playing = self._find_playing()
+        infos = [self._info(step.infos, agent) if agent in acted else _inactive() for agent in self.agents]
+        over = not self._playing
+        if over:
+            observations = self._finish_episode(step, acted, truncated, infos)
+        else:
+            observations = self._rows(step.observations, step.infos, self._playing)
+            for agent in terminated | truncated:
+                row = self.agents.index(agent)
+                infos[row][TERMINAL_OBSERVATION] = deepcopy(self._own(step.observations, agent, required=False))
+        return (
+            observations,
+            np.array([rewards.get(agent, 0.0) for agent in self.agents], dtype=np.float32),
+            np.array([over and agent not in truncated for agent in self.agents]),
+            np.array([over and agent in truncated for agent in self.agents]),
+            infos,
+        )
+
+    def _finish_episode(
+        self, step: parallel_calls.Step, acted: Container[Any], truncated: set[Any], infos: Infos
+    ) -> Any:
+        """Put the last observations into the infos, and begin the next episode; return its observations."""
+        # Rows are copies, so games may reuse their arrays in the reset.
+        last = self._rows(step.observations, step.infos, acted, active=truncated, over=True)
+        for agent, info, row in zip(self.agents, infos, iterate(self.observation_space, last), strict=True):
+            info[TRUNCATED] = agent in truncated
+            info[TERMINAL_OBSERVATION] = row
+        return self.reset()[0]
+
+    def close(self) -> None:
+        """Close the game, once."""
+        if not self._is_closed:
+            self._is_closed = True
+            super().close()
+
+    def _find_playing(self) -> dict[Any, None]:
+        """Return the agents that take part; one that ended does not come back."""
+        present = parallel_calls.playing_agents(self.par_env, self.agents, self._place)
+        return {agent: None for agent in self.agents if agent in present and agent not in self._ended}
+
+    def _info(self, infos: Mapping[Any, Any], agent: Any) -> Info:
+        info = _copied(parallel_calls.info(infos, agent, self._place), agent)
+        if info:
+            for key in RESERVED_KEYS.intersection(info):
+                info[f"game_{key}"] = info.pop(key)
+        return info
+
+    # ---- rows
+
+    def _rows(
+        self,
+        observations: Mapping[Any, Any],
+        infos: Mapping[Any, Any],
+        shown: Container[Any],
+        active: Container[Any] | None = None,
+        over: bool = False,
+    ) -> Any:
+        """
+        Stack the observations of the N rows.
+
+        :param shown: agents whose observations are shown, the others' rows are zeros
+        :param active: agents that take part, and must have an observation; None for those shown
+        :param over: whether these are the last observations of the episode, on which nobody acts
+        """
+        active = shown if active is None else active
+        rows = {
+            agent: self._own(observations, agent, required=agent in active) if agent in shown else self._blank
+            for agent in self.agents
+        }
+        if self._form.rows.is_dict:
+            state = self._read_state()
+            rows = {
+                agent: {OBS_KEY: own, **self._signals(agent, observations, infos, agent in active, over), **state}
+                for agent, own in rows.items()
+            }
+        return self.concat_obs(rows)
+
+    def _own(self, observations: Mapping[Any, Any], agent: Any, required: bool) -> Any:
+        """Return an agent's own observation, zeros if there is none and none is required."""
+        observation = observations.get(agent)
+        if observation is None:
+            if required:
+                raise ValueError(
+                    f"expected an observation for {agent}, which takes part, in {self._place}, got observations for "
+                    f"{[name for name, value in observations.items() if value is not None]}"
+                )
+            return self._blank
+        if self._form.has_masks_inside:
+            if not isinstance(observation, Mapping) or OBSERVATION not in observation:
+                got = list(observation) if isinstance(observation, Mapping) else type(observation).__name__
+                raise ValueError(
+                    f"observation of {agent} in {self._place}: expected a dict with "
+                    f"{[OBSERVATION, ACTION_MASK_KEY]}, got {got}"
+                )
+            observation = observation[OBSERVATION]
+        return self._own_reader.read(observation, f"{agent} in {self._place}")
+
+    def _read_state(self) -> Info:
+        if self._state_reader is None:
+            return {}
+        return {STATE_KEY: self._state_reader.read(self.par_env.state(), f"the state of {self._place}")}
+
+    def _signals(
+        self, agent: Any, observations: Mapping[Any, Any], infos: Mapping[Any, Any], active: bool, over: bool
+    ) -> Info:
+        """Return what an agent's row shows beside its own observation and the state."""
+        rows = self._form.rows
+        signals: Info = {}
+        if rows.active:
+            signals[ACTIVE_KEY] = int(active)
+        if rows.n_masked_actions is not None:
+            signals[ACTION_MASK_KEY] = np.zeros(rows.n_masked_actions, dtype=np.int8)
+            if active:
+                signals[ACTION_MASK_KEY] = self._mask(agent, observations, infos, rows.n_masked_actions, over)
+        return signals
+
+    def _mask(
+        self, agent: Any, observations: Mapping[Any, Any], infos: Mapping[Any, Any], n_actions: int, over: bool
+    ) -> npt.NDArray[np.int8]:
+        source = observations if self._form.masks == "observation" else infos
+        found = (source.get(agent) or {}).get(ACTION_MASK_KEY)
+        mask = np.asarray(found)
+        if mask.shape == (n_actions,) and mask.dtype.kind in "biuf" and ((mask == 0) | (mask == 1)).all():
+            return mask.astype(np.int8)
+        if over:
+            return np.zeros(n_actions, dtype=np.int8)
+        raise ValueError(
+            f"expected {ACTION_MASK_KEY!r} in the {self._form.masks} of {agent} in {self._place}, {n_actions} zeros "
+            f"and ones (one per action), got {found!r}; give it at every step to every agent that acts, or pass "
+            "action_masks=False"
+        )
+
+    # ---- what SB3 asks games for
+
+    def answer(self, question: str, *args: Any) -> Any:
+        """
+        Answer a question about the game; see :mod:`sb3_saf.envs.game_layers`.
+
+        :param question: "has_attr", "get_attr", "set_attr", "call" (name, arguments, keyword arguments), "is_wrapped",
+            "action_masks"
+        :param args: of the question
+        """
+        if question == "call":
+            name, positional, keywords = args
+            return game_layers.get_attribute(self.par_env, name)(*positional, **keywords)
+        if question == "action_masks":
+            return game_layers.action_masks(self.par_env, self.agents)
+        answers: dict[str, Callable[..., Any]] = {
+            "has_attr": game_layers.has_attribute,
+            "get_attr": game_layers.get_attribute,
+            "set_attr": game_layers.set_attribute,
+            "is_wrapped": game_layers.is_wrapped,
+        }
+        return answers[question](self.par_env, *args)
+
+
+def _add_missing_attributes(env: Any) -> None:
+    """Give a game the attributes that SuperSuit and SB3 read and PettingZoo does not insist on."""
+    if not hasattr(env, "metadata"):
+        env.metadata = {}
+    if not hasattr(env.unwrapped, "render_mode"):
+        env.unwrapped.render_mode = None
+
+
+def _inactive() -> Info:
+    """Return the info of an agent that takes no part."""
+    return {ACTIVE_KEY: False}
+
+
+def _copied(info: Mapping[str, Any], agent: Any) -> Info:
+    """Copy an info as it is now; games may go on to use theirs."""
+    if not info:
+        return {}
+    if all(type(value) in _UNCHANGING for value in info.values()):
+        return dict(info)  # as good as a deep copy, and ten times faster
+    try:
+        return deepcopy(dict(info))
+    except Exception as error:
+        raise TypeError(
+            f"the info of {agent} cannot be copied ({error}), it is {info}; leave out what cannot be copied"
+        ) from error

@@ -1,0 +1,150 @@
+"""Games of one process: SuperSuit's ``ConcatVecEnv`` with its faults repaired."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from supersuit.vector import ConcatVecEnv
+
+from sb3_saf.envs.game_form import GameForm
+from sb3_saf.envs.game_source import GameSource
+from sb3_saf.envs.supersuit_game import Info, Infos, TeamMarkovVectorEnv
+
+#: Game, question and arguments of :meth:`TeamMarkovVectorEnv.answer`.
+Question = tuple[int, str, tuple[Any, ...]]
+
+
+class Played(NamedTuple):
+    """
+    A step of some games, by row.
+
+    :param observations: of the rows
+    :param rewards: float32
+    :param dones: bool
+    :param infos: of the rows
+    :param reset_infos: infos of the last reset of each row's game
+    :param notes: what to warn of
+    """
+
+    observations: Any
+    rewards: npt.NDArray[np.float32]
+    dones: npt.NDArray[np.bool_]
+    infos: Infos
+    reset_infos: Infos
+    notes: list[str]
+
+
+class TeamConcatVecEnv(ConcatVecEnv):
+    """
+    Games of this process, one after another.
+
+    Repairs of :class:`supersuit.vector.ConcatVecEnv`: each game gets its own seed and options, games can be asked for
+    attributes and methods, and all games are closed even if closing one fails.
+
+    :param source: makes the games
+    :param form: of the games
+    :param indices: of the games among all
+    :raises ValueError: if the source makes the same environment again
+    """
+
+    def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:
+        self._notes: list[str] = []
+        self._indices = indices
+        super().__init__(
+            [lambda index=index: TeamMarkovVectorEnv(source.build(), form, index, self._notes) for index in indices]
+        )
+        self._n_agents = len(form.agents)
+        _check_all_differ(self.vec_envs)
+
+    def reset(
+        self, seed: Sequence[int | None] | None = None, options: Sequence[Info | None] | None = None
+    ) -> tuple[Any, Infos]:
+        """
+        Begin an episode in every game.
+
+        :param seed: of each game
+        :param options: for each game
+        :return: observations and infos of the rows
+        """
+        none = [None] * len(self.vec_envs)
+        started = [
+            game.reset(seed=one, options=own)
+            for game, one, own in zip(self.vec_envs, seed or none, options or none, strict=True)
+        ]
+        observations, infos = zip(*started, strict=True)
+        return self.concat_obs(observations), [info for game in infos for info in game]
+
+    def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
+        """
+        Begin an episode in every game of this process.
+
+        :param seeds: of all E games
+        :param options: for all E games
+        :return: observations and infos of the rows
+        """
+        return self.reset([seeds[game] for game in self._indices], [options[game] for game in self._indices])
+
+    def play(self, actions: npt.NDArray[Any]) -> Played:
+        """
+        Step every game of this process.
+
+        :param actions: of the B rows of all games
+        :return: the step of the rows of this process
+        """
+        first, last = self._indices[0], self._indices[-1] + 1
+        rows = actions[first * self._n_agents : last * self._n_agents]
+        observations, rewards, terminations, truncations, infos = self.step(rows)
+        reset_infos = [info for game in self.vec_envs for info in game.reset_infos]
+        return Played(observations, rewards, terminations | truncations, infos, reset_infos, self._notes)
+
+    def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
+        """
+        Ask games.
+
+        :param questions: to any games
+        :return: answers of the games of this process, by the question's place in the list
+        """
+        games = dict(zip(self._indices, self.vec_envs, strict=True))
+        return {
+            place: games[game].answer(question, *args)
+            for place, (game, question, args) in enumerate(questions)
+            if game in games
+        }
+
+    def close(self) -> None:
+        """Close all games, once; then raise the first error."""
+        self.closed = True
+        errors = [error for game in self.vec_envs if (error := _closing_error(game)) is not None]
+        if errors:
+            raise errors[0]
+
+
+def _closing_error(game: TeamMarkovVectorEnv) -> Exception | None:
+    try:
+        game.close()
+    except Exception as error:
+        return error
+    return None
+
+
+def _check_all_differ(games: Sequence[TeamMarkovVectorEnv]) -> None:
+    n_objects = len({id(game.par_env.unwrapped) for game in games})
+    if n_objects < len(games):
+        raise ValueError(
+            "expected a function that makes a new environment at each call, got one that returned the same object "
+            f"for {len(games) - n_objects + 1} games"
+        )
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """Join observations of the rows of several processes."""
+    if len(parts) == 1:
+        return parts[0]
+    if isinstance(parts[0], Mapping):
+        return {key: joined([part[key] for part in parts]) for key in parts[0]}
+    if isinstance(parts[0], tuple):
+        return tuple(joined(entries) for entries in zip(*parts, strict=True))
+    return np.concatenate(parts)

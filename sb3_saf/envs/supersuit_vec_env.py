@@ -1,0 +1,388 @@
+"""Any PettingZoo ParallelEnv as a Stable-Baselines3 VecEnv, through SuperSuit."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from functools import partial
+from numbers import Integral
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.vec_env.base_vec_env import (
+    VecEnv,
+    VecEnvIndices,
+    VecEnvObs,
+    VecEnvStepReturn,
+    tile_images,
+)
+
+from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, check_is_parallel, first_infos_of, game_form
+from sb3_saf.envs.game_source import GameSource
+from sb3_saf.envs.space_reader import bounds_of, counted_from_zero, first_value
+from sb3_saf.envs.supersuit_game import Info
+from sb3_saf.envs.supersuit_games import Question, TeamConcatVecEnv
+from sb3_saf.envs.supersuit_workers import WorkerGames
+from sb3_saf.envs.teams import Array, check_count, check_seed
+
+
+def game_seeds(seed: int, n_games: int) -> list[int]:
+    """
+    Return the seeds of the games of a run, the same as ``hecogrid_envs.game_seeds``.
+
+    :param seed: of the run
+    :param n_games: E; game ``i`` gets the same seed whatever the number of games
+    """
+    words = [np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1, np.uint64)[0] for i in range(n_games)]
+    return [int(word) >> 1 for word in words]  # 63 bits, which every game takes
+
+
+class SuperSuitVecEnv(VecEnv):
+    """
+    Games of a PettingZoo ParallelEnv as rows of one VecEnv, flattened by SuperSuit.
+
+    Rows are game-major, then agent: row ``game * N + agent``, agents in the order of ``possible_agents``. An episode
+    is a team's: its N rows are done together, when its last agent has ended. The row of an agent that ended earlier
+    (or has not joined) shows zeros, gets no reward, and its infos hold ``"active": False``; the info of the step at
+    which it ended holds its ``"terminal_observation"``.
+
+    Infos of done rows hold ``"terminal_observation"`` and ``"TimeLimit.truncated"`` (True if that row's agent was
+    truncated and not terminated at that step); reset infos are in ``reset_infos`` only. A game's own infos named
+    ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which mean something else to
+    Stable-Baselines3, are renamed: ``"game_episode"``, ...
+
+    Observations and actions of Discrete and MultiDiscrete spaces are counted from 0 in rows, whatever the ``start``
+    of the game's space. Actions of a Box of integers may be given as floats, which are rounded.
+
+    ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` and ``get_images`` take and return rows, as SB3's
+    callers expect; what is meant is the row's game. So ``env_method`` without indices calls a game's method N times:
+    for a method that changes the game use :meth:`game_method`. ``action_masks`` is the exception, for sb3-contrib:
+    each game is asked once, and if it answers with a dict by agent, each row gets its own agent's mask.
+
+    On request rows carry signals. The observation of a row is then a Dict of ``"obs"``, the agent's own observation,
+    and
+
+    - ``"active"``, Discrete(2): 1 while the row's agent takes part. In the last observation of an episode: 1 if the
+      agent was stopped by a time limit, so that something would have followed;
+    - ``"action_mask"``, MultiBinary(A): 1 for legal actions; zeros for agents that do not act;
+    - ``"state"``: the game's ``state()``, in the rows of all its agents, active or not.
+
+    An exception in a game is raised here as it is, also from a worker process; afterwards call ``reset``.
+
+    :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it.
+        For worker processes it must be possible to pickle it with cloudpickle
+    :param n_games: E, number of games
+    :param seed: of the games, as in :meth:`seed`
+    :param n_cpus: number of worker processes; 1 keeps all games in this process
+    :param active: whether rows tell if their agent takes part
+    :param action_masks: None leaves observations as they are. ``"auto"`` shows masks in rows if the game gives any, in
+        observations of the form {"observation", "action_mask"} or in ``infos[agent]["action_mask"]``, True insists on
+        them, False shows none; all three take observations out of that form, and turn Dicts and Tuples of scalars and
+        vectors into one vector, as ``gymnasium.spaces.flatten`` does
+    :param state: whether rows show the game's ``state()``
+    :raises ValueError: if the environment is no ParallelEnv, cannot be copied, its agents differ in their spaces, or
+        it does not give the signals
+    """
+
+    def __init__(
+        self,
+        make_env: MakeEnv,
+        n_games: int,
+        seed: int | None = None,
+        n_cpus: int = 1,
+        active: bool = False,
+        action_masks: AskMasks | None = None,
+        state: bool = False,
+    ) -> None:
+        self.n_games = check_count("n_games", n_games)
+        n_cpus = min(check_count("n_cpus", n_cpus), self.n_games)
+        check_seed(seed)
+        source, form = _source_and_form(make_env, n_cpus, active, action_masks, state)
+        self.possible_agents = list(form.agents)
+        self.n_agents = len(self.possible_agents)
+        self._game_action_space = form.action_space
+        self._closed = self._begun = self._has_warned = False
+        self._actions: Array | None = None
+        self._games = (
+            TeamConcatVecEnv(source, form, range(self.n_games))
+            if n_cpus == 1
+            else WorkerGames(source, form, self.n_games, n_cpus)
+        )
+        try:
+            super().__init__(self.n_games * self.n_agents, form.rows.to_space(), counted_from_zero(form.action_space))
+            self.seed(seed)
+        except BaseException:
+            self.close()
+            raise
+        self._next_options: list[Info | None] = [None] * self.n_games
+
+    # ---- episodes
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Seed all games, at the next reset; later episodes go on with each game's own random stream.
+
+        :param seed: game ``i`` gets ``game_seeds(seed, E)[i]``, whatever the number of processes; None for fresh
+            entropy
+        :return: for each row, the seed of its game
+        """
+        check_seed(seed)
+        if seed is None:
+            seed = cast(int, np.random.SeedSequence().entropy)
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training.
+        self.seeded_with = tuple(game_seeds(int(seed), self.n_games))
+        self._next_seeds: list[int | None] = list(self.seeded_with)
+        return [game_seed for game_seed in self.seeded_with for _ in range(self.n_agents)]
+
+    def set_options(self, options: list[Info] | Info | None = None) -> None:
+        """
+        Set the options of the next reset.
+
+        :param options: for all games, or a list with those for each row, where a game takes those of its first row
+        """
+        if isinstance(options, (list, tuple)) and len(options) != self.num_envs:
+            raise ValueError(
+                f"expected a dict for all games or a list of {self.num_envs} dicts, one per row ({self.n_games} games "
+                f"of {self.n_agents} agents), got {len(options)}"
+            )
+        by_row = options if isinstance(options, (list, tuple)) else [options] * self.num_envs
+        self._next_options = [own or None for own in by_row[:: self.n_agents]]
+
+    def reset(self) -> VecEnvObs:
+        """
+        Begin an episode in every game; a step that was begun is cancelled.
+
+        :return: observations of the B rows
+        """
+        self._check_open()
+        self._begun, self._actions = False, None
+        observations, self.reset_infos = self._games.reset_all(self._next_seeds, self._next_options)
+        self._next_seeds, self._next_options = [None] * self.n_games, [None] * self.n_games
+        self._begun = True
+        return cast(VecEnvObs, observations)
+
+    def step_async(self, actions: npt.ArrayLike) -> None:
+        """
+        Take the actions of a step.
+
+        :param actions: of the B rows; those of agents that have ended are ignored
+        :raises ValueError: if one is not in the action space; no game has been stepped then
+        """
+        self._check_open()
+        if not self._begun:
+            raise RuntimeError("no episode has begun (or one was stopped by an error): call reset() before step()")
+        self._actions = _checked_actions(self.action_space, self.possible_agents, self.n_games, actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Step all games.
+
+        :return: observations, rewards (float32), dones (bool) and infos of the B rows
+        """
+        if self._actions is None:
+            raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
+        actions = _in_games_form(self._game_action_space, self._actions)
+        self._begun, self._actions = False, None
+        step = self._games.play(actions)
+        self._begun = True
+        for row in np.flatnonzero(step.dones).tolist():
+            self.reset_infos[row] = step.reset_infos[row]
+        if step.notes and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(f"{step.notes[0]}; later ones are not reported", UserWarning, stacklevel=2)
+        return step.observations, step.rewards, step.dones, step.infos
+
+    def close(self) -> None:
+        """Close all games and end the worker processes; a second time does nothing."""
+        if not self._closed:
+            self._closed = True
+            self._games.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("the vector environment is closed (it was closed); make a new one")
+
+    # ---- what SB3 asks for by row
+
+    def _ask(self, questions: Sequence[Question]) -> list[Any]:
+        self._check_open()
+        answers = self._games.ask(questions)
+        return [answers[place] for place in range(len(questions))]
+
+    def _rows(self, indices: VecEnvIndices) -> list[int]:
+        listed = range(self.num_envs) if indices is None else [indices] if isinstance(indices, Integral) else indices
+        return _checked_indices("row", cast(Iterable[int], listed), self.num_envs)
+
+    def _ask_rows(self, indices: VecEnvIndices, question: str, *args: Any) -> list[Any]:
+        """Ask the games of some rows, once each; return for each row the answer of its game."""
+        games = [row // self.n_agents for row in self._rows(indices)]
+        asked = list(dict.fromkeys(games))
+        answers = dict(zip(asked, self._ask([(game, question, args) for game in asked]), strict=True))
+        return [answers[game] for game in games]
+
+    def has_attr(self, attr_name: str) -> bool:
+        """
+        Return whether all games have an attribute.
+
+        :param attr_name: of the game, or of a wrapper around it
+        """
+        return all(self._ask_rows(None, "has_attr", attr_name))
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        Get an attribute of the rows' games; from a worker process comes a copy.
+
+        :param attr_name: of the game, or of a wrapper around it
+        :param indices: rows
+        :return: one value per row
+        """
+        return self._ask_rows(indices, "get_attr", attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        Set an attribute of the rows' games, once per game.
+
+        :param attr_name: of the game, or of the wrapper around it that has it
+        :param value: the new value
+        :param indices: rows
+        """
+        self._ask_rows(indices, "set_attr", attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of the rows' games, once for every row: a game with N rows among the indices is called N times.
+
+        :param method_name: of the game, or of a wrapper around it
+        :param method_args: positional arguments
+        :param indices: rows
+        :param method_kwargs: keyword arguments
+        :return: one result per row
+        """
+        rows = self._rows(indices)
+        if method_name == "action_masks" and not method_args and not method_kwargs:
+            masks = self._ask_rows(rows, "action_masks")
+            return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
+        call = (method_name, method_args, method_kwargs)
+        return self._ask([(row // self.n_agents, "call", call) for row in rows])
+
+    def game_method(
+        self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of games, once each.
+
+        :param method_name: of the game, or of a wrapper around it
+        :param args: positional arguments
+        :param games: which games, None for all
+        :param kwargs: keyword arguments
+        :return: one result per game
+        """
+        listed = range(self.n_games) if games is None else [games] if isinstance(games, Integral) else games
+        chosen = _checked_indices("game", cast(Iterable[int], listed), self.n_games)
+        return self._ask([(game, "call", (method_name, args, kwargs)) for game in chosen])
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        Return whether the rows' games are wrapped.
+
+        :param wrapper_class: a wrapper
+        :param indices: rows
+        :return: one answer per row
+        """
+        return self._ask_rows(indices, "is_wrapped", wrapper_class.__module__, wrapper_class.__qualname__)
+
+    def get_images(self) -> Sequence[npt.NDArray[Any] | None]:
+        """
+        Draw every game.
+
+        :return: one picture per row; rows of one game share it. None if the render mode is not ``"rgb_array"``
+        """
+        pictures = self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games
+        return [picture for picture in pictures for _ in range(self.n_agents)]
+
+    def render(self, mode: str | None = None) -> npt.NDArray[Any] | None:
+        """
+        Draw every game once.
+
+        :param mode: None, or the environment's own
+        :return: one picture of all games for ``"rgb_array"``, else None
+        """
+        if self.render_mode is None or mode not in (None, self.render_mode):
+            return super().render(mode)  # which explains what is wrong
+        pictures = self.game_method("render")
+        return tile_images(pictures) if self.render_mode == "rgb_array" else None
+
+
+def _source_and_form(
+    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks | None, state: bool
+) -> tuple[GameSource, GameForm]:
+    """Look at an example of the game, and keep what games are made of."""
+    is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
+    example: Any = make_env() if is_factory else make_env
+    check_is_parallel(example, is_factory)
+    try:
+        source = GameSource(make_env, is_factory, n_cpus)
+        form = game_form(example, partial(first_infos_of, source.build), active, action_masks, state)
+    finally:
+        if is_factory:
+            # Games may rely on having been reset before they are closed; this one has only been looked at.
+            with suppress(Exception):
+                example.close()
+    return source, form
+
+
+def _checked_indices(kind: str, indices: Iterable[int], n: int) -> list[int]:
+    """Count negative indices from the end."""
+    listed = [int(index) for index in indices]
+    for index in listed:
+        if not -n <= index < n:
+            raise ValueError(f"there is no {kind} {index}: expected 0 to {n - 1}")
+    return [index % n for index in listed]
+
+
+def _checked_actions(
+    space: spaces.Space[Any], agents: Sequence[Any], n_games: int, actions: npt.ArrayLike
+) -> npt.NDArray[Any]:
+    """Bring the actions of all rows into the dtype of their space, or say what is wrong with them."""
+    array = np.asarray(actions)
+    shape = (n_games * len(agents), *cast(tuple[int, ...], space.shape))
+    dtype = np.dtype(space.dtype)
+    if array.shape != shape or array.dtype.kind not in _kinds_of_actions(space):
+        raise ValueError(
+            f"expected actions from {space} for {shape[0]} rows, {dtype} of shape {shape}, "
+            f"got {array.dtype} of shape {array.shape}"
+        )
+    if dtype.kind == "f":  # bounds are rounded to the dtype, so actions must be before they are compared
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype, copy=False)
+    elif array.dtype.kind == "f" and isinstance(space, spaces.Box):
+        array = np.rint(array)
+    low, high = bounds_of(space)
+    inside = (array >= low) & (array <= high)
+    if isinstance(space, spaces.MultiBinary):
+        inside &= (array == 0) | (array == 1)
+    outside = np.argwhere(~inside)
+    if len(outside):
+        row = int(outside[0, 0])
+        game, agent = divmod(row, len(agents))
+        raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
+    return np.array(array, dtype=dtype)  # a copy: the caller may go on to use its array
+
+
+def _kinds_of_actions(space: spaces.Space[Any]) -> str:
+    """Return which kinds of numbers may be actions; SB3's policies give floats for MultiBinary and for every Box."""
+    if isinstance(space, spaces.MultiBinary):
+        return "biuf"
+    return "fiu" if isinstance(space, spaces.Box) else "iu"
+
+
+def _in_games_form(space: spaces.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Count actions from where the game counts them."""
+    start = first_value(space)
+    return (actions + start).astype(actions.dtype, copy=False) if np.any(start != 0) else actions

@@ -1,0 +1,256 @@
+"""Games in several processes: Stable-Baselines3's ``SubprocVecEnv`` over groups of games."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import threading
+import time
+import traceback
+import weakref
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from functools import partial
+from multiprocessing import connection
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple
+
+import cloudpickle
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_saf.envs.game_form import GameForm
+from sb3_saf.envs.game_source import GameSource
+from sb3_saf.envs.supersuit_game import Info, Infos
+from sb3_saf.envs.supersuit_games import Played, Question, TeamConcatVecEnv, joined
+
+#: Seconds that a worker process gets to close its games.
+CLOSE_TIMEOUT = 10.0
+
+
+class Failure(NamedTuple):
+    """An exception on its way from a worker process."""
+
+    error: BaseException
+    trace: str
+
+
+class GameProcess(gymnasium.Env[Any, Any]):
+    """
+    A group of games in a worker process, as one environment of a SubprocVecEnv.
+
+    Only its method :meth:`run` is used: rows of a group do not fit into the scalar rewards and dones of an environment.
+    What goes there and comes back is pickled by cloudpickle, which takes lambdas, and exceptions are replies, so that a
+    game's error does not end the process.
+
+    :param source: makes the games
+    :param form: of the games
+    :param indices: of the games among all
+    """
+
+    observation_space = action_space = spaces.Discrete(1)
+
+    def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:
+        self._make_games = partial(TeamConcatVecEnv, source, form, indices)
+        self._games: TeamConcatVecEnv | None = None
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def run(self, payload: bytes) -> bytes:
+        """
+        Call a method of this class.
+
+        :param payload: pickled name and arguments
+        :return: pickled result or :class:`Failure`
+        """
+        try:
+            name, args = pickle.loads(payload)
+            result = getattr(self, name)(*args)
+        except (Exception, SystemExit) as error:
+            return _packed_failure(error)
+        try:
+            return bytes(cloudpickle.dumps(result))
+        except Exception as error:
+            refusal = TypeError(
+                f"this reply cannot leave its worker process ({error}), it is {result!r}; "
+                "make it something that can be pickled, or use n_cpus=1"
+            )
+            return _packed_failure(refusal)
+
+    def build(self) -> None:
+        """Make the games."""
+        self._games = self._make_games()
+
+    def call(self, name: str, *args: Any) -> Any:
+        """Call a method of the games."""
+        return getattr(self._games, name)(*args)
+
+    def close_games(self, timeout: float) -> None:
+        """Close the games; the process ends if that takes more seconds."""
+        timer = threading.Timer(timeout, os._exit, [1])
+        timer.daemon = True
+        timer.start()
+        try:
+            if self._games is not None:
+                self._games.close()
+        finally:
+            timer.cancel()
+
+
+class WorkerGames:
+    """
+    Games in several processes, with the methods of :class:`TeamConcatVecEnv`.
+
+    :param source: makes the games
+    :param form: of the games
+    :param n_games: E
+    :param n_cpus: number of processes, at most; they start as :mod:`multiprocessing` is set to start them
+    """
+
+    def __init__(self, source: GameSource, form: GameForm, n_games: int, n_cpus: int) -> None:
+        size = -(-n_games // n_cpus)
+        self._groups = [range(first, min(first + size, n_games)) for first in range(0, n_games, size)]
+        #: Why nothing can be asked any more.
+        self.ended: str | None = None
+        self._venv = SubprocVecEnv(
+            [partial(GameProcess, source, form, group) for group in self._groups],
+            start_method=multiprocessing.get_start_method(),
+        )
+        self._watch = _Watch(self._venv.processes, [_named(group) for group in self._groups])
+        self._watch.start()
+        # At the interpreter's exit, or when the environment is forgotten.
+        self._finalizer = weakref.finalize(self, _close_workers, self._venv, os.getpid())
+        self._run("build")
+
+    def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
+        """Begin an episode in every game (see :class:`TeamConcatVecEnv`)."""
+        observations, infos = zip(*self._run("call", "reset_all", seeds, options), strict=True)
+        return joined(observations), [info for group in infos for info in group]
+
+    def play(self, actions: npt.NDArray[Any]) -> Played:
+        """Step every game (see :class:`TeamConcatVecEnv`)."""
+        steps: list[Played] = self._run("call", "play", actions)
+        return Played(
+            joined([step.observations for step in steps]),
+            np.concatenate([step.rewards for step in steps]),
+            np.concatenate([step.dones for step in steps]),
+            [info for step in steps for info in step.infos],
+            [info for step in steps for info in step.reset_infos],
+            [note for step in steps for note in step.notes],
+        )
+
+    def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
+        """Ask games (see :class:`TeamConcatVecEnv`)."""
+        answers: dict[int, Any] = {}
+        for group in self._run("call", "ask", list(questions)):
+            answers |= group
+        return answers
+
+    def close(self) -> None:
+        """Close all games and end the processes; then raise the first error of a game."""
+        self._finalizer.detach()
+        if self.ended is None:
+            self.ended = "it was closed"
+            self._results(_close_workers(self._venv, os.getpid()))
+
+    def _run(self, name: str, *args: Any) -> list[Any]:
+        """Call a method of :class:`GameProcess` in all processes."""
+        if self.ended is not None:
+            raise RuntimeError(f"the vector environment is closed ({self.ended}); make a new one")
+        try:
+            replies = self._venv.env_method("run", cloudpickle.dumps((name, args)))
+        except (EOFError, OSError) as error:  # the watch has ended all processes
+            self._watch.join(CLOSE_TIMEOUT)
+            self._end(self._watch.first_end or "a worker process stopped answering")
+            raise RuntimeError(f"{self.ended}; the vector environment is closed, make a new one") from error
+        except BaseException:
+            self._end("it was interrupted while it waited for its worker processes")
+            raise
+        return self._results(replies)
+
+    def _results(self, replies: Sequence[bytes]) -> list[Any]:
+        results = [pickle.loads(reply) for reply in replies]
+        for result, group in zip(results, self._groups, strict=False):
+            if isinstance(result, Failure):
+                where = f"in the worker process of {_named(group)}:\n{result.trace}"
+                raise result.error from RuntimeError(where)
+        return results
+
+    def _end(self, reason: str) -> None:
+        self.ended = reason
+        self._finalizer.detach()
+        _kill(self._venv.processes)
+
+
+class _Watch(threading.Thread):
+    """
+    End all processes when one has ended.
+
+    A forked process holds copies of the pipes of the others, so that nobody who waits for a reply of a dead process
+    would be told of its end.
+
+    :param processes: all workers
+    :param names: of their games, for the message
+    """
+
+    def __init__(self, processes: Sequence[BaseProcess], names: Sequence[str]) -> None:
+        super().__init__(daemon=True)
+        self._processes, self._names = processes, names
+        #: What there is to say of the first process that ended.
+        self.first_end: str | None = None
+
+    def run(self) -> None:
+        """Wait for the first end, and end the others."""
+        ended = connection.wait([process.sentinel for process in self._processes])
+        number = next(n for n, process in enumerate(self._processes) if process.sentinel in ended)
+        process = self._processes[number]
+        while (code := process.exitcode) is None:  # another thread may be about to learn it
+            time.sleep(0.001)
+        self.first_end = (
+            f"worker process {number} ({self._names[number]}, pid {process.pid}) ended with exit code {code}"
+        )
+        _kill(self._processes)
+
+
+def _named(group: range) -> str:
+    return f"games {group.start} to {group.stop - 1}" if len(group) > 1 else f"game {group.start}"
+
+
+def _packed_failure(error: BaseException) -> bytes:
+    trace = traceback.format_exc()
+    try:
+        pickled = cloudpickle.dumps(Failure(error, trace))
+        pickle.loads(pickled)  # some exceptions cannot be made again from their arguments
+        return bytes(pickled)
+    except Exception:
+        return bytes(cloudpickle.dumps(Failure(RuntimeError(f"{type(error).__name__}: {error}"), trace)))
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has ended, even if that was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def _close_workers(venv: SubprocVecEnv, owner: int) -> list[bytes]:
+    """Close the games of all processes that still live, and end them; return their replies."""
+    if os.getpid() != owner:  # a copy in a forked process
+        return []
+    replies: list[bytes] = []
+    with suppress(EOFError, OSError):
+        replies = venv.env_method("run", cloudpickle.dumps(("close_games", (CLOSE_TIMEOUT,))))
+        venv.close()
+    _kill(venv.processes)
+    return replies
+
+
+def _kill(processes: Sequence[BaseProcess]) -> None:
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.join()
