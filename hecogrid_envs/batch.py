@@ -15,6 +15,7 @@ from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Wo
 from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName, check_task
 from hecogrid_envs.seeding import fresh_seed, generator_word
+from hecogrid_envs.snapshots import check_snapshot, load_snapshot, take_snapshot
 from hecogrid_envs.state import StateMapping, check_state
 from hecogrid_envs.threads import NOTHING, Shares
 from hecogrid_envs.tiles import INVISIBLE, turned_atlases
@@ -249,29 +250,29 @@ class GameBatch:
         """
         Copy all that the games' future depends on, random generators included; see :meth:`restore`.
 
-        :return: arrays by name, with games along the first axis or flattened
+        :return: arrays by name, with games along the first axis
         """
-        return {"seeded": self._seeded.copy(), **{name: array.copy() for name, array in self._games._asdict().items()}}
+        return take_snapshot(self._games, self._seeded)
+
+    def check_snapshot(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
+        """
+        Check that the games could be in a state.
+
+        :param snapshot: what :meth:`snapshot` gave
+        :raises ValueError: naming the first array that does not fit, or the first value that no game reaches
+        """
+        check_snapshot(snapshot, self._games, self._seeded, self.params)
 
     def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
         """
         Go on from a snapshot of a batch with the same task, parameters and number of games.
 
         :param snapshot: what :meth:`snapshot` gave; copied
-        :raises ValueError: naming the first array that does not fit; nothing is changed then
+        :raises ValueError: see :meth:`check_snapshot`; nothing is changed then
         """
-        own = {"seeded": self._seeded, **self._games._asdict()}
-        if different := sorted(own.keys() ^ snapshot.keys()):
-            raise ValueError(f"expected a snapshot with the arrays {sorted(own)}, they differ in {different[0]!r}")
-        for name, array in own.items():
-            given = snapshot[name]
-            if given.shape != array.shape or given.dtype != array.dtype:
-                raise ValueError(
-                    f"expected {name!r} of shape {array.shape} and {array.dtype}, got {given.shape} and {given.dtype}; "
-                    "take the task, the parameters and the number of games that the snapshot was made with"
-                )
-        for name, array in own.items():
-            array[...] = snapshot[name]
+        self.check_snapshot(snapshot)
+        load_snapshot(self._games, self._book, snapshot)
+        self._seeded[...] = snapshot["seeded"]
         self._begun = False  # looked up at the next step
 
     def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:

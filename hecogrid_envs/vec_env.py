@@ -145,22 +145,38 @@ class NativeVecEnv(VecEnv):
             "games": self.batch.snapshot(),
         }
 
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that these games could be in a state.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: naming the first difference, if the state is that of other games or one that no game reaches
+        """
+        own = self.checkpoint_state()
+        if different := sorted(own.keys() ^ state.keys()):
+            raise ValueError(f"expected the state of games with {', '.join(own)}, they differ in {different[0]!r}")
+        for name in ("task", "n_games"):
+            if own[name] != state[name]:
+                raise ValueError(f"expected games with {name}={own[name]!r}, got a state with {name}={state[name]!r}")
+        params = state["params"] if isinstance(state["params"], Mapping) else {}
+        for name, value in own["params"].items():
+            if params.get(name) != value:
+                raise ValueError(f"expected games with {name}={value!r}, got a state with {name}={params.get(name)!r}")
+        if not isinstance(state["running"], bool) or not isinstance(state["games"], Mapping):
+            raise ValueError("expected the state of games with 'running' true or false and arrays in 'games'")
+        _check_seeds(state["seeds"], self.n_games, self.n_agents)
+        self.batch.check_snapshot(state["games"])
+        if state["running"] and not state["games"]["seeded"].all():
+            raise ValueError("expected running games to have begun, got a state in which one has not")
+
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
         Go on from there; observations of the present are those of before.
 
         :param state: what :meth:`checkpoint_state` gave
-        :raises ValueError: naming the first difference, if the state is that of other games
+        :raises ValueError: see :meth:`check_checkpoint_state`
         """
-        own = self.checkpoint_state()
-        for name in ("task", "n_games"):
-            if own[name] != state[name]:
-                raise ValueError(f"expected games with {name}={own[name]!r}, got a state with {name}={state[name]!r}")
-        for name, value in own["params"].items():
-            if state["params"].get(name) != value:
-                raise ValueError(
-                    f"expected games with {name}={value!r}, got a state with {name}={state['params'].get(name)!r}"
-                )
+        self.check_checkpoint_state(state)
         self.batch.restore(state["games"])
         self._running = state["running"]
         self._seeds = list(state["seeds"])
@@ -215,6 +231,15 @@ class NativeVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No row is wrapped in a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
+
+
+def _check_seeds(seeds: Any, n_games: int, n_agents: int) -> None:
+    """The seeds of the next reset, one for each row."""
+    is_seed = [seed is None or (isinstance(seed, int) and 0 <= seed < 2**128) for seed in seeds] if seeds else []
+    if not isinstance(seeds, list) or len(seeds) != n_games * n_agents or not all(is_seed):
+        raise ValueError(
+            f"expected {n_games * n_agents} seeds of at least 0 or None, one for each row, got {seeds!r:.80}"
+        )
 
 
 def _plain(value: object) -> object:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_saf.checkpoints.data import decode, encode
+from sb3_saf.checkpoints.data import decode, encode, write_tree
 from sb3_saf.checkpoints.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 from sb3_saf.checkpoints.store import CheckpointFolder
 
@@ -27,6 +27,12 @@ TREE: dict[str, Any] = {
     "tensor": th.arange(4.0),
     "$": "a key that marks nothing",
 }
+
+
+def put(folder: CheckpointFolder, tree: Any, game_steps: int) -> None:
+    folder.write(lambda file: write_tree(file, tree, "1.2"), game_steps)
+
+
 ROUNDS = int(os.environ.get("CHECKPOINT_DAMAGES", "200"))
 
 
@@ -60,7 +66,7 @@ def test_every_truncation_and_bit_flip_is_recognised() -> None:
 
 
 def test_wrong_content_with_a_right_checksum_is_an_error_of_ours() -> None:
-    for content in (b"", b"sb3_saf checkpoint, format 1, written by sb3_saf 1.2\nnonsense", b"something else"):
+    for content in (b"", b"sb3_saf checkpoint, format 2, written by sb3_saf 1.2\nnonsense", b"something else"):
         with pytest.raises(DamagedCheckpointError):
             decode(content + hashlib.sha256(content).digest())
 
@@ -72,9 +78,9 @@ def in_format_9() -> bytes:
 
 def test_an_unknown_format_says_who_wrote_it(tmp_path: Path) -> None:
     folder = CheckpointFolder(tmp_path)
-    folder.write(encode(1, "1.2"), 10)
-    folder.write(in_format_9(), 20)
-    with pytest.raises(UnknownFormatError, match=r"checkpoint-000000000020.*format 9.*sb3_saf 7\.5\.0.*format 1"):
+    put(folder, 1, 10)
+    folder.write(lambda file: file.write(in_format_9()), 20)
+    with pytest.raises(UnknownFormatError, match=r"checkpoint-000000000020.*format 9.*sb3_saf 7\.5\.0.*format 2"):
         folder.newest()
 
 
@@ -82,7 +88,7 @@ def test_the_last_ones_are_kept_and_the_newest_is_read(tmp_path: Path) -> None:
     folder = CheckpointFolder(tmp_path / "new" / "folder", keep=2)
     assert folder.newest() is None
     for steps in (5, 30, 100, 999_999_999_999):
-        folder.write(encode(steps, "1.2"), steps)
+        put(folder, steps, steps)
     assert [int(path.stem.split("-")[1]) for path in folder.checkpoints()] == [999_999_999_999, 100]
     loaded = folder.newest()
     assert loaded is not None and loaded.tree == 999_999_999_999
@@ -91,7 +97,7 @@ def test_the_last_ones_are_kept_and_the_newest_is_read(tmp_path: Path) -> None:
 def test_a_damaged_file_is_passed_over_with_a_warning_that_names_both(tmp_path: Path) -> None:
     folder = CheckpointFolder(tmp_path)
     for steps in (10, 20):
-        folder.write(encode(steps, "1.2"), steps)
+        put(folder, steps, steps)
     newest, before = folder.checkpoints()
     newest.write_bytes(newest.read_bytes()[:-1])
     with pytest.warns(UserWarning, match=rf"{newest}.*checksum.*Going back to {before}"):
@@ -108,8 +114,8 @@ def test_a_damaged_file_is_passed_over_with_a_warning_that_names_both(tmp_path: 
 def test_a_damaged_newer_file_does_not_push_out_what_is_written_after_it(tmp_path: Path) -> None:
     folder = CheckpointFolder(tmp_path, keep=1)
     (tmp_path / "checkpoint-000000000020.ckpt").write_bytes(b"damaged")
-    folder.write(encode(10, "1.2"), 10)
-    folder.write(encode(15, "1.2"), 15)
+    put(folder, 10, 10)
+    put(folder, 15, 15)
     with pytest.warns(UserWarning, match="Going back to .*15.ckpt"):
         loaded = folder.newest()
     assert loaded is not None and loaded.tree == 15
@@ -117,14 +123,14 @@ def test_a_damaged_newer_file_does_not_push_out_what_is_written_after_it(tmp_pat
 
 def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = CheckpointFolder(tmp_path)
-    folder.write(encode(1, "1.2"), 10)
+    put(folder, 1, 10)
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(CheckpointError, match=r"No space left.*last good one is .*checkpoint-000000000010"):
-        folder.write(encode(2, "1.2"), 20)
+        put(folder, 2, 20)
     monkeypatch.undo()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-000000000010.ckpt"]
     loaded = folder.newest()
@@ -135,7 +141,7 @@ def test_what_a_killed_write_left_is_removed_and_never_read(tmp_path: Path) -> N
     (tmp_path / ".writing-abc").write_bytes(b"half")
     folder = CheckpointFolder(tmp_path)
     assert folder.newest() is None
-    folder.write(encode(1, "1.2"), 10)
+    put(folder, 1, 10)
     assert not (tmp_path / ".writing-abc").exists()
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import tracemalloc
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.checkpoints.data import read_tree, write_tree
 from sb3_saf.envs.teams import TeamSpaces
 
 N_AGENTS, N_GAMES, N_ACTIONS = 2, 3, 4
@@ -178,6 +181,41 @@ def test_rows_that_are_no_teams_are_refused() -> None:
         buffer.add({**rows, "obs": rows["obs"][:, :2]}, rows, *rest)
     with pytest.raises(ValueError, match="whole teams"):
         TeamReplayBuffer(10, TeamSpaces.of(OWN, 2).to_dict_space(), spaces.Discrete(2), n_envs=3)
+
+
+def test_teams_that_never_take_part_are_refused() -> None:
+    buffer, story = make_buffer(active=True), Story()
+    rest: Any = (np.zeros(6, dtype=int), np.zeros(6), np.zeros(6), [{}] * 6)
+    rows = story.rows(story.now)
+    dead = {**rows, "active": np.zeros((6, N_AGENTS), dtype=np.int8)}
+    buffer.add(dead, dead, *rest)
+    with pytest.raises(ValueError, match=r"expected agents that take part, got none in 1 steps of 3 games"):
+        buffer.sample(3)
+    copy = make_buffer(active=True)
+    copy.load_checkpoint_state(buffer.checkpoint_state())
+    with pytest.raises(ValueError, match="expected agents that take part"):
+        copy.sample(3)
+    buffer.add({**dead, "active": np.ones((6, N_AGENTS), dtype=np.int8)}, dead, *rest)
+    assert len(buffer.sample(3).rewards) == 3
+
+
+def test_a_checkpoint_is_written_without_a_second_buffer_in_memory(tmp_path: Path) -> None:
+    space = TeamSpaces.of(spaces.Box(0, 255, (3_000,), np.uint8), N_AGENTS).to_dict_space()
+    buffer = TeamReplayBuffer(6_000, space, spaces.Discrete(4), n_envs=N_AGENTS * N_GAMES)
+    buffer._n_steps, buffer.pos, buffer._has_played, buffer.full = buffer.buffer_size, 0, True, True
+    assert buffer.nbytes > 30e6
+    tracemalloc.start()
+    try:
+        with (tmp_path / "file").open("wb") as file:
+            write_tree(file, buffer.checkpoint_state(), "1.0")
+        written = tracemalloc.get_traced_memory()[1]
+        tracemalloc.reset_peak()
+        with (tmp_path / "file").open("rb") as file:
+            read_tree(file)
+        read = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert written < 0.6 * buffer.nbytes and read < 1.5 * buffer.nbytes
 
 
 def test_memory_that_does_not_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

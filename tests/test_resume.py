@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import signal
 import subprocess
@@ -60,10 +61,18 @@ class Lightning(BaseCallback):
         return True
 
 
-def make(folder: Path | None = None, algorithm: Any = PPO, policy: str = "SAFPolicy", **arguments: Any) -> Any:
+def make(
+    folder: Path | None = None,
+    algorithm: Any = PPO,
+    policy: str = "SAFPolicy",
+    games_seed: int = 3,
+    coordination: int = 1,
+    **arguments: Any,
+) -> Any:
     """A model as a user's script makes it at every start."""
+    monitor_dir = None if folder is None else str(folder)
     env = sb3_saf.make_team_env(
-        "TeamTogether", N_GAMES, seed=3, monitor_dir=None if folder is None else str(folder), **TASK
+        "TeamTogether", N_GAMES, seed=games_seed, monitor_dir=monitor_dir, **TASK | {"coordination": coordination}
     )
     settings: dict[str, Any] = {"seed": 3, "policy_kwargs": LIGHT} | arguments
     if algorithm is not QPLEX:
@@ -85,10 +94,11 @@ def weights(model: BaseAlgorithm) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in model.policy.state_dict().items()}
 
 
-def evaluation(folder: Path | None = None) -> TeamEvalCallback:
-    env = sb3_saf.make_team_env("TeamTogether", 2, seed=50, **TASK)
+def evaluation(folder: Path | None = None, seed: int = 50, **arguments: Any) -> TeamEvalCallback:
+    env = sb3_saf.make_team_env("TeamTogether", 2, seed=seed, **TASK)
     path = None if folder is None else str(folder)
-    return TeamEvalCallback(env, n_eval_episodes=2, eval_freq=40, deterministic=False, verbose=0, log_path=path)
+    settings: dict[str, Any] = {"n_eval_episodes": 2, "eval_freq": 40, "deterministic": False} | arguments
+    return TeamEvalCallback(env, verbose=0, log_path=path, **settings)
 
 
 def struck(folder: Path, make_model: Callable[[], Any], after_calls: int, others: Any = ()) -> None:
@@ -187,8 +197,8 @@ def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: 
 def test_what_agents_remember_goes_on(tmp_path: Path) -> None:
     done, resumed = go_on(tmp_path, MODELS["QPLEX with memory"](), rollouts=2), MODELS["QPLEX with memory"]()
     resume(tmp_path, resumed, Lightning(-1))
-    assert resumed._agent_state[0].any()
-    for part, expected in zip(resumed._agent_state, done._agent_state, strict=True):
+    assert resumed.agent_state[0].any()
+    for part, expected in zip(resumed.agent_state, done.agent_state, strict=True):
         assert np.array_equal(part, expected)
 
 
@@ -242,31 +252,60 @@ def test_resume_alone(tmp_path: Path) -> None:
     assert weights(model) == weights(undisturbed)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "difference"),
-    [
-        ({"gamma": 0.5}, "gamma is 0.99 there and 0.5 in the model"),
-        ({"learning_rate": 0.1}, "lr_schedule is"),
-        ({"policy_kwargs": LIGHT | {"net_arch": [9]}}, "policy's net_arch"),
-        ({"policy": "MAPPOPolicy"}, "policy is 'SAFPolicy' there and 'MAPPOPolicy'"),
-        ({"n_epochs": 5}, "n_epochs is 2 there and 5"),
-    ],
-)
-def test_the_first_difference_is_named(arguments: dict[str, Any], difference: str, tmp_path: Path) -> None:
-    go_on(tmp_path, make(), rollouts=1)
-    with pytest.raises(CheckpointError, match=difference):
-        resume(tmp_path, make(**arguments))
+def fingerprint(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"}
 
 
-def test_other_games_and_callbacks_are_named(tmp_path: Path) -> None:
-    go_on(tmp_path, make(), rollouts=1)
-    env = sb3_saf.make_team_env("TeamTogether", N_GAMES, **{**TASK, "coordination": 2})
-    with pytest.raises(CheckpointError, match=r"coordination=2, got a state with coordination=1"):
-        resume(tmp_path, make(env=env), Lightning(-1))
-    with pytest.raises(CheckpointError, match=r"callbacks \['Lightning'\], got \['TeamEvalCallback'\]"):
-        resume(tmp_path, make(), evaluation())
+DIFFERENCES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], str]] = {
+    "hyperparameter": (lambda f: make(f, gamma=0.5), evaluation, "gamma is 0.99 there and 0.5 in the model"),
+    "schedule": (lambda f: make(f, learning_rate=0.1), evaluation, "lr_schedule is"),
+    "network": (lambda f: make(f, policy_kwargs=LIGHT | {"net_arch": [9]}), evaluation, "policy's net_arch"),
+    "policy": (lambda f: make(f, policy="MAPPOPolicy"), evaluation, "policy is 'SAFPolicy' there and 'MAPPOPolicy'"),
+    "epochs": (lambda f: make(f, n_epochs=5), evaluation, "n_epochs is 2 there and 5"),
+    "seed": (lambda f: make(f, seed=4), evaluation, "seed is 3 there and 4 in the model"),
+    "games' seeds": (lambda f: make(f, seed=None, games_seed=4), evaluation, r"the seeds of the games is \["),
+    "game": (lambda f: make(f, coordination=2), evaluation, "coordination=2, got a state with coordination=1"),
+    "episodes of evaluation": (
+        make,
+        lambda f: evaluation(f, n_eval_episodes=3),
+        "another TeamEvalCallback: its n_eval_episodes is 2 there and 3 here",
+    ),
+    "frequency of evaluation": (make, lambda f: evaluation(f, eval_freq=50), "its eval_freq is 40 there and 50"),
+    "determinism of evaluation": (make, lambda f: evaluation(f, deterministic=True), "its deterministic is False"),
+    "games of evaluation": (make, lambda f: evaluation(f, seed=51), "its seeds of the games is"),
+    "callback": (make, lambda f: Lightning(-1), r"callbacks \['TeamEvalCallback'\], got \['Lightning'\]"),
+}
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int | None], Path]:
+    """Folders of finished runs, by the model's seed."""
+
+    @functools.cache
+    def folder_of(seed: int | None) -> Path:
+        folder = tmp_path_factory.mktemp("run")
+        resumable_learn(make(folder, seed=seed), ROLLOUT, folder / "ck", evaluation(folder), every_game_steps=1)
+        return folder
+
+    return folder_of
+
+
+@pytest.mark.parametrize("name", DIFFERENCES)
+def test_another_run_is_named_before_anything_is_touched(name: str, finished_run: Callable[[int | None], Path]) -> None:
+    folder = finished_run(None if name == "games' seeds" else 3)  # a model's seed is that of its games, too
+    before = fingerprint(folder)
+    make_other, make_callback, message = DIFFERENCES[name]
+    with pytest.raises(CheckpointError, match=message):
+        resumable_learn(make_other(folder), 2 * ROLLOUT, folder / "ck", make_callback(folder))
+    assert fingerprint(folder) == before
+
+
+def test_a_folder_without_checkpoints_cannot_be_resumed(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="found none"):
         resume(tmp_path / "elsewhere", make())
+    (tmp_path / "file").touch()
+    with pytest.raises(CheckpointError, match="cannot keep checkpoints in"):
+        resumable_learn(make(), ROLLOUT, tmp_path / "file")
 
 
 def test_another_run_does_not_go_into_the_folder(tmp_path: Path) -> None:
@@ -319,7 +358,7 @@ def test_foreign_games_are_refused_or_begin_anew(tmp_path: Path) -> None:
         resumable_learn(supersuit(), ROLLOUT, tmp_path / "exact")
     with pytest.raises(RuntimeError):
         resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(20), every_game_steps=1, exact=False)
-    model = resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", exact=False)
+    model = resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(-1), exact=False)
     assert model.num_timesteps == 4 * ROLLOUT
 
 

@@ -1,5 +1,5 @@
 """
-Replay of teams: what all agents of a game saw and did, each joint observation stored once.
+Replay buffer of teams: what all agents of a game observed and did, each joint observation stored once.
 
 Letters: S slots, E games, N agents, A actions, G sampled team steps. A *team step* is one game step of one game.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -39,10 +39,12 @@ Indices = npt.NDArray[np.int64]
 
 _TRUNCATED: Final = "TimeLimit.truncated"
 _NO_ACTION: Final = -1
+#: The observation after a step is that of the next slot.
+_IN_NEXT_SLOT: Final = -1
 
 
 def free_memory() -> int | None:
-    """Bytes of memory that are free; None where nobody knows."""
+    """Return the free memory in bytes, or None where it cannot be found out."""
     if psutil is not None:
         return int(psutil.virtual_memory().available)
     try:
@@ -53,7 +55,7 @@ def free_memory() -> int | None:
 
 class TeamSteps(NamedTuple):
     """
-    What teams see at G steps.
+    Observations of teams at G steps.
 
     :param own: (G, N, *shape) own observations of all agents
     :param masks: (G, N, A) bool, legal actions; None if all always are
@@ -69,7 +71,7 @@ class TeamSteps(NamedTuple):
 
 class Sequences(NamedTuple):
     """
-    How the G steps of a sample lie in time: ``n`` sequences of ``length`` steps, one after the other.
+    The order in time of the G steps of a sample: ``n`` sequences of ``length`` steps, one after the other.
 
     :param n: number of sequences
     :param length: steps of each, those before the loss counts included
@@ -93,7 +95,7 @@ class TeamReplaySamples(NamedTuple):
     :param actions: (G, N) int64
     :param after: after the step; of an episode's end, its last observations
     :param rewards: (G,) team rewards, the sums of the agents' rewards
-    :param dones: (G,) 1.0 where nothing follows that is worth anything
+    :param dones: (G,) 1.0 where the value of what follows is not bootstrapped
     :param sequences: None for single steps
     """
 
@@ -151,7 +153,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self._check_memory()
 
     def _allocate(self, n_actions: int) -> None:
-        #: One more slot than steps: for what was seen after the newest step.
+        #: One more slot than steps: for the observation after the newest step.
         self.n_slots = self.buffer_size + 1
         shape = (self.n_slots, self.n_games)
         team = self.team_spaces
@@ -164,31 +166,34 @@ class TeamReplayBuffer(ReplayBuffer):
             self.seen[STATE_KEY] = np.zeros((*shape, *(team.state.shape or ())), dtype=team.state.dtype)
         self.actions = np.zeros((*shape, self.n_agents), dtype=np.min_scalar_type(n_actions - 1))
         self.rewards = np.zeros(shape, dtype=np.float32)
-        #: Whether nothing follows that is worth anything; whether the episode ends; whether one starts.
+        #: Whether the value of what follows is not bootstrapped; whether the episode ends; whether one starts.
         self.terminal, self.ended, self.starts = (np.zeros(shape, dtype=np.bool_) for _ in range(3))
-        #: Where the observation after a step was put aside; -1 if it is in the next slot.
-        self.aside_index = np.full(shape, -1, dtype=np.int32)
+        #: Index in ``aside`` of the observation after a step; -1 if it is that of the next slot.
+        self.aside_index = np.full(shape, _IN_NEXT_SLOT, dtype=np.int32)
         self.aside = {key: array[:0, 0].copy() for key, array in self.seen.items()}
         self._free: list[int] = []
         self._n_steps = 0
+        #: Whether any agent took part since the last reset.
+        self._has_played = False
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Remove all steps."""
         super().reset()
+        self._has_played = False
         self._n_steps = 0
-        self.aside_index[:] = -1
+        self.aside_index[:] = _IN_NEXT_SLOT
         self._free = list(range(len(self.aside[OBS_KEY])))
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays."""
+        """Return the bytes of all arrays."""
         parts = [*self.seen.values(), *self.aside.values()]
         parts += [self.actions, self.rewards, self.terminal, self.ended, self.starts, self.aside_index]
         return sum(array.nbytes for array in parts)
 
     @property
     def n_stored(self) -> int:
-        """Game steps that can be sampled, over all games."""
+        """Return the number of game steps that can be sampled, over all games."""
         return self.size() * self.n_games
 
     def _check_memory(self) -> None:
@@ -227,6 +232,7 @@ class TeamReplayBuffer(ReplayBuffer):
         :raises ValueError: if the rows are not whole teams in index order
         """
         now, after = self._parts(obs, "obs"), self._parts(next_obs, "next_obs")
+        self._has_played |= ACTIVE_KEY not in now or bool(now[ACTIVE_KEY].any())
         slot = self.pos
         self._begin(slot, now, None if episode_starts is None else np.asarray(episode_starts)[:: self.n_agents])
         ended = np.asarray(done).reshape(self.n_games, self.n_agents)[:, 0].astype(bool)
@@ -242,11 +248,11 @@ class TeamReplayBuffer(ReplayBuffer):
         self.full = self._n_steps == self.buffer_size
 
     def size(self) -> int:
-        """Steps of each game that can be sampled."""
+        """Return the number of steps of each game that can be sampled."""
         return self._n_steps
 
     def _parts(self, obs: Mapping[str, Array], what: str) -> dict[str, Array]:
-        """What is stored of rows, by game: (B, ...) -> (E, N, ...) or (E, ...)."""
+        """Check rows and return what is stored of them, by game: (B, ...) -> (E, N, ...) or (E, ...)."""
         own, agents = np.asarray(obs[OBS_KEY]), np.asarray(obs[AGENT_KEY]).reshape(-1)
         expected, dtype = (self.n_envs, *self.team_spaces.own_shape), self.team_spaces.team.dtype
         if own.shape != expected or not np.can_cast(own.dtype, dtype, "same_kind"):
@@ -269,7 +275,7 @@ class TeamReplayBuffer(ReplayBuffer):
         return parts
 
     def _begin(self, slot: int, now: dict[str, Array], starts: npt.NDArray[Any] | None) -> None:
-        """Write what is seen before a step, and put aside what it replaces if the step before needs it."""
+        """Write the observation before a step, and put aside what it replaces if the step before needs it."""
         if self.size() == 0:
             self.starts[slot] = True
         else:
@@ -292,7 +298,7 @@ class TeamReplayBuffer(ReplayBuffer):
             self.aside[key][place] = array[(slot + 1) % self.n_slots, game]
 
     def _grow(self) -> None:
-        """More places for observations put aside; at most as many as there are steps are ever in use."""
+        """Add places for observations put aside; at most as many as there are steps are ever in use."""
         n_places = len(self.aside[OBS_KEY])
         n_more = max(n_places, self.n_games)
         for key, array in self.aside.items():
@@ -300,18 +306,19 @@ class TeamReplayBuffer(ReplayBuffer):
         self._free = list(range(n_places, n_places + n_more))[::-1]
 
     def _release(self, slot: int) -> None:
-        """Free what a step that is overwritten has put aside."""
+        """Free the places of a step that is overwritten."""
         places = self.aside_index[slot]
         self._free += places[places >= 0].tolist()
-        self.aside_index[slot] = -1
+        self.aside_index[slot] = _IN_NEXT_SLOT
 
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
     def checkpoint_state(self) -> dict[str, Any]:
         """
-        All that is stored, for exact resume; slots that were never filled are left out.
+        Return all that is stored, for exact resume; slots that were never filled are left out.
 
-        :return: plain data for :meth:`load_checkpoint_state` of a buffer that was made with the same arguments
+        :return: plain data for :meth:`load_checkpoint_state` of a buffer that was made with the same arguments; its
+            arrays are views of the buffer's
         """
         n_filled = self.n_slots if self.full else self.pos + 1
         return {
@@ -323,15 +330,65 @@ class TeamReplayBuffer(ReplayBuffer):
             "n_steps": self._n_steps,
         }
 
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that the buffer could be in a state.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: naming the first part that does not fit
+        """
+        if state.get("n_slots") != self.n_slots:
+            raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state.get('n_slots')}")
+        _check_names(state, ("n_slots", "slots", "aside", "free", "pos", "n_steps"), "the replay buffer")
+        pos, n_steps = (_checked_whole(name, state[name], self.n_slots - 1) for name in ("pos", "n_steps"))
+        if n_steps < self.buffer_size and pos != n_steps:
+            raise ValueError(f"expected a replay buffer of {n_steps} steps that goes on at {n_steps}, got {pos}")
+        n_filled = self.n_slots if n_steps == self.buffer_size else pos + 1
+        self._check_arrays(state["slots"], {name: part[:n_filled] for name, part in self._by_slot().items()})
+        self._check_arrays(state["aside"], {f"{key}": part for key, part in self.aside.items()}, any_length=True)
+        n_places = len(state["aside"][OBS_KEY])
+        used = state["slots"]["aside_index"]
+        places = sorted([*used[used != _IN_NEXT_SLOT].tolist(), *_checked_list("free", state["free"])])
+        if places != list(range(n_places)):
+            raise ValueError(f"expected each of the {n_places} observations put aside to belong to one step or to none")
+        if len({len(part) for part in state["aside"].values()}) > 1:
+            raise ValueError("expected as many observations put aside of each kind")
+        self._check_values(state["slots"], "seen ")
+        self._check_values(state["aside"], "")
+
+    def _check_arrays(self, found: Any, like: Mapping[str, Array], any_length: bool = False) -> None:
+        _check_names(found, like, "the arrays of the replay buffer")
+        for name, own in like.items():
+            shape = own.shape
+            if any_length and isinstance(found[name], np.ndarray) and found[name].ndim:
+                shape = (len(found[name]), *own.shape[1:])
+            if not isinstance(found[name], np.ndarray) or found[name].shape != shape or found[name].dtype != own.dtype:
+                raise ValueError(
+                    f"expected {name!r} of the replay buffer of shape {shape} and {own.dtype}, got "
+                    f"{np.shape(found[name])} and {getattr(found[name], 'dtype', type(found[name]).__name__)}"
+                )
+
+    def _check_values(self, arrays: Mapping[str, Array], prefix: str) -> None:
+        """Check numbers that networks look up in tables."""
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        if "actions" in arrays and (arrays["actions"] >= n_actions).any():
+            raise ValueError(f"expected actions from 0 to {n_actions - 1}, got {arrays['actions'].max()}")
+        own, space = arrays[f"{prefix}{OBS_KEY}"], self.team_spaces.team
+        if own.dtype.kind in "biu" and ((own < space.low) | (own > space.high)).any():
+            raise ValueError(f"expected observations in {space}, got {own.min()} to {own.max()}")
+        for key in (ACTION_MASK_KEY, ACTIVE_KEY):
+            flags = arrays.get(f"{prefix}{key}")
+            if flags is not None and flags.size and not 0 <= flags.min() <= flags.max() <= 1:
+                raise ValueError(f"expected {key!r} of 0 and 1, got {flags.min()} to {flags.max()}")
+
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
         Go on from there.
 
         :param state: what :meth:`checkpoint_state` gave
-        :raises ValueError: if it is that of a buffer of another size
+        :raises ValueError: see :meth:`check_checkpoint_state`
         """
-        if state["n_slots"] != self.n_slots:
-            raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state['n_slots']}")
+        self.check_checkpoint_state(state)
         self.reset()
         for name, array in self._by_slot().items():
             saved = state["slots"][name]
@@ -339,9 +396,11 @@ class TeamReplayBuffer(ReplayBuffer):
         self.aside = {key: np.array(part) for key, part in state["aside"].items()}
         self._free, self.pos, self._n_steps = list(state["free"]), state["pos"], state["n_steps"]
         self.full = self._n_steps == self.buffer_size
+        active = state["slots"].get(f"seen {ACTIVE_KEY}")
+        self._has_played = self._n_steps > 0 and (active is None or bool(active.any()))
 
     def _by_slot(self) -> dict[str, Array]:
-        """All arrays with one entry per slot, by name."""
+        """Return all arrays with one entry per slot, by name."""
         seen = {f"seen {key}": array for key, array in self.seen.items()}
         names = ("actions", "rewards", "terminal", "ended", "starts", "aside_index")
         return seen | {name: getattr(self, name) for name in names}
@@ -375,7 +434,7 @@ class TeamReplayBuffer(ReplayBuffer):
         first, games = self._draw(self.size() - length + 1, n_sequences)
         window = np.arange(-burn_in, length)
         raw = (first[:, np.newaxis] + window).reshape(-1)
-        # Steps before the oldest stand still at the oldest: the memory is reset at each of them, so they leave nothing.
+        # Steps before the oldest are replaced by the oldest: the memory is reset at each, so they have no effect.
         steps, games = np.maximum(raw, 0), np.repeat(games, len(window))
         samples = self._get_samples(steps * self.n_games + games)
         slots = self._slots(steps)
@@ -394,14 +453,19 @@ class TeamReplayBuffer(ReplayBuffer):
     def _check_filled(self) -> None:
         if self.size() == 0:
             raise ValueError("expected a replay buffer with at least one step, got an empty one; add steps first")
+        if not self._has_played:
+            raise ValueError(
+                f"expected agents that take part, got none in {self.size()} steps of {self.n_games} games; there is "
+                f"nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or raise learning_starts"
+            )
 
     def _draw(self, n_steps: int, count: int) -> tuple[Indices, Indices]:
-        """``count`` steps counted from the oldest, and games, from the generator that SB3 seeds."""
+        """Draw ``count`` steps counted from the oldest, and games, from the generator that SB3 seeds."""
         steps = np.random.randint(0, n_steps, size=count)  # noqa: NPY002
         return steps, np.random.randint(0, self.n_games, size=count)  # noqa: NPY002
 
     def _slots(self, steps: Indices) -> Indices:
-        """Slots of steps that are counted from the oldest."""
+        """Return the slots of steps that are counted from the oldest."""
         slots: Indices = (self.pos - self.size() + steps) % self.n_slots
         return slots
 
@@ -409,7 +473,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self, batch_inds: Indices, env: VecNormalize | None = None
     ) -> TeamReplaySamples:
         """
-        The given team steps.
+        Return the given team steps.
 
         :param batch_inds: (G,) each is ``step * E + game``, steps counted from the oldest
         :param env: must be None
@@ -445,3 +509,21 @@ class TeamReplayBuffer(ReplayBuffer):
             None if active is None else active != 0,
             tensors.get(STATE_KEY),
         )
+
+
+def _check_names(value: Any, names: Iterable[str], where: str) -> None:
+    if not isinstance(value, Mapping) or set(value) != set(names):
+        got = sorted(map(str, value)) if isinstance(value, Mapping) else type(value).__name__
+        raise ValueError(f"expected {where} to have {', '.join(names)}, got {got}")
+
+
+def _checked_whole(name: str, value: Any, high: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= high:
+        raise ValueError(f"expected {name!r} of the replay buffer from 0 to {high}, got {value!r}")
+    return int(value)
+
+
+def _checked_list(name: str, value: Any) -> list[int]:
+    if not isinstance(value, list) or not all(isinstance(entry, int) for entry in value):
+        raise ValueError(f"expected {name!r} of the replay buffer to be a list of whole numbers, got {value!r:.80}")
+    return value

@@ -6,31 +6,64 @@ import os
 import uuid
 import weakref
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import NoReturn
+from typing import BinaryIO, Final, NamedTuple, NoReturn
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.checkpoints.callbacks import all_callbacks, callback_states
-from sb3_saf.checkpoints.data import Tree, encode
+from sb3_saf.checkpoints.checks import check_keys, check_text, check_whole
+from sb3_saf.checkpoints.data import Tree, encode, write_tree
 from sb3_saf.checkpoints.environments import environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.generators import generator_states
 from sb3_saf.checkpoints.logs import logger_state
-from sb3_saf.checkpoints.models import description, is_off_policy, model_state, require_resumable
+from sb3_saf.checkpoints.models import is_off_policy, model_state, require_resumable
+from sb3_saf.checkpoints.runs import callback_descriptions, description
 from sb3_saf.checkpoints.software import software
-from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.checkpoints.store import CheckpointFolder, Loaded
 from sb3_saf.envs.teams import check_count, require_n_agents
 
-#: The run that a model is in: its name is in every checkpoint, so that no other run goes on in the folder.
-_RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, str] = weakref.WeakKeyDictionary()
+
+class Run(NamedTuple):
+    """
+    The run that a model is in.
+
+    :param name: in every checkpoint, so that no other run goes on in the folder
+    :param description: of the model and its games as they were made for the first start
+    """
+
+    name: str
+    description: dict[str, Tree]
 
 
-def enter_run(model: BaseAlgorithm, run: str) -> None:
+#: Entries of a checkpoint.
+_ENTRIES: Final = (
+    *("run", "game_steps", "software", "description", "callback_descriptions"),
+    *("model", "environment", "callbacks", "generators", "logger"),
+)
+
+_RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary()
+
+
+def enter_run(model: BaseAlgorithm, run: Run) -> None:
     """Say that a model goes on with a run."""
     _RUNS[model] = run
+
+
+def newest_checkpoint(folder: CheckpointFolder) -> Loaded | None:
+    """
+    Read the newest good checkpoint of a run.
+
+    :raises CheckpointError: see :meth:`CheckpointFolder.newest`; also for a file that holds something else
+    """
+    newest = folder.newest()
+    if newest is not None:
+        check_keys(newest.tree, _ENTRIES, "the checkpoint")
+        check_text(newest.tree["run"], "the run's name")
+        check_whole(newest.tree["game_steps"], "the game steps")
+    return newest
 
 
 class TeamCheckpointCallback(BaseCallback):
@@ -38,11 +71,10 @@ class TeamCheckpointCallback(BaseCallback):
     Write checkpoints from which :func:`sb3_saf.resume` goes on exactly.
 
     The state is taken at the start of a rollout: the update before is done, and the buffer is empty. The end of
-    training writes one, too. Between them the last state waits in memory, which :meth:`write_last` puts on the disk.
+    training writes one, too. Between them the last state is kept in memory, which :meth:`write_last` writes to disk.
 
-    A rollout of QPLEX is one step of all games, and its state holds the replay buffer: a copy of it at every step would
-    cost more than learning. So its state is taken only where it is written, and who wants to stop a run says so with
-    :meth:`stop_soon`.
+    A rollout of QPLEX is one step of all games, and its state holds the replay buffer, too large to copy at every step.
+    So its state is written at once where it is taken, and whoever wants to stop a run calls :meth:`stop_soon`.
 
     Give it as the first of several callbacks, for what others do at the start of a rollout comes again on resuming.
 
@@ -73,7 +105,7 @@ class TeamCheckpointCallback(BaseCallback):
         self.store = CheckpointFolder(folder, check_count("keep", keep))
         self.others = list(all_callbacks(others))
         self.exact = exact
-        self._run = ""
+        self._run = Run("", {})
         self._between_rollouts = False
         self._last: tuple[int, bytes] | None = None
         self._written: int | None = None
@@ -83,9 +115,11 @@ class TeamCheckpointCallback(BaseCallback):
         require_resumable(self.model)
         require_n_agents(self.training_env)
         self.store.acquire()
-        self._run = _RUNS.setdefault(self.model, uuid.uuid4().hex)
-        newest = self.store.newest()
-        if newest is not None and newest.tree["run"] != self._run:
+        if self.model not in _RUNS:
+            enter_run(self.model, Run(uuid.uuid4().hex, description(self.model)))
+        self._run = _RUNS[self.model]
+        newest = newest_checkpoint(self.store)
+        if newest is not None and newest.tree["run"] != self._run.name:
             raise CheckpointError(
                 f"{self.store.path} has checkpoints of another run ({newest.path.name}): go on with it by "
                 "sb3_saf.resume(folder, model, callbacks), or give this run a folder of its own"
@@ -115,10 +149,6 @@ class TeamCheckpointCallback(BaseCallback):
         self.write_last()
         self.store.release()
 
-    def can_stop_at_once(self) -> bool:
-        """Whether the last state between rollouts is at hand at any moment."""
-        return not is_off_policy(self.model)
-
     def stop_soon(self, stop: Callable[[], NoReturn]) -> None:
         """
         End training before the next rollout, with the state of that moment at hand for :meth:`write_last`.
@@ -133,14 +163,20 @@ class TeamCheckpointCallback(BaseCallback):
         return steps
 
     def _take(self) -> None:
-        self._last = (self._game_steps(), encode(self._state(), software()["sb3_saf"]))
+        """Keep the present state; with a replay buffer, on the disk."""
+        steps = self._game_steps()
+        if not is_off_policy(self.model):
+            self._last = (steps, encode(self._state(), software()["sb3_saf"]))
+        elif steps != self._written:
+            self._write(lambda file: write_tree(file, self._state(), software()["sb3_saf"]), steps)
 
-    def _state(self) -> Tree:
+    def _state(self) -> dict[str, Tree]:
         return {
-            "run": self._run,
+            "run": self._run.name,
             "game_steps": self._game_steps(),
             "software": software(),
-            "description": description(self.model),
+            "description": self._run.description,
+            "callback_descriptions": callback_descriptions(self.others),
             "model": model_state(self.model),
             "environment": environment_state(self.training_env) if self.exact else None,
             "callbacks": callback_states(self.others) if self.exact else None,
@@ -148,20 +184,18 @@ class TeamCheckpointCallback(BaseCallback):
             "logger": logger_state(self.model.logger),
         }
 
-    def write_last(self) -> Path | None:
+    def write_last(self) -> None:
         """
         Write the last state between rollouts, unless it is written already.
 
-        :return: the file; None if there is nothing new
         :raises CheckpointError: if it cannot be written
         """
-        if self._last is None or self._last[0] == self._written:
-            return None
-        steps, data = self._last
-        path = self.store.write(data, steps)
+        if self._last is not None and self._last[0] != self._written:
+            steps, data = self._last
+            self._write(lambda file: file.write(data), steps)
+
+    def _write(self, content: Callable[[BinaryIO], object], steps: int) -> None:
+        path = self.store.write(content, steps)
         self._written = steps
-        if is_off_policy(self.model):
-            self._last = None  # memory for as much as the replay buffer
         if self.verbose >= 1:
             print(f"Checkpoint {path}")
-        return path

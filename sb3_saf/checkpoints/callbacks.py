@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+import numpy as np
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -17,21 +18,36 @@ from stable_baselines3.common.callbacks import (
 )
 
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
+from sb3_saf.checkpoints.checks import check_keys, check_list, check_real, check_whole, refused
 from sb3_saf.checkpoints.data import Tree
-from sb3_saf.checkpoints.environments import Stateful, environment_state, load_environment_state
-from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.checkpoints.environments import (
+    Stateful,
+    check_environment_state,
+    check_stateful,
+    environment_state,
+    is_stateful,
+    load_environment_state,
+)
 from sb3_saf.inspection.callback import InspectionCallback
 
-_COUNTERS: Final[dict[Any, tuple[str, ...]]] = {
-    BaseCallback: ("n_calls",),
-    EvalCallback: (
-        *("best_mean_reward", "last_mean_reward", "evaluations_results", "evaluations_timesteps"),
-        *("evaluations_length", "evaluations_successes"),
-    ),
-    TeamEvalCallback: ("evaluations_game_steps", "_next_evaluation"),
-    EveryNTimesteps: ("last_time_trigger",),
-    StopTrainingOnMaxEpisodes: ("n_episodes",),
-    StopTrainingOnNoModelImprovement: ("last_best_mean_reward", "no_improvement_evals"),
+#: Kinds of counters: a whole number, any number, a list of whole numbers, a list of evaluations.
+_Kind = Literal["whole", "real", "steps", "results"]
+
+#: Counters of callbacks, the only attributes that a checkpoint sets.
+_COUNTERS: Final[dict[Any, dict[str, _Kind]]] = {
+    BaseCallback: {"n_calls": "whole"},
+    EvalCallback: {
+        "best_mean_reward": "real",
+        "last_mean_reward": "real",
+        "evaluations_results": "results",
+        "evaluations_timesteps": "steps",
+        "evaluations_length": "results",
+        "evaluations_successes": "results",
+    },
+    TeamEvalCallback: {"evaluations_game_steps": "steps", "_next_evaluation": "whole"},
+    EveryNTimesteps: {"last_time_trigger": "whole"},
+    StopTrainingOnMaxEpisodes: {"n_episodes": "whole"},
+    StopTrainingOnNoModelImprovement: {"last_best_mean_reward": "real", "no_improvement_evals": "whole"},
 }
 
 #: A run may go on without them, or with them: progress bars of a terminal, looks into the policy.
@@ -64,41 +80,71 @@ def callback_states(callbacks: Iterable[BaseCallback]) -> list[Tree]:
 
     :raises CheckpointError: if an environment for evaluation cannot give its state
     """
-    return [{"class": type(one).__name__, "state": _state(one)} for one in callbacks]
+    return [
+        {
+            "counters": {name: getattr(one, name) for name in _kinds(one)},
+            "own": dict(one.checkpoint_state()) if isinstance(one, Stateful) else None,
+            "eval_env": environment_state(one.eval_env) if isinstance(one, EvalCallback) else None,
+        }
+        for one in callbacks
+    ]
+
+
+def check_callback_states(callbacks: Iterable[BaseCallback], states: Tree) -> None:
+    """
+    Check that callbacks could be in these states.
+
+    :raises CheckpointError: naming the first part that does not fit
+    """
+    callbacks = list(callbacks)
+    check_list(states, "the states of callbacks", len(callbacks))
+    for one, state in zip(callbacks, states, strict=True):
+        where = f"the state of {type(one).__name__}"
+        check_keys(state, ("counters", "own", "eval_env"), where)
+        check_keys(state["counters"], _kinds(one), f"the counters in {where}")
+        for name, kind in _kinds(one).items():
+            _check_counter(one, state["counters"][name], kind, name)
+        if is_stateful(one):
+            check_stateful(one, state["own"], type(one).__name__)
+        if isinstance(one, EvalCallback):
+            check_environment_state(one.eval_env, state["eval_env"])
 
 
 def load_callback_states(callbacks: Iterable[BaseCallback], states: list[Tree]) -> None:
-    """
-    Go on from there.
-
-    :raises CheckpointError: if the callbacks are not those of the checkpoint
-    """
-    callbacks = list(callbacks)
-    found, saved = [type(one).__name__ for one in callbacks], [state["class"] for state in states]
-    if found != saved:
-        raise CheckpointError(
-            f"the checkpoint was made with the callbacks {saved}, got {found}; pass them in the same order"
-        )
+    """Go on from states that passed :func:`check_callback_states`."""
     for one, state in zip(callbacks, states, strict=True):
-        _load(one, state["state"])
+        for name in _kinds(one):
+            setattr(one, name, state["counters"][name])
+        if isinstance(one, Stateful):
+            one.load_checkpoint_state(state["own"])
+        if isinstance(one, EvalCallback):
+            load_environment_state(one.eval_env, state["eval_env"])
 
 
-def _names(callback: BaseCallback) -> list[str]:
-    return [name for kind, names in _COUNTERS.items() if isinstance(callback, kind) for name in names]
+def _kinds(callback: BaseCallback) -> dict[str, _Kind]:
+    """The callback's counters."""
+    return {name: k for kind, names in _COUNTERS.items() if isinstance(callback, kind) for name, k in names.items()}
 
 
-def _state(callback: BaseCallback) -> Tree:
-    return {
-        "counters": {name: getattr(callback, name) for name in _names(callback)},
-        "own": dict(callback.checkpoint_state()) if isinstance(callback, Stateful) else None,
-        "eval_env": environment_state(callback.eval_env) if isinstance(callback, EvalCallback) else None,
-    }
+def _check_counter(callback: BaseCallback, value: Tree, kind: _Kind, name: str) -> None:
+    if kind == "whole":
+        check_whole(value, name)
+    elif kind == "real":
+        check_real(value, name, finite=False)
+    else:
+        check_list(value, name)
+        for entry in value:
+            if kind == "steps":
+                check_whole(entry, name)
+            else:
+                _check_evaluation(callback, entry, name)
 
 
-def _load(callback: BaseCallback, state: Tree) -> None:
-    for name, value in state["counters"].items():
-        setattr(callback, name, value)
-    if isinstance(callback, Stateful) and state["own"] is not None:
-        callback.load_checkpoint_state(state["own"])
-    if isinstance(callback, EvalCallback) and state["eval_env"] is not None:
-        load_environment_state(callback.eval_env, state["eval_env"])
+def _check_evaluation(callback: BaseCallback, entry: Tree, name: str) -> None:
+    """One evaluation: a number for each of its episodes."""
+    assert isinstance(callback, EvalCallback)
+    check_list(entry, name)
+    if name != "evaluations_successes" and len(entry) != callback.n_eval_episodes:
+        raise refused(name, f"lists of {callback.n_eval_episodes} episodes", f"one of {len(entry)}")
+    for number in entry:
+        check_real(float(number) if isinstance(number, (bool, np.bool_)) else number, name, finite=False)

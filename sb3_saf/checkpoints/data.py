@@ -1,70 +1,92 @@
 """
-A tree of plain data as bytes, and back, without pickle.
+A tree of plain data as a file, and back, without pickle.
 
-A file is a line of text with the format and the version that wrote it, then safetensors, then the SHA-256 of all of
-that. The line and the checksum stay as they are in all formats, so any version can tell damage from another format.
+A file is a line of text with the format and the version that wrote it, a line of JSON with the tree, the arrays of the
+tree as NumPy's .npy records, then the SHA-256 of all of that. The first line and the checksum are the same in all
+formats, so any version can tell damage from another format. Arrays are written and read one by one: a file takes no
+memory beside the arrays themselves.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import os
 import re
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from safetensors.numpy import load, save
 
 from sb3_saf.checkpoints.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 
 Array = npt.NDArray[Any]
 #: None, bool, int, float, str, arrays, tensors, and lists, tuples, deques and dicts of these.
 Tree = Any
 
 _HEADER: Final = re.compile(rb"sb3_saf checkpoint, format (\d{1,9}), written by sb3_saf ([^\n]{1,80})\n")
+_LONGEST_HEADER: Final = 200
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
-#: Name of the JSON among the arrays, whose names are numbers.
-_TREE: Final = "tree"
+_CHUNK: Final = 1 << 20
 #: Marks what JSON has no form for: {_KIND: "array", "is": 3}.
 _KIND: Final = "$"
 
 
-def encode(tree: Tree, version: str) -> bytes:
+class _HashedFile:
     """
-    The content of a checkpoint's file.
+    A file that computes the SHA-256 of what is written to it.
 
-    :param tree: see :data:`Tree`; copied
+    :param file: open for writing
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.digest = hashlib.sha256()
+
+    def write(self, data: bytes) -> int:
+        """Write bytes."""
+        self.digest.update(data)
+        return self._file.write(data)
+
+
+def write_tree(file: BinaryIO, tree: Tree, version: str) -> None:
+    """
+    Write a checkpoint.
+
+    :param file: open for writing
+    :param tree: see :data:`Tree`
     :param version: of this package
-    :raises CheckpointError: for anything else in the tree, saying where
+    :raises CheckpointError: for anything else in the tree, naming its place
     """
-    arrays: dict[str, Array] = {}
+    arrays: list[Array] = []
     text = json.dumps(_pack(tree, arrays, "state"), separators=(",", ":"))
-    arrays[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
-    header = f"sb3_saf checkpoint, format {FORMAT}, written by sb3_saf {version}\n".encode()
-    body = save(arrays)
-    digest = hashlib.sha256(header)
-    digest.update(body)
-    return b"".join((header, body, digest.digest()))  # one copy: it may hold a replay buffer
+    hashed = _HashedFile(file)
+    hashed.write(f"sb3_saf checkpoint, format {FORMAT}, written by sb3_saf {version}\n".encode())
+    hashed.write(text.encode() + b"\n")
+    for array in arrays:
+        np.lib.format.write_array(hashed, array, allow_pickle=False)
+    file.write(hashed.digest.digest())
 
 
-def decode(data: bytes) -> Tree:
+def read_tree(file: BinaryIO) -> Tree:
     """
-    The tree of a checkpoint's file.
+    Read a checkpoint.
 
-    :param data: content of the file
+    :param file: open for reading, at its start
     :raises DamagedCheckpointError: if a bit was changed or the file was cut short
     :raises UnknownFormatError: if another version wrote it in another format
     """
-    content, digest = memoryview(data)[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]  # no copy: it may hold a replay buffer
-    if hashlib.sha256(content).digest() != digest:
+    size = file.seek(0, os.SEEK_END) - _DIGEST_BYTES
+    if size < 0 or _digest(file, size) != file.read(_DIGEST_BYTES):
         raise DamagedCheckpointError("its checksum does not match: it was cut short or changed")
-    header = _HEADER.match(content)
+    file.seek(0)
+    header = _HEADER.fullmatch(file.readline(_LONGEST_HEADER))
     if header is None:
         raise DamagedCheckpointError("it does not begin as a checkpoint of sb3_saf does")
     if int(header[1]) != FORMAT:
@@ -74,13 +96,45 @@ def decode(data: bytes) -> Tree:
             f"reads format {FORMAT}; install that version to go on"
         )
     try:
-        arrays = load(bytes(content[header.end() :]))
-        return _unpack(json.loads(arrays.pop(_TREE).tobytes()), arrays)
+        packed = json.loads(file.readline())
+        arrays: dict[int, Array] = {}
+        while file.tell() < size:
+            arrays[len(arrays)] = _read_array(file)
+        return _unpack(packed, arrays)
     except Exception as error:  # a right checksum over wrong content: not written by this package
         raise DamagedCheckpointError(f"its content cannot be read: {error}") from error
 
 
-def _pack(value: Tree, arrays: dict[str, Array], where: str) -> Any:
+def encode(tree: Tree, version: str) -> bytes:
+    """A checkpoint in memory, see :func:`write_tree`; the tree is copied."""
+    file = io.BytesIO()
+    write_tree(file, tree, version)
+    return file.getvalue()
+
+
+def decode(data: bytes) -> Tree:
+    """The tree of a checkpoint in memory, see :func:`read_tree`."""
+    return read_tree(io.BytesIO(data))
+
+
+def _digest(file: BinaryIO, size: int) -> bytes:
+    """SHA-256 of the first ``size`` bytes."""
+    digest = hashlib.sha256()
+    file.seek(0)
+    while size > 0 and (chunk := file.read(min(_CHUNK, size))):
+        digest.update(chunk)
+        size -= len(chunk)
+    return digest.digest()
+
+
+def _read_array(file: BinaryIO) -> Array:
+    array: Array = np.lib.format.read_array(file, allow_pickle=False)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"an array has the dtype {array.dtype}")
+    return array
+
+
+def _pack(value: Tree, arrays: list[Array], where: str) -> Any:
     if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
     if isinstance(value, th.Tensor):
@@ -99,15 +153,14 @@ def _pack(value: Tree, arrays: dict[str, Array], where: str) -> Any:
     raise CheckpointError(f"{where} is a {type(value).__name__}, which a checkpoint cannot hold; it holds plain data")
 
 
-def _pack_array(kind: str, array: Array, arrays: dict[str, Array], where: str) -> dict[str, Any]:
+def _pack_array(kind: str, array: Array, arrays: list[Array], where: str) -> dict[str, Any]:
     if array.dtype.kind not in "biuf":
         raise CheckpointError(f"{where} has the dtype {array.dtype}, which a checkpoint cannot hold")
-    name = str(len(arrays))
-    arrays[name] = array.copy() if array.ndim == 0 else np.ascontiguousarray(array)
-    return {_KIND: kind, "is": name}
+    arrays.append(np.asarray(array, order="C"))
+    return {_KIND: kind, "is": len(arrays) - 1}
 
 
-def _unpack(packed: Any, arrays: dict[str, Array]) -> Tree:
+def _unpack(packed: Any, arrays: dict[int, Array]) -> Tree:
     if isinstance(packed, list):
         return [_unpack(item, arrays) for item in packed]
     if not isinstance(packed, dict):
@@ -119,7 +172,7 @@ def _unpack(packed: Any, arrays: dict[str, Array]) -> Tree:
         return {_unpack(key, arrays): _unpack(item, arrays) for key, item in content}
     if kind == "tuple":
         return tuple(_unpack(item, arrays) for item in content)
-    array = arrays[content].copy()  # safetensors gives views of the file that cannot be written to
+    array = arrays.pop(content)  # each belongs to one place
     if kind == "tensor":
         return th.from_numpy(array)
     return array[()] if kind == "scalar" else array

@@ -5,17 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage
 
+from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_observations, check_real
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
-from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 
 
 @runtime_checkable
 class Stateful(Protocol):
-    """What a VecEnv, a wrapper or a callback has to offer for its state to be in checkpoints."""
+    """
+    What a VecEnv, a wrapper or a callback has to offer for its state to be in checkpoints.
+
+    It may have a method ``check_checkpoint_state(state)``, too, which raises ValueError for a state that it could not
+    be in. All parts of a run are checked before the first one is loaded.
+    """
 
     def checkpoint_state(self) -> Mapping[str, Any]:
         """All that the future depends on, as plain data."""
@@ -43,38 +49,67 @@ def environment_state(venv: VecEnv) -> list[Tree]:
     return [{"class": type(layer).__name__, "state": _layer_state(layer)} for layer in layers(venv)]
 
 
-def load_environment_state(venv: VecEnv, states: list[Tree]) -> None:
+def check_environment_state(venv: VecEnv, states: Tree) -> None:
     """
-    Go on from there.
+    Check that every layer could be in its state.
 
     :raises CheckpointError: if the layers or their arguments differ, naming the first difference
     """
+    check_list(states, "the state of the environment")
+    for state in states:
+        check_keys(state, ("class", "state"), "the state of a layer of the environment")
     found, saved = [type(layer).__name__ for layer in layers(venv)], [state["class"] for state in states]
     if found != saved:
         raise CheckpointError(
-            f"the checkpoint's environment is {' of '.join(saved)}, got {' of '.join(found)}; make it the same way"
+            f"the checkpoint's environment is {' of '.join(map(str, saved))}, got {' of '.join(found)}; make it the "
+            "same way"
         )
     for layer, state in zip(layers(venv), states, strict=True):
-        try:
-            _load_layer_state(layer, state["state"])
-        except ValueError as error:
-            raise CheckpointError(
-                f"the checkpoint does not fit the environment's {type(layer).__name__}: {error}"
-            ) from error
+        if is_stateful(layer):
+            check_stateful(layer, state["state"], f"the environment's {type(layer).__name__}")
+        elif isinstance(layer, VecNormalize):
+            _check_normalize_state(layer, state["state"])
 
 
-def _is_stateful(layer: VecEnv) -> bool:
-    # Of the class: a wrapper answers for what it wraps when its attributes are asked for.
-    return issubclass(type(layer), Stateful)
+def load_environment_state(venv: VecEnv, states: list[Tree]) -> None:
+    """Go on from states that passed :func:`check_environment_state`."""
+    for layer, state in zip(layers(venv), states, strict=True):
+        if isinstance(layer, Stateful) and is_stateful(layer):
+            layer.load_checkpoint_state(state["state"])
+        elif isinstance(layer, VecNormalize):
+            _load_normalize_state(layer, state["state"])
+
+
+def is_stateful(part: object) -> bool:
+    """Whether a layer or a callback gives its state; asked of its class, since wrappers hand on attributes."""
+    return issubclass(type(part), Stateful)
+
+
+def check_stateful(part: object, state: Tree, where: str) -> None:
+    """
+    Let a layer or a callback check its own state, if it does.
+
+    :raises CheckpointError: if it refuses
+    """
+    check = getattr(type(part), "check_checkpoint_state", None)
+    if not isinstance(state, dict):
+        raise CheckpointError(f"the checkpoint does not fit {where}: expected a dict, got {type(state).__name__}")
+    if check is None:
+        return
+    try:
+        check(part, state)
+    except CheckpointError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
+        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise CheckpointError(f"the checkpoint does not fit {where}: {said}") from error
 
 
 def _layer_state(layer: VecEnv) -> Tree:
-    if isinstance(layer, Stateful) and _is_stateful(layer):
+    if isinstance(layer, Stateful) and is_stateful(layer):
         return dict(layer.checkpoint_state())
     if isinstance(layer, VecNormalize):
         return _normalize_state(layer)
-    if isinstance(layer, CentralizedValueWrapper):
-        return {"n_steps": layer._n_steps, "masks_shown": layer._masks_shown}
     if isinstance(layer, VecTransposeImage):
         return {}
     raise CheckpointError(
@@ -85,15 +120,6 @@ def _layer_state(layer: VecEnv) -> Tree:
     )
 
 
-def _load_layer_state(layer: VecEnv, state: Tree) -> None:
-    if isinstance(layer, Stateful) and _is_stateful(layer):
-        layer.load_checkpoint_state(state)
-    elif isinstance(layer, VecNormalize):
-        _load_normalize_state(layer, state)
-    elif isinstance(layer, CentralizedValueWrapper):
-        layer._n_steps, layer._masks_shown = state["n_steps"], state["masks_shown"]
-
-
 def _statistics(layer: VecNormalize) -> dict[str, RunningMeanStd]:
     found = {"ret": layer.ret_rms}
     if layer.norm_obs:
@@ -102,18 +128,29 @@ def _statistics(layer: VecNormalize) -> dict[str, RunningMeanStd]:
     return found
 
 
-def _normalize_state(layer: VecNormalize) -> Tree:
+def _normalize_state(layer: VecNormalize) -> dict[str, Tree]:
     return {
         "returns": layer.returns,
         "old_reward": layer.old_reward,
-        "old_obs": layer.old_obs,
-        **{name: [s.mean, s.var, float(s.count)] for name, s in _statistics(layer).items()},
+        "old_obs": getattr(layer, "old_obs", None),
+        **{name: [np.asarray(s.mean), np.asarray(s.var), float(s.count)] for name, s in _statistics(layer).items()},
     }
+
+
+def _check_normalize_state(layer: VecNormalize, state: Tree) -> None:
+    own = _normalize_state(layer)
+    check_keys(state, own, "the state of VecNormalize")
+    check_array(state["returns"], (layer.num_envs,), np.float64, "the returns of VecNormalize")
+    if state["old_obs"] is not None:
+        rewards, space = "the last rewards of VecNormalize", layer.venv.observation_space
+        check_like(np.zeros(np.shape(state["old_reward"])), np.zeros(layer.num_envs), rewards)
+        check_observations(state["old_obs"], space, layer.num_envs, "the last observations of VecNormalize")
+    for name in _statistics(layer):
+        check_like(state[name], own[name], f"the statistics {name!r} of VecNormalize")
+        check_real(state[name][2], f"the statistics {name!r} of VecNormalize")
 
 
 def _load_normalize_state(layer: VecNormalize, state: Tree) -> None:
     layer.returns, layer.old_reward, layer.old_obs = state["returns"], state["old_reward"], state["old_obs"]
     for name, statistics in _statistics(layer).items():
-        if name not in state:
-            raise ValueError(f"expected the statistics {name!r}, got {sorted(state)}")
         statistics.mean, statistics.var, statistics.count = state[name]

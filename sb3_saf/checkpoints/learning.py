@@ -18,16 +18,19 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.finite import FiniteCallback
-from sb3_saf.checkpoints.callback import TeamCheckpointCallback, enter_run
-from sb3_saf.checkpoints.callbacks import all_callbacks, load_callback_states
+from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run, newest_checkpoint
+from sb3_saf.checkpoints.callbacks import all_callbacks, check_callback_states, load_callback_states
+from sb3_saf.checkpoints.checks import refused
 from sb3_saf.checkpoints.data import Tree
-from sb3_saf.checkpoints.environments import load_environment_state
+from sb3_saf.checkpoints.environments import check_environment_state, load_environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
-from sb3_saf.checkpoints.generators import load_generator_states
-from sb3_saf.checkpoints.logs import continue_logs
-from sb3_saf.checkpoints.models import check_description, is_off_policy, load_model_state, require_resumable
-from sb3_saf.checkpoints.software import warn_of_differences
+from sb3_saf.checkpoints.generators import check_generator_states, load_generator_states
+from sb3_saf.checkpoints.logs import check_logger_state, continue_logs
+from sb3_saf.checkpoints.models import check_model_state, is_off_policy, load_model_state, require_resumable
+from sb3_saf.checkpoints.runs import check_descriptions
+from sb3_saf.checkpoints.software import check_software, warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.errors import NonFiniteError
 
 #: Torch's own words for distributions of actions that weights too large have made of NaN.
@@ -42,7 +45,8 @@ def resume(
     """
     Load the newest good checkpoint into a model, its environment and its callbacks.
 
-    They are made by the caller as for the first start, so nothing is unpickled. Then
+    They are made by the caller as for the first start, so nothing is unpickled. The checkpoint is compared with them,
+    and checked, before anything is touched. Then
     ``model.learn(total_timesteps - model.num_timesteps, callback, reset_num_timesteps=False)`` goes on, with the
     ``total_timesteps`` of the first start: schedules depend on it. Do nothing in between that draws random numbers.
 
@@ -50,35 +54,52 @@ def resume(
     :param model: made as for the first start, with its environment
     :param callback: all callbacks, in the order of the first start; a TeamCheckpointCallback among them is left out
     :return: the file that was loaded
-    :raises CheckpointError: if there is no good checkpoint, or model, environment or callbacks differ from those of the
-        first start, naming the first difference
+    :raises CheckpointError: if there is no good checkpoint, or model, environment, callbacks or seeds differ from those
+        of the first start, naming the first difference
     """
     require_resumable(model)
-    loaded = CheckpointFolder(folder).newest()
+    loaded = newest_checkpoint(CheckpointFolder(folder))
     if loaded is None:
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
-    tree = loaded.tree
-    check_description(model, tree["description"])
-    warn_of_differences(tree["software"])
     others = [one for one in all_callbacks(callback) if not isinstance(one, TeamCheckpointCallback)]
-    if tree["callbacks"] is not None:
-        load_callback_states(others, tree["callbacks"])
-    load_model_state(model, tree["model"])
-    _load_environment(model, tree["environment"])
-    continue_logs(model, tree["logger"])
-    enter_run(model, tree["run"])
-    load_generator_states(tree["generators"], model.action_space)  # last: nothing of the above shall draw from them
+    _check(model, others, loaded.tree)
+    warn_of_differences(loaded.tree["software"])
+    _load(model, others, loaded.tree)
     return loaded.path
 
 
-def _load_environment(model: BaseAlgorithm, state: Tree) -> None:
+def _check(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
+    """
+    Check everything before anything is touched.
+
+    :raises CheckpointError: naming the first difference
+    """
     assert model.env is not None
-    if state is not None:
-        load_environment_state(model.env, state)
-        return
-    # Other games than the first ones: those were played already.
-    model.env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
-    model._last_obs = None
+    check_descriptions(model, others, tree["description"], tree["callback_descriptions"])
+    check_software(tree["software"])
+    check_model_state(model, tree["model"])
+    if tree["model"]["counters"]["num_timesteps"] != tree["game_steps"] * require_n_agents(model.env):
+        raise refused("num_timesteps", "those of the game steps", tree["model"]["counters"]["num_timesteps"])
+    if tree["environment"] is not None:
+        check_environment_state(model.env, tree["environment"])
+        check_callback_states(others, tree["callbacks"])
+    check_generator_states(tree["generators"], model.action_space)
+    check_logger_state(tree["logger"])
+
+
+def _load(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
+    assert model.env is not None
+    load_model_state(model, tree["model"])
+    if tree["environment"] is not None:
+        load_callback_states(others, tree["callbacks"])
+        load_environment_state(model.env, tree["environment"])
+    else:
+        # Other games than the first ones: those were played already.
+        model.env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
+        model._last_obs = None
+    continue_logs(model, tree["logger"])
+    enter_run(model, Run(tree["run"], tree["description"]))
+    load_generator_states(tree["generators"], model.action_space)  # last: nothing of the above shall draw from them
 
 
 def resumable_learn(

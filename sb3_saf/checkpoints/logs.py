@@ -3,57 +3,76 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
-from torch.utils.tensorboard import SummaryWriter
 
+from sb3_saf.checkpoints.checks import check_keys, check_list, check_name, check_real, check_text, check_whole
 from sb3_saf.checkpoints.data import Tree
 
 
-class _ContinuedTensorBoard(TensorBoardOutputFormat):
-    """
-    More events for a run: those of steps after the checkpoint, which come again, are hidden by TensorBoard.
-
-    :param folder: of the run
-    :param last_step: of the checkpoint
-    """
-
-    def __init__(self, folder: str, last_step: int) -> None:
-        self.writer = SummaryWriter(log_dir=folder, purge_step=last_step + 1)
-        self._is_closed = False
-
-
 def logger_state(logger: Logger) -> Tree:
-    """Where the logs are, and the numbers that were recorded and not written yet."""
+    """The name of the logs' folder, and the numbers that were recorded and not written yet."""
     numbers = {
         name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))
     }
+    has_tensorboard = any(isinstance(output, TensorBoardOutputFormat) for output in logger.output_formats)
     return {
-        "folder": logger.get_dir(),
-        "tensorboard": any(isinstance(output, TensorBoardOutputFormat) for output in logger.output_formats),
-        "numbers": [[name, value, logger.name_to_excluded[name] or ()] for name, value in numbers.items()],
-        "counts": {name: logger.name_to_count[name] for name in numbers},
+        # Of a folder below the model's, which may have been moved when the run goes on.
+        "tensorboard": os.path.basename(logger.get_dir() or "") if has_tensorboard else None,
+        "numbers": [
+            [name, value, list(logger.name_to_excluded[name] or ()), logger.name_to_count[name]]
+            for name, value in numbers.items()
+        ],
     }
+
+
+def check_logger_state(state: Tree) -> None:
+    """
+    Check names and numbers.
+
+    :raises CheckpointError: naming the first that is none
+    """
+    check_keys(state, ("tensorboard", "numbers"), "logger")
+    if state["tensorboard"] is not None:
+        check_name(state["tensorboard"], "the folder of the logs")
+    check_list(state["numbers"], "the logged numbers")
+    for entry in state["numbers"]:
+        check_list(entry, "a logged number", 4)
+        name, value, excluded, count = entry
+        check_text(name, "the name of a logged number")
+        if not isinstance(value, (bool, np.bool_)):
+            check_real(value, name, finite=False)
+        check_list(excluded, f"what {name} is excluded from")
+        for part in excluded:
+            check_text(part, f"what {name} is excluded from")
+        check_whole(count, f"the count of {name}")
 
 
 def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
     """Give the model a logger that goes on in the same folder; one that the caller has set stays."""
-    if not model._custom_logger:
-        model.set_logger(_continued_logger(model, state))
-    for name, value, excluded in state["numbers"]:
+    if not hasattr(model, "logger"):
+        model.set_logger(_continued_logger(model, state["tensorboard"]))
+    for name, value, excluded, count in state["numbers"]:
         model.logger.name_to_value[name] = value
-        model.logger.name_to_excluded[name] = excluded
-        model.logger.name_to_count[name] = state["counts"][name]
+        model.logger.name_to_excluded[name] = tuple(excluded)
+        model.logger.name_to_count[name] = count
 
 
-def _continued_logger(model: BaseAlgorithm, state: Tree) -> Logger:
+def _continued_logger(model: BaseAlgorithm, name: str | None) -> Logger:
+    from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
     formats = ["stdout"] if model.verbose >= 1 else [""]
-    if not state["tensorboard"] or model.tensorboard_log is None:
+    if name is None or model.tensorboard_log is None:
         return configure(None, formats)
-    # Below the model's folder, which may have been moved since.
-    folder = os.path.join(model.tensorboard_log, os.path.basename(state["folder"]))
+    folder = os.path.join(model.tensorboard_log, name)
     logger = configure(folder, formats)
-    logger.output_formats.append(_ContinuedTensorBoard(folder, model.num_timesteps))
+    board = TensorBoardOutputFormat(folder)
+    # TensorBoard hides what was written after the checkpoint: it comes again.
+    start = SessionLog(status=SessionLog.START)
+    file_writer: Any = board.writer.file_writer
+    file_writer.add_event(Event(step=model.num_timesteps + 1, session_log=start))
+    logger.output_formats.append(board)
     return logger

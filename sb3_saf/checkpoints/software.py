@@ -1,4 +1,4 @@
-"""What the bits of a run depend on beside its settings."""
+"""Versions and hardware that the last bits of a run depend on."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import warnings
 from importlib.metadata import PackageNotFoundError, version
 
 import torch as th
+
+from sb3_saf.checkpoints.checks import check_text, refused
+from sb3_saf.checkpoints.data import Tree
 
 
 def software() -> dict[str, str]:
@@ -26,6 +29,15 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:  # run from a checkout that was never installed
         return "0+unknown"
+
+
+def check_software(saved: Tree) -> None:
+    """Check that a checkpoint names versions as :func:`software` does."""
+    if not isinstance(saved, dict):
+        raise refused("the versions of software", "a dict", repr(saved)[:80])
+    for name, value in saved.items():
+        check_text(name, "the name of a software")
+        check_text(value, f"the version of {name}")
 
 
 def warn_of_differences(saved: dict[str, str]) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
-from sb3_saf.checkpoints.data import Tree, decode
+from sb3_saf.checkpoints.data import Tree, read_tree
 from sb3_saf.checkpoints.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 
 try:
@@ -46,40 +47,37 @@ class CheckpointFolder:
         if not self.path.is_dir():
             return []
         found = [(int(match[1]), path) for path in self.path.iterdir() if (match := _NAME.fullmatch(path.name))]
-        return [path for _, path in sorted(found, reverse=True)]
+        return [path for _, path in sorted(found, reverse=True) if path.is_file()]
 
-    def write(self, data: bytes, game_steps: int) -> Path:
+    def write(self, content: Callable[[BinaryIO], object], game_steps: int) -> Path:
         """
         Add a checkpoint, then remove all but the newest ``keep``.
 
         The content goes to a temporary file that takes its name when it is on the disk: a run that dies here leaves the
         checkpoints of before and perhaps a temporary file, which the next write removes.
 
-        :param data: content of the file
-        :param game_steps: name
+        :param content: writes the content to a file
+        :param game_steps: the checkpoint's name
         :raises CheckpointError: if it cannot be written, for instance because the disk is full
         """
         target = self.path / f"checkpoint-{game_steps:012d}.ckpt"
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self._remove_temporary_files()
-            _write_atomically(target, data)
+            for path in self.path.glob(f"{_TEMPORARY_PREFIX}*"):
+                path.unlink(missing_ok=True)
+            _write_atomically(target, content)
         except OSError as error:
             older = self.checkpoints()
             last = f"the last good one is {older[0]}" if older else "there is no earlier one"
             raise CheckpointError(
-                f"cannot write the checkpoint {target} ({len(data)} bytes): {error}; {last}. Make room or choose "
-                "another folder, then resume"
+                f"cannot write the checkpoint {target}: {error}; {last}. Make room or choose another "
+                "folder, then resume"
             ) from error
         # Newer ones are damaged, or this run would have begun there.
         own = [path for path in self.checkpoints() if path.name <= target.name]
         for path in own[self.keep :]:
             path.unlink(missing_ok=True)
         return target
-
-    def _remove_temporary_files(self) -> None:
-        for path in self.path.glob(f"{_TEMPORARY_PREFIX}*"):
-            path.unlink(missing_ok=True)
 
     def newest(self) -> Loaded | None:
         """
@@ -91,7 +89,8 @@ class CheckpointFolder:
         paths = self.checkpoints()
         for i, path in enumerate(paths):
             try:
-                return Loaded(path, decode(path.read_bytes()))
+                with path.open("rb") as file:
+                    return Loaded(path, read_tree(file))
             except UnknownFormatError as error:
                 raise UnknownFormatError(f"cannot use the checkpoint {path}: {error}") from None
             except (DamagedCheckpointError, OSError) as error:
@@ -110,12 +109,17 @@ class CheckpointFolder:
         """
         Keep other runs out until :meth:`release` or the end of this process, however it ends.
 
-        :raises CheckpointError: if another run is at work here, naming its process
+        :raises CheckpointError: if the folder cannot be made, or another run is at work here, naming its process
         """
         if self._lock is not None or fcntl is None:
             return
-        self.path.mkdir(parents=True, exist_ok=True)
-        lock = os.open(self.path / _LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = os.open(self.path / _LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise CheckpointError(
+                f"cannot keep checkpoints in {self.path}: {error}; give the run a folder that it may write to"
+            ) from error
         try:
             # The system gives it back when the process ends: no killed run leaves it behind.
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -137,11 +141,11 @@ class CheckpointFolder:
             self._lock = None
 
 
-def _write_atomically(target: Path, data: bytes) -> None:
+def _write_atomically(target: Path, content: Callable[[BinaryIO], object]) -> None:
     temporary = target.with_name(f"{_TEMPORARY_PREFIX}{os.getpid()}-{target.name}")
     try:
         with temporary.open("wb") as file:
-            file.write(data)
+            content(file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)

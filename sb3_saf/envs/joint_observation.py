@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -120,6 +121,33 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     def _shows_masks(self, method_name: str) -> bool:
         return method_name == _ACTION_MASKS and self.team_spaces.action_mask is not None
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        Steps so far, and the action masks of the present.
+
+        :return: plain data for :meth:`load_checkpoint_state`
+        """
+        return {"n_steps": self._n_steps, "masks_shown": self._masks_shown}
+
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that the wrapper could be in a state.
+
+        :raises ValueError: naming the part that does not fit
+        """
+        steps, masks = state["n_steps"], state["masks_shown"]
+        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
+            raise ValueError(f"expected 'n_steps' to be a whole number, got {steps!r}")
+        n_actions = self._raw.n_masked_actions
+        if masks is not None and (n_actions is None or np.shape(masks) != (self.num_envs, n_actions)):
+            raise ValueError(f"expected action masks of {self.num_envs} rows and {n_actions} actions")
+        if masks is not None and not np.isin(masks, (0, 1)).all():
+            raise ValueError("expected action masks of 0 and 1")
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from there."""
+        self._n_steps, self._masks_shown = state["n_steps"], state["masks_shown"]
 
     def reset(self) -> dict[str, Array]:
         """

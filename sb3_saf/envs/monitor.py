@@ -129,6 +129,26 @@ class TeamMonitor(TeamVecEnvWrapper):
             "file_size": None if self._writer is None else _synced_size(self._writer.file_handler),
         }
 
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that the monitor could be in a state.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: naming the part that does not fit
+        """
+        for name, own in (("returns", self._returns), ("lengths", self._lengths)):
+            found = state[name]
+            if np.shape(found) != own.shape or getattr(found, "dtype", None) != own.dtype:
+                raise ValueError(f"expected {name!r} of {self.n_games} games, got {found!r:.80}")
+        for name in ("episode_count", "n_steps", "file_size"):
+            count = state[name]
+            if name == "file_size" and count is None:
+                continue
+            if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count < 2**63:
+                raise ValueError(f"expected {name!r} to be a whole number, got {count!r}")
+        if isinstance(state["t_start"], bool) or not isinstance(state["t_start"], float):
+            raise ValueError(f"expected 't_start' to be a time, got {state['t_start']!r}")
+
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
         Go on from there: lines that were written to the file later are cut off, for they will come again.

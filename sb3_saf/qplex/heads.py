@@ -1,5 +1,5 @@
 """
-What agents make of their own observations: Q values. Nothing else enters, so that agents act alone.
+Q values of each agent, from its own observations alone, so that agents act without each other.
 
 Letters: K rows, N agents, A actions, U heads of a pool, d features, H size of the memory.
 """
@@ -22,7 +22,7 @@ def q_values(
     actor: ActorNetwork, latents: th.Tensor, agent: th.Tensor | None, masks: th.Tensor | None = None, draw: bool = False
 ) -> th.Tensor:
     """
-    Q_i of every action.
+    Compute Q_i of every action.
 
     Of a pool, the favourite head's (highest q . k_u), or that of a head drawn with its weight: Gumbel noise on the
     logits, a hard choice, the gradient straight through it. All actions of a row are one head's, so the best action of
@@ -45,7 +45,7 @@ def q_values(
 
 class AgentMemory(nn.Module):
     """
-    An LSTM over what an agent has seen and done. It reads the features, the last action and the agent's index.
+    An LSTM over an agent's observations and actions. It reads the features, the last action and the agent's index.
 
     :param features_dim: d
     :param action_space: one agent's action space
@@ -60,7 +60,7 @@ class AgentMemory(nn.Module):
 
     def inputs(self, features: th.Tensor, last_actions: th.Tensor, agent: th.Tensor) -> th.Tensor:
         """
-        What the LSTM reads.
+        Join what the LSTM reads.
 
         :param features: (K, d)
         :param last_actions: (K,) int64, -1 at the start of an episode
@@ -73,21 +73,21 @@ class AgentMemory(nn.Module):
         return th.cat([features, last.to(features.dtype), identity.to(features.dtype)], dim=1)
 
     def forward(self, inputs: th.Tensor, memory: Memory) -> Memory:
-        """One step: (K, d + A + N) inputs."""
+        """Do one step: (K, d + A + N) inputs."""
         result: Memory = self.cell(inputs, memory)
         return result
 
     def empty(self, n_rows: int, like: th.Tensor) -> Memory:
-        """What K agents remember at the start of an episode."""
+        """Return the memory of K agents at the start of an episode."""
         zeros = like.new_zeros(n_rows, self.hidden_size)
         return zeros, zeros
 
     def unroll(self, inputs: th.Tensor, resets: th.Tensor) -> Memory:
         """
-        Remember whole sequences.
+        Run over whole sequences.
 
         :param inputs: (n, T, N, d + A + N) of n sequences of T steps
-        :param resets: (n, T) bool, steps before which agents forget
+        :param resets: (n, T) bool, steps before which the memory is reset
         :return: hidden and cell state after every step, each (n * T * N, H)
         """
         n, length, n_agents = inputs.shape[:3]

@@ -36,13 +36,13 @@ class TeamError(NamedTuple):
 
     @property
     def loss(self) -> th.Tensor:
-        """Mean of the squared errors, as published."""
+        """Return the mean of the squared errors, as published."""
         return self.td.square().mean()
 
 
 class Features(NamedTuple):
     """
-    What an encoder makes of two observations of each team.
+    Features of two observations of each team.
 
     :param now: (G, N, d) before the step
     :param after: (G, N, d) after it
@@ -69,7 +69,7 @@ class _Views(NamedTuple):
 
     @classmethod
     def of(cls, policy: QPLEXPolicy, samples: TeamReplaySamples) -> _Views:
-        """Find them."""
+        """Find the distinct observations of a batch."""
         shape = samples.now.own.shape[:2]
         both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
         found: UniqueRows = policy.views.find(both)
@@ -79,7 +79,7 @@ class _Views(NamedTuple):
 
 def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -> TeamError:
     """
-    Temporal-difference errors; the gradient goes into the online networks.
+    Compute temporal-difference errors; the gradient goes into the online networks.
 
     :param policy: with its online and target networks
     :param samples: joint transitions
@@ -108,7 +108,7 @@ def _counted(error: TeamError, sequences: Sequences | None) -> TeamError:
 
 
 def _agents(actions: th.Tensor) -> th.Tensor:
-    """(G N,) indices of agents."""
+    """Return (G N,) indices of agents."""
     n_steps, n_agents = actions.shape
     return th.arange(n_agents, device=actions.device).repeat(n_steps)
 
@@ -117,7 +117,7 @@ def _agents(actions: th.Tensor) -> th.Tensor:
 
 
 def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
-    """Features and what heads read, of the online networks; views that are only seen after a step get no gradient."""
+    """Encode with the online networks; observations that only occur after a step get no gradient."""
     encoder = policy.online.encoder
     known = policy.encode_with(encoder, views.views[: views.n_now])
     with th.no_grad():
@@ -128,7 +128,7 @@ def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
 
 
 def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
-    """The same of the target networks. Without memory, only what is seen after a step is encoded."""
+    """Encode with the target networks; without memory, only the observations after a step."""
     networks = policy.target
     if networks.memory is not None:
         every = policy.encode_with(networks.encoder, views.views)
@@ -136,16 +136,16 @@ def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
         return features, _recall(networks, features, samples)
     seen, rows = views.after.unique(return_inverse=True)
     after = gather(policy.encode_with(networks.encoder, views.views[seen]), rows)
-    features = Features(after, after)  # nobody reads the target's features of before
+    features = Features(after, after)  # the target's features before the step are not read
     return features, features
 
 
 def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples) -> Features:
-    """What heads read: the features, or what agents remember with them."""
+    """Return what heads read: the features, or the memory's output."""
     memory, sequences = networks.memory, samples.sequences
     if memory is None:
         return features
-    assert sequences is not None, "agents that remember learn from sequences"
+    assert sequences is not None, "agents with memory learn from sequences"
     shape = samples.actions.shape
     agent = _agents(samples.actions)
     inputs = memory.inputs(features.now.flatten(0, 1), sequences.last_actions.flatten(), agent)
@@ -164,7 +164,7 @@ def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples)
 def _q_values(
     networks: QNetworks, latents: th.Tensor, agent: th.Tensor, steps: TeamSteps, draw: bool = False
 ) -> th.Tensor:
-    """(G, N, A) values of agents' actions, -inf for illegal ones: (G, N, H)."""
+    """Compute (G, N, A) values of agents' actions, -inf for illegal ones, from (G, N, H)."""
     masks = None if steps.masks is None else steps.masks.flatten(0, 1)
     return q_values(networks.actor, latents.flatten(0, 1), agent, masks, draw).view(*latents.shape[:2], -1)
 
@@ -177,7 +177,7 @@ def _mix(
     features: th.Tensor,
     actions: th.Tensor,
 ) -> Mixed:
-    """Q_tot of joint actions (G, N): (G, N, A) values and (G, N, d) features."""
+    """Compute Q_tot of joint actions (G, N) from (G, N, A) values and (G, N, d) features."""
     chosen = values.gather(2, actions.unsqueeze(2)).squeeze(2)
     choice = JointChoice(chosen, values.max(dim=2).values, actions, steps.active)
     mixed: Mixed = networks.mixer(_state(policy, networks.state_encoder, steps, features), choice)
@@ -186,11 +186,11 @@ def _mix(
 
 def greedy_q_tot(policy: QPLEXPolicy, values: th.Tensor, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
     """
-    Q_tot of the joint action that agents take by themselves: each its own best one.
+    Compute Q_tot of the greedy joint action: each agent's own best one.
 
-    :param policy: whose online networks judge
+    :param policy: with its online networks
     :param values: (G, N, A) Q_i, -inf for illegal actions
-    :param steps: what teams see
+    :param steps: observations of the teams
     :param features: (G, N, d) of the online encoder
     :return: (G,)
     """
@@ -198,7 +198,7 @@ def greedy_q_tot(policy: QPLEXPolicy, values: th.Tensor, steps: TeamSteps, featu
 
 
 def _state(policy: QPLEXPolicy, state_encoder: nn.Module | None, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
-    """(G, S) what the mixer reads: the encoded state of the game, or the features of all agents."""
+    """Return the mixer's input (G, S): the encoded state of the game, or the features of all agents."""
     if state_encoder is not None:
         assert steps.states is not None
         return policy.encode_states(state_encoder, steps.states)

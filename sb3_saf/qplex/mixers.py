@@ -30,7 +30,7 @@ _EPSILON: Final = 1e-10
 
 class JointChoice(NamedTuple):
     """
-    What a team did at G steps, and what each agent thinks of its part.
+    Joint actions of a team at G steps, and each agent's values of its own part.
 
     :param chosen: (G, N) Q_i of the agents' actions
     :param best: (G, N) V_i = max of Q_i over legal actions

@@ -1,4 +1,4 @@
-"""What QPLEX is made of: heads, pool, memory and mixer."""
+"""The parts of QPLEX: heads, pool, memory and mixer."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class QPLEXParts:
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
     ) -> ActorNetwork:
-        """The Q heads: an actor whose logits are Q values."""
+        """Make the Q heads: an actor whose logits are Q values."""
         if self.n_policies == 1:
             heads = n_agents if self.heads == "per_agent" else None
             return SinglePolicy(features_dim, action_space, hidden, activation_fn, n_agents=heads)
@@ -87,14 +87,14 @@ class QPLEXParts:
         )
 
     def agent_memory(self, features_dim: int, action_space: spaces.Discrete, n_agents: int) -> AgentMemory | None:
-        """Each agent's memory, if any."""
+        """Make each agent's memory, if any."""
         if not self.lstm_hidden_size:
             return None
         return AgentMemory(features_dim, action_space, n_agents, self.lstm_hidden_size)
 
     def make_mixer(self, state_dim: int, n_agents: int, n_actions: int) -> Mixer:
         """
-        The mixer.
+        Make the mixer.
 
         :param state_dim: size of the state that it reads
         :param n_agents: N

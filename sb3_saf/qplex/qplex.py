@@ -44,7 +44,7 @@ from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
 SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
 
 _TERMINAL_OBSERVATION: Final = "terminal_observation"
-_STORED_KEYS: Final = (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY)
+_STORED_KEYS: Final[tuple[str, ...]] = (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY)
 
 
 class QPLEX(OffPolicyAlgorithm):
@@ -58,8 +58,8 @@ class QPLEX(OffPolicyAlgorithm):
     *game steps*, summed over all parallel games, however many games there are. ``total_timesteps`` counts rows (game
     steps times N), as everywhere in SB3.
 
-    **Exploration**: each agent tosses a coin of its own, with the same probability, and then takes any legal action;
-    ``predict(deterministic=False)`` does so, too.
+    **Exploration**: epsilon-greedy over legal actions, drawn for each agent independently;
+    ``predict(deterministic=False)`` explores, too.
 
     :param policy: ``"QPLEXPolicy"``, ``"QPLEXPoolPolicy"`` (Q heads from a pool) or ``"QPLEXLstmPolicy"`` (memory)
     :param env: vector environment of teams
@@ -83,7 +83,7 @@ class QPLEX(OffPolicyAlgorithm):
     :param tensorboard_log: folder for TensorBoard; None for none
     :param policy_kwargs: arguments of the policy, see :class:`QPLEXPolicy` and :class:`QPLEXParts`
     :param verbose: 0 for silence, 1 for information, 2 for debugging
-    :param seed: of everything
+    :param seed: of weights, exploration, sampling and games
     :param device: where networks are
     :param _init_setup_model: whether to build the networks now
     :raises ValueError: for environments without teams, actions that are not Discrete, and numbers that do not fit
@@ -155,8 +155,8 @@ class QPLEX(OffPolicyAlgorithm):
         self.exploration_final_eps = exploration_final_eps
         self.max_grad_norm = max_grad_norm
         self.exploration_rate = exploration_initial_eps
-        #: What agents with memory remember while games are played.
-        self._agent_state: State | None = None
+        #: Memory of the agents during rollouts, None without memory.
+        self.agent_state: State | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -208,7 +208,7 @@ class QPLEX(OffPolicyAlgorithm):
             )
 
     def _convert_train_freq(self) -> None:
-        """One step of all games at a time; :meth:`train` knows when updates are due."""
+        """Play one step of all games at a time; :meth:`train` decides when updates are due."""
         if not isinstance(self.train_freq, TrainFreq):
             self.update_interval = int(self.train_freq)  # type: ignore[arg-type]
         self.train_freq = TrainFreq(1, TrainFrequencyUnit.STEP)  # type: ignore[assignment]
@@ -240,7 +240,7 @@ class QPLEX(OffPolicyAlgorithm):
         return self.num_timesteps // self.n_agents
 
     def _crossed(self, interval: int) -> int:
-        """How many multiples of ``interval`` the last step of all games has reached, in game steps."""
+        """Count the multiples of ``interval`` game steps that the last step of all games has reached."""
         steps = self._game_steps()
         return steps // interval - (steps - self.n_games) // interval
 
@@ -259,7 +259,7 @@ class QPLEX(OffPolicyAlgorithm):
         :param observation: rows, or own observations alone; see :meth:`QPLEXPolicy.predict`
         :param state: of policies with memory
         :param episode_start: (B,) where an episode starts
-        :param deterministic: False tosses each agent's coin with the current exploration rate
+        :param deterministic: False explores with the current exploration rate, each agent independently
         :return: actions and the next state
         """
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
@@ -272,29 +272,29 @@ class QPLEX(OffPolicyAlgorithm):
         return explored.reshape(actions.shape), state
 
     def _explore(self, actions: Array, rate: float, masks: Array | None) -> Array:
-        """(B,) actions, each replaced with the given probability by any legal action."""
+        """Replace each of (B,) actions with the given probability by any legal action."""
         # SB3 seeds NumPy's global generator, and no other, from the run's seed.
-        coins = np.random.random(len(actions)) < rate  # noqa: NPY002
+        explores = np.random.random(len(actions)) < rate  # noqa: NPY002
         if masks is None:
             others = np.random.randint(0, int(self.action_space.n), size=len(actions))  # noqa: NPY002
         else:
             legal = np.asarray(masks).reshape(len(actions), -1) != 0
             others = np.where(legal, np.random.random(legal.shape), -1.0).argmax(axis=1)  # noqa: NPY002
-        result: Array = np.where(coins, others, actions)
+        result: Array = np.where(explores, others, actions)
         return result
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(B,) actions of the step to come; all random before ``learning_starts`` game steps."""
+        """Choose (B,) actions of the next step; all random before ``learning_starts`` game steps."""
         assert isinstance(self._last_obs, dict)
         starts = self._last_episode_starts
-        if self._agent_state is not None and len(self._agent_state[0]) != n_envs:
-            self._agent_state = None  # another environment
-        actions, state = self.policy.predict(self._last_obs, self._agent_state, starts)
+        if self.agent_state is not None and len(self.agent_state[0]) != n_envs:
+            self.agent_state = None  # another environment
+        actions, state = self.policy.predict(self._last_obs, self.agent_state, starts)
         rate = 1.0 if self._game_steps() < learning_starts else self.exploration_rate
         actions = self._explore(actions, rate, self._last_obs.get(ACTION_MASK_KEY))
-        self._agent_state = None if state is None else (*state[:-1], actions.copy())
+        self.agent_state = None if state is None else (*state[:-1], actions.copy())
         return actions, actions
 
     def collect_rollouts(
@@ -351,12 +351,10 @@ class QPLEX(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store one step of all games; of games that ended, with their last observations."""
+        """Store one step of all games, with the last observations of games that ended."""
         assert isinstance(self._last_obs, dict) and isinstance(new_obs, dict)
         assert isinstance(replay_buffer, TeamReplayBuffer)
-        keys: list[str] = [
-            key for key in (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY) if key in new_obs
-        ]
+        keys = [key for key in _STORED_KEYS if key in new_obs]
         after = {key: new_obs[key] for key in keys}
         ended = np.flatnonzero(dones)
         if len(ended):
@@ -405,7 +403,7 @@ class QPLEX(OffPolicyAlgorithm):
         self._log(error)
 
     def _sample(self, batch_size: int) -> TeamReplaySamples:
-        """A batch; of sequences for agents with memory."""
+        """Sample a batch; of sequences for agents with memory."""
         parts = self.policy.parts
         if self.policy.memory is None:
             return self._buffer().sample(batch_size)
@@ -413,7 +411,7 @@ class QPLEX(OffPolicyAlgorithm):
         return self._buffer().sample_sequences(n_sequences, parts.sequence_length, parts.burn_in)
 
     def _log(self, error: TeamError) -> None:
-        """Of the last gradient step; means over the batch."""
+        """Log the last gradient step as means over the batch."""
         record = self.logger.record
         record("train/n_updates", self._n_updates, exclude="tensorboard")
         record("train/loss", error.loss.item())

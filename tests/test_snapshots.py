@@ -1,0 +1,93 @@
+"""Snapshots of games: what is computed from them equals what play left, and states that no game reaches are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs.constants import Rules
+
+N_GAMES = 4
+#: Crowded, so that several agents share a cell.
+LEVEL: dict[str, Any] = {
+    "n_agents": 6,
+    "grid_size": 9,
+    "n_treasures": 12,
+    "coordination": 2,
+    "heterogeneity": 3,
+    "max_cycles": 25,
+    "observation": "tiles",
+}
+
+
+def played(task: str = "TeamTogether", rules: Rules = "paper", n_steps: int = 60) -> GameBatch:
+    batch = GameBatch(task, HECOGridParams(**LEVEL, rules=rules), N_GAMES)
+    batch.reset(seeds=game_seeds(0, N_GAMES))
+    actions = np.random.default_rng(0).choice(7, size=(n_steps, N_GAMES, 6), p=[0.1, 0.1, 0.4, 0.2, 0.2, 0, 0])
+    for step in actions:
+        batch.advance(step)
+    return batch
+
+
+@pytest.mark.parametrize("rules", ["paper", "released"])
+@pytest.mark.parametrize("task", ["TeamTogether", "TeamSupport", "KeyForTreasure"])
+def test_games_of_a_snapshot_are_those_that_were_played(task: str, rules: Rules) -> None:
+    batch = played(task, rules)
+    fresh = GameBatch(task, batch.params, N_GAMES)
+    fresh.restore(batch.snapshot())
+    assert batch._games.crowd.max() > 1
+    for name, array in batch._games._asdict().items():
+        if not name.startswith("sight"):  # computed anew when it is asked for
+            np.testing.assert_array_equal(getattr(fresh._games, name), array, err_msg=name)
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        actions = rng.integers(7, size=(N_GAMES, 6))
+        for one, other in zip(batch.advance(actions), fresh.advance(actions), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def _set(name: str, value: Any) -> Callable[[dict[str, Any]], object]:
+    def change(snapshot: dict[str, Any]) -> None:
+        snapshot[name].reshape(-1)[0] = value
+
+    return change
+
+
+def _same_cell(snapshot: dict[str, Any]) -> None:
+    """Two agents arrive in one cell as its first."""
+    for name in ("x", "y"):
+        snapshot[name][0, :] = snapshot[name][0, 0]
+    snapshot["rank"][0] = 0
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (_set("x", 10_000_000), "'agent_pos' must hold values from 0 to 8, got 10000000"),
+        (_set("x", 0), "agent 0 stands in a wall"),
+        (_set("rank", 32_000), "'rank'"),
+        (_same_cell, r"'rank' \[0, 0, 0"),
+        (_set("terrain", 9), "9 in 'terrain'"),
+        (_set("terrain", 0), "the outer ring must be wall"),
+        (_set("direction", 4), "'agent_dir' must hold values from 0 to 3"),
+        (_set("colour", 200), "200 in 'colour'"),
+        (_set("order", 77), "no order of the agents"),
+        (_set("steps", -1), "-1 in 'steps'"),
+        (_set("collected", 99), "99 in 'collected'"),
+        (lambda snapshot: snapshot.pop("rng"), "differ in 'rng'"),
+        (lambda snapshot: snapshot.update(x=snapshot["x"][:, :5]), r"expected 'x' of shape \(4, 6\)"),
+        (lambda snapshot: snapshot.update(x=snapshot["x"].astype(float)), "expected 'x' of shape"),
+        (lambda snapshot: snapshot.update(x=None), r"got \(\) and NoneType"),
+    ],
+)
+def test_what_no_game_reaches_is_refused_and_changes_nothing(change: Callable[..., object], fault: str) -> None:
+    batch = played(n_steps=5)
+    before, snapshot = batch.snapshot(), batch.snapshot()
+    change(snapshot)
+    with pytest.raises(ValueError, match=fault):
+        batch.restore(snapshot)
+    np.testing.assert_equal(batch.snapshot(), before)
