@@ -26,6 +26,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.buffers.rollout import TeamRolloutBuffer
     from sb3_saf.callbacks.evaluation import TeamEvalCallback
     from sb3_saf.callbacks.finite import FiniteCallback
+    from sb3_saf.callbacks.game_steps import GameStepsCallback
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
@@ -46,14 +47,13 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
     from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
-    from sb3_saf.policies.ippo import IPPOPolicy
-    from sb3_saf.policies.mappo import MAPPOPolicy
-    from sb3_saf.policies.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
-    from sb3_saf.policies.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
-    from sb3_saf.policies.saf import SAFPolicy
+    from sb3_saf.policies.ippo import IPPOLstmPolicy, IPPOMaskablePolicy, IPPOPolicy
+    from sb3_saf.policies.mappo import MAPPOLstmPolicy, MAPPOMaskablePolicy, MAPPOPolicy
+    from sb3_saf.policies.saf import SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
+    from sb3_saf.training.ppo_settings import ppo_settings
 
     register_all()
 else:
@@ -77,6 +77,7 @@ __all__ = [
     "EvaluationResult",
     "ExportError",
     "FiniteCallback",
+    "GameStepsCallback",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -111,6 +112,7 @@ __all__ = [
     "inspect_team",
     "load_weights",
     "make_team_env",
+    "ppo_settings",
     "resumable_learn",
     "resume",
 ]

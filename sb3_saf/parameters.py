@@ -2,22 +2,23 @@
 The paper's parameter table: ``python -m sb3_saf.parameters`` counts every weight and prints it beside the paper's
 numbers.
 
-The table is for 10 agents, 28 x 28 x 3 views, 7 actions, one head per agent (``paper_table_kwargs`` of each policy).
+The table is for 10 agents, 28 x 28 x 3 observations, 7 actions, one head per agent. Declarations say which algorithms
+are in it, and with which arguments.
 """
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from torch import nn
 
 from sb3_saf.envs.teams import TeamSpaces
-from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.ippo import IPPOPolicy
-from sb3_saf.policies.mappo import MAPPOPolicy
-from sb3_saf.policies.saf import SAFPolicy
+from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.declaration import Declaration
+from sb3_saf.registration import DECLARATIONS
 
 N_AGENTS: Final = 10
 #: Parts that only the released code has and that the paper's figure for SAF includes.
@@ -41,38 +42,38 @@ class TableRow(NamedTuple):
 
 
 def count(module: nn.Module) -> int:
-    """Number of trainable weights."""
+    """Return the number of trainable weights."""
     return sum(parameter.numel() for parameter in module.parameters() if parameter.requires_grad)
 
 
-def paper_policy(policy_class: type[TeamActorCriticPolicy]) -> TeamActorCriticPolicy:
+def paper_policy(declaration: Declaration) -> TeamPolicy:
     """
-    A policy as in the paper's table.
+    Make a policy as in the paper's table.
 
-    :param policy_class: IPPOPolicy, MAPPOPolicy or SAFPolicy
+    :param declaration: of an algorithm that is in it
     """
-    views = TeamSpaces.of(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
-    kwargs = policy_class.paper_table_kwargs()
-    return policy_class(views, spaces.Discrete(7), lambda _: 0.0, ortho_init=False, **kwargs)
+    assert declaration.paper_table is not None
+    rows = TeamSpaces.of(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
+    policy_class: Any = declaration.policies[PPO][0]
+    kwargs = declaration.paper_table.policy_kwargs
+    policy: TeamPolicy = policy_class(rows, spaces.Discrete(7), lambda _: 0.0, ortho_init=False, **kwargs)
+    return policy
 
 
 def parameter_table() -> list[TableRow]:
-    """Count the encoder and the three models."""
-    ippo, mappo, saf = (paper_policy(policy) for policy in (IPPOPolicy, MAPPOPolicy, SAFPolicy))
-    return [
-        TableRow("CNN", count(ippo.features_extractor), None, "shared by all models and agents"),
-        TableRow("IPPO", count(ippo), 1_740_016, _made_of(ippo)),
-        TableRow("MAPPO", count(mappo), 2_477_296, _made_of(mappo)),
-        TableRow("SAF", count(saf), 2_698_342, _made_of(saf)),
-    ]
-
-
-def _made_of(policy: TeamActorCriticPolicy) -> str:
-    return f"CNN + actors {count(policy.actor):,} + critics {count(policy.value_net):,}"
+    """Count the encoder and the models, the smallest first."""
+    rows = []
+    for declaration in DECLARATIONS:
+        if declaration.paper_table is not None:
+            policy = paper_policy(declaration)
+            made_of = f"CNN + actors {count(policy.actor):,} + critics {count(policy.value_net):,}"
+            rows.append(TableRow(declaration.name, count(policy), declaration.paper_table.n_parameters, made_of))
+    encoder = TableRow("CNN", count(policy.features_extractor), None, "shared by all models and agents")
+    return [encoder, *sorted(rows, key=lambda row: row.counted)]
 
 
 def format_table(rows: list[TableRow]) -> str:
-    """The table as text, with the account of SAF's difference."""
+    """Return the table as text, with the account of SAF's difference."""
     lines = [f"{'model':<8}{'counted':>12}{'paper':>12}{'difference':>12}  made of"]
     for row in rows:
         paper = "" if row.paper is None else f"{row.paper:,}"

@@ -1,37 +1,46 @@
-"""Makes the policies known to algorithms by name, as SB3 knows "MlpPolicy"."""
+"""Find what the files of algorithms declare, and let SB3's algorithms know their policies by name."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import warnings
+from collections.abc import Iterator
+from types import ModuleType
 from typing import Final
 
-from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
-from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.callbacks.game_steps import log_game_steps
-from sb3_saf.policies.ippo import IPPOPolicy
-from sb3_saf.policies.mappo import MAPPOPolicy
-from sb3_saf.policies.maskable import IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy
-from sb3_saf.policies.recurrent import IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy
-from sb3_saf.policies.saf import SAFPolicy
-from sb3_saf.policies.stock_policies import warn_of_stock_policies
-from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
-from sb3_saf.qplex.qplex import QPLEX
+import sb3_saf.policies
+import sb3_saf.qplex
+from sb3_saf.policies.declaration import AlgorithmSpec, Declaration
 
-#: Which names each algorithm learns. SB3 keeps one dict per algorithm.
-POLICIES: Final[dict[type[BaseAlgorithm], dict[str, type[BasePolicy]]]] = {
-    algorithm: {policy.__name__: policy for policy in policies}
-    for algorithm, policies in (
-        (PPO, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
-        (A2C, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
-        (TRPO, (IPPOPolicy, MAPPOPolicy, SAFPolicy)),
-        (RecurrentPPO, (IPPOLstmPolicy, MAPPOLstmPolicy, SAFLstmPolicy)),
-        (QPLEX, (QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy)),
-        (MaskablePPO, (IPPOMaskablePolicy, MAPPOMaskablePolicy, SAFMaskablePolicy)),
+
+def _declared_in(package: ModuleType) -> Iterator[Declaration]:
+    for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+        found = getattr(importlib.import_module(module.name), "DECLARATION", None)
+        if isinstance(found, Declaration):
+            yield found
+
+
+#: All algorithms, those of the paper first.
+DECLARATIONS: Final[tuple[Declaration, ...]] = tuple(
+    sorted(
+        [*_declared_in(sb3_saf.policies), *_declared_in(sb3_saf.qplex)],
+        key=lambda one: ("SAF", "MAPPO", "IPPO", one.name).index(one.name),
     )
-}
+)
+
+#: What each name of the command lines stands for.
+COMMANDS: Final[dict[str, AlgorithmSpec]] = {name: spec for one in DECLARATIONS for name, spec in one.commands.items()}
+
+
+def _names(declaration: Declaration) -> Iterator[tuple[type[BaseAlgorithm], str, type[BasePolicy]]]:
+    for algorithm, policies in declaration.policies.items():
+        yield from ((algorithm, policy.__name__, policy) for policy in policies)
+        yield algorithm, f"{declaration.name}Policy", policies[0]
+        yield algorithm, declaration.name, policies[0]
 
 
 def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:
@@ -55,12 +64,7 @@ def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]
 
 
 def register_all() -> None:
-    """
-    Register every policy, log game steps beside SB3's rows, and warn of SB3's own policies on teams; done when
-    ``sb3_saf`` is imported.
-    """
-    for algorithm, policies in POLICIES.items():
-        log_game_steps(algorithm)
-        warn_of_stock_policies(algorithm)
-        for name, policy in policies.items():
+    """Register every policy; done when ``sb3_saf`` is imported, and all that the import changes."""
+    for declaration in DECLARATIONS:
+        for algorithm, name, policy in _names(declaration):
             register(algorithm, name, policy)

@@ -251,8 +251,7 @@ def test_minibatches_leave_out_who_takes_no_part_and_keep_the_rest() -> None:
     def by_row(buffer: Any) -> list[Any]:
         found = []
         for sample in buffer.get(6):
-            keys = sorted(sample.observations)
-            parts = [*(sample.observations[key] for key in keys), *sample[1:]]
+            parts = [*(value for _, value in sorted(sample.observations.items())), *sample[1:]]
             flags = sample.observations["active"].numpy()[np.arange(len(parts[0])), sample.observations["agent"][:, 0]]
             found += [
                 row for row, flag in zip(zip(*(p.tolist() for p in parts), strict=True), flags, strict=True) if flag
@@ -430,8 +429,8 @@ def test_a_mask_that_allows_everything_changes_nothing() -> None:
     policy = make_policy(SAFPolicy)
     obs = random_rows()
     obs["action_mask"][:] = 1
-    own = policy.views.own(obs["obs"])
-    unmasked = actor_distribution(policy.actor, policy.action_space, policy.views.per_agent(policy.actor, own, None))
+    parameters = policy.actor(policy.extract_features(obs))
+    unmasked = actor_distribution(policy.actor, policy.action_space, parameters)
     masked = policy.get_distribution(obs)
     th.testing.assert_close(cast(Any, masked.distribution).logits, cast(Any, unmasked.distribution).logits)
 

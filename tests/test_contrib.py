@@ -122,9 +122,9 @@ def no_memory(n_sequences: int) -> LstmStates:
 def test_names_are_registered() -> None:
     for kind, algorithm in ALGORITHMS.items():
         for family in FAMILIES:
-            name = f"{family}{kind}Policy"
-            assert algorithm.policy_aliases[name] is getattr(sb3_saf, name)
-    assert "SAFPolicy" not in MaskablePPO.policy_aliases
+            policy = getattr(sb3_saf, f"{family}{kind}Policy")
+            for name in (policy.__name__, f"{family}Policy", family):
+                assert algorithm.policy_aliases[name] is policy
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -176,7 +176,7 @@ def test_model_saves_loads_and_continues(kind: str, tmp_path: Path) -> None:
 def test_game_steps_are_logged(kind: str, tmp_path: Path) -> None:
     model = make_model(f"IPPO{kind}Policy")
     model.set_logger(configure(str(tmp_path), ["csv"]))
-    model.learn(192)
+    model.learn(192, sb3_saf.GameStepsCallback())
     model.logger.close()
     with open(tmp_path / "progress.csv") as file:
         rows = list(csv.DictReader(file))

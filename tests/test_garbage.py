@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import sb3_saf
@@ -83,7 +84,7 @@ CAUSES: dict[str, tuple[Any, str]] = {
     ),
     "returns": (
         lambda: ppo(games(what="rewards", value=3e38, step=2)),
-        "returns of the rollout must be finite, got inf at game step 12, after 0 updates.*",
+        "returns of the rollout must be finite, got inf at game step 12, after 0 steps of the optimizer.*",
     ),
     "values of QPLEX": (
         lambda: QPLEX(
@@ -104,12 +105,32 @@ def test_training_stops_with_step_name_and_last_good_checkpoint_and_good_weights
     assert all(bool(tensor.isfinite().all()) for tensor in model.policy.state_dict().values())
 
 
-def test_the_losses_are_named_and_nothing_was_learned_from_them() -> None:
-    model = ppo(ent_coef=float("nan"))
+def test_nothing_is_learned_from_bad_losses_and_those_of_before_are_named() -> None:
+    model = ppo().learn(ROLLOUT)
     before = weights(model)
-    with pytest.raises(NonFiniteError, match=r"policy_loss -?\d.*, value_loss \d.*entropy_loss -?\d.*, loss nan;"):
+    model.ent_coef = float("nan")
+    with pytest.raises(NonFiniteError, match=r"the gradient of \S+ must be finite, got nan at game step \d+, after 0"):
         model.learn(ROLLOUT, FiniteCallback())
     assert weights(model) == before
+    model = ppo()
+    spoil = SpoiledLater(model)
+    with pytest.raises(NonFiniteError, match=r"\(the update before had .*train/value_loss \d.*train/loss -?\d.*\)"):
+        model.learn(3 * ROLLOUT, [FiniteCallback(), spoil])
+
+
+class SpoiledLater(BaseCallback):
+    """Makes the loss NaN after the first update."""
+
+    def __init__(self, model: PPO) -> None:
+        super().__init__()
+        self.ppo = model
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps > ROLLOUT:
+            self.ppo.ent_coef = float("nan")
 
 
 def test_one_bad_gradient_is_named_before_clipping_spreads_it() -> None:

@@ -39,8 +39,7 @@ from sb3_saf.networks.actor import PoolOutput
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.ippo import IPPOPolicy
-from sb3_saf.policies.saf import SAFPolicy
-from sb3_saf.policies.saf_critic import SAFCritic
+from sb3_saf.policies.saf import SAFCritic, SAFPolicy
 from tests.contrib_teams import MaskedTeams
 from tests.probe_envs import ConstantReward, DelayedReward, Message, Probe
 from tests.team_venv import TeamVenv

@@ -12,7 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from sb3_saf.networks.knowledge_source import KnowledgeSource
 from sb3_saf.networks.layers import Attention, orthogonal_init
 from sb3_saf.policies.parts import CriticInput
-from sb3_saf.policies.saf_critic import SAFCritic
+from sb3_saf.policies.saf import SAFCritic
 
 Array = npt.NDArray[np.float64]
 N_TEAMS, N_AGENTS, SIZE = 3, 5, 8

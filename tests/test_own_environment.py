@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_saf import RandomPolicy, make_team_env
-from sb3_saf.policies.stock_policies import warn_of_stock_policies
+from sb3_saf import GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
 from tests.toy_envs import CounterEnv, TellingEnv
 
 
@@ -105,30 +104,72 @@ def test_sb3s_own_policy_warns_that_it_sees_the_team() -> None:
     settings: dict[str, Any] = {"n_steps": 2, "batch_size": 8, "n_epochs": 1, "device": "cpu"}
     model = PPO("MultiInputPolicy", env, **settings)
     with pytest.warns(
-        UserWarning, match=r"its actor sees 'team', .*: IPPOPolicy, .*, SAFPolicy, as in PPO\('SAFPolicy'"
+        UserWarning, match=r"its actor sees 'team', .*: IPPOPolicy, MAPPOPolicy, SAFPolicy, as in PPO\('SAFPolicy'"
     ):
-        model.learn(8)
+        model.learn(8, GameStepsCallback())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        PPO("SAFPolicy", env, **settings).learn(8)
-        PPO("MlpPolicy", "CartPole-v1", **settings | {"n_steps": 8}).learn(8)
-    assert warn_of_stock_policies(PPO) is PPO
-    once = PPO.learn
-    assert warn_of_stock_policies(PPO).learn is once
+        settings |= {"rollout_buffer_class": TeamRolloutBuffer}
+        PPO("SAFPolicy", env, **settings).learn(8, GameStepsCallback())
+        del settings["rollout_buffer_class"]
+        PPO("MlpPolicy", "CartPole-v1", **settings | {"n_steps": 8}).learn(8, GameStepsCallback())
+
+
+def test_sb3s_own_buffer_warns_once_and_names_the_remedy() -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    model = PPO("SAFPolicy", env, n_steps=4, batch_size=8, device="cpu")
+    with pytest.warns(UserWarning, match=r"SAFPolicy is trained on .*ppo_settings\(env\)") as told:
+        model.learn(32)
+    assert len(told) == 1
+
+
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_a_batch_of_no_whole_teams_is_refused_before_the_first_rollout() -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    model = PPO("IPPOPolicy", env, n_steps=8, batch_size=15, rollout_buffer_class=TeamRolloutBuffer, device="cpu")
+    with pytest.raises(ValueError, match=r"must be a multiple of n_agents=2, .*, got 15; use batch_size=14 or 16"):
+        model.learn(16, GameStepsCallback())
+    assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize("policy", ["SAF", "MAPPO", "IPPO"])
+@pytest.mark.parametrize("overrides", [{}, {"n_steps": 7, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}])
+def test_good_settings_train_any_team(policy: str, overrides: dict[str, Any]) -> None:
+    env = make_team_env(CounterEnv, n_envs=3, seed=0)
+    settings = ppo_settings(env, device="cpu", **overrides)
+    assert settings["batch_size"] % 2 == 0 and settings["rollout_buffer_class"] is TeamRolloutBuffer
+    assert all(settings[key] == value for key, value in overrides.items())
+    model = PPO(policy, env, **settings)
+    assert model.n_steps * model.n_envs == (42 if overrides else 2 * 3 * 268)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(1 if overrides else 0, GameStepsCallback())
 
 
 @pytest.mark.parametrize("policy", ["SAFPolicy", "MAPPOPolicy"])
-def test_observations_by_agent_are_refused_with_what_to_pass(policy: str) -> None:
+def test_observations_by_agent_give_actions_by_agent(policy: str) -> None:
     model = PPO(policy, make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
     observations, _ = CounterEnv().reset(seed=0)
-    with pytest.raises(ValueError, match=r"got 'agent_0'. .* model.predict\(np.stack\(list\(observations.values\(\)"):
-        model.predict(observations)
-    alone, _ = model.predict(observations["agent_1"], deterministic=True)
+    actions, state = model.predict(observations, deterministic=True)
+    assert state is None
     stacked, _ = model.predict(np.stack(list(observations.values())), deterministic=True)
-    assert stacked.shape == (2,)
-    assert stacked[1] == alone
+    assert actions == dict(zip(observations, stacked, strict=True))
+    assert model.predict({"agent_1": observations["agent_1"]}, deterministic=True)[0] == {"agent_1": stacked[1]}
     with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a mistake in it is no dict of agents
         model.predict({"obs": observations["agent_1"], "team_view": observations["agent_1"]})
+    with pytest.raises(ValueError, match=r"expected observations of at most 2 agents, got 3"):
+        model.predict({**observations, "agent_2": observations["agent_1"]})
+
+
+def test_actors_that_read_who_acts_need_all_agents_or_their_index() -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    model = PPO("IPPOPolicy", env, policy_kwargs={"actor_identity": True}, device="cpu")
+    observations, _ = CounterEnv().reset(seed=0)
+    actions, _ = model.predict(observations, deterministic=True)
+    alone = {"obs": observations["agent_1"], "agent": 1}
+    assert model.predict(alone, deterministic=True)[0] == actions["agent_1"]
+    with pytest.raises(ValueError, match=r"expected the observation to have 'agent'"):
+        model.predict({"agent_1": observations["agent_1"]})
 
 
 def test_masks_in_pettingzoos_form_are_understood() -> None:
@@ -139,6 +180,7 @@ def test_masks_in_pettingzoos_form_are_understood() -> None:
         given = observations[agent]
         action, _ = model.predict(given, deterministic=True)
         assert given["action_mask"][action] == 1
+        assert model.predict(observations, deterministic=True)[0][agent] == action
         assert (
             action
             == model.predict({"obs": given["observation"], "action_mask": given["action_mask"]}, None, None, True)[0]

@@ -7,25 +7,25 @@ import sys
 
 import pytest
 
-from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.parameters import count, paper_policy, parameter_table
-from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.saf_critic import SAFCritic
+from sb3_saf.policies import ippo, mappo, saf
+from sb3_saf.policies.declaration import Declaration
+from sb3_saf.policies.saf import SAFCritic
 
 ACTOR, OWN_CRITIC, JOINT_CRITIC, CNN = 25_735, 24_961, 98_689, 1_233_056
 
 
 @pytest.mark.parametrize(
-    ("policy_class", "expected"),
+    ("declaration", "expected"),
     [
-        (IPPOPolicy, CNN + 10 * (ACTOR + OWN_CRITIC)),
-        (MAPPOPolicy, CNN + 10 * (ACTOR + JOINT_CRITIC)),
-        (SAFPolicy, CNN + 4 * ACTOR + 10 * JOINT_CRITIC + 233_600),
+        (ippo.DECLARATION, CNN + 10 * (ACTOR + OWN_CRITIC)),
+        (mappo.DECLARATION, CNN + 10 * (ACTOR + JOINT_CRITIC)),
+        (saf.DECLARATION, CNN + 4 * ACTOR + 10 * JOINT_CRITIC + 233_600),
     ],
 )
-def test_parts_add_up_to_the_whole(policy_class: type[TeamActorCriticPolicy], expected: int) -> None:
-    assert count(paper_policy(policy_class)) == expected
+def test_parts_add_up_to_the_whole(declaration: Declaration, expected: int) -> None:
+    assert count(paper_policy(declaration)) == expected
 
 
 def test_the_table_has_the_published_numbers() -> None:
@@ -34,7 +34,7 @@ def test_the_table_has_the_published_numbers() -> None:
 
 
 def test_safs_projections_and_knowledge_source() -> None:
-    policy = paper_policy(SAFPolicy)
+    policy = paper_policy(saf.DECLARATION)
     critic, pool = policy.value_net, policy.actor
     assert isinstance(critic, SAFCritic) and isinstance(pool, PolicyPool)
     assert count(critic.message_net) == count(critic.state_net) == count(pool.query_net) == 33_088

@@ -24,8 +24,7 @@ from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.layers import Linear
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.distributions import actor_distribution
-from sb3_saf.policies.mappo import MAPPOParts
-from sb3_saf.policies.mappo_critic import JointCritic
+from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import register
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, take, team_rows, to_numpy
 
@@ -532,7 +531,7 @@ def test_predict_needs_the_agent_with_heads_per_agent() -> None:
     expected, _ = policy.predict(obs, deterministic=True)
     own = {key: obs[key] for key in ("obs", "agent")}
     np.testing.assert_array_equal(policy.predict(own, deterministic=True)[0], expected)
-    action, _ = policy.predict({"obs": obs["obs"][2], "agent": 2}, deterministic=True)  # type: ignore[dict-item]
+    action, _ = policy.predict({"obs": obs["obs"][2], "agent": 2}, deterministic=True)
     assert action == expected[2]
 
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_saf.buffers.minibatch import TeamMinibatch
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
@@ -127,6 +128,19 @@ def test_minibatches_hold_whole_teams(batch_size: int | None, sizes: list[int]) 
         np.testing.assert_array_equal(
             obs["team"].reshape(-1, N_AGENTS, N_AGENTS, 4), np.repeat(own[:, None], N_AGENTS, 1)
         )
+
+
+def test_minibatches_say_which_teams_they_hold() -> None:
+    team, _ = make_both("vector")
+    for sample in team.get(12):
+        batch = sample.observations
+        assert isinstance(batch, TeamMinibatch)
+        assert set(batch) == {"obs", "agent"}, "the joint observation is made for those who ask"
+        assert batch.teams.rows is None and batch.teams.active is None
+        assert th.equal(batch.teams.observations.flatten(0, 1), batch["obs"])
+        assert set(dict(batch.items())) == {"obs", "agent", "team"}
+        with pytest.raises(KeyError, match="other"):
+            batch["other"]
 
 
 def test_sb3s_buffer_splits_teams() -> None:

@@ -1,8 +1,9 @@
-"""Distinct rows are found exactly, and views are encoded once each with unchanged results."""
+"""Unique rows are found exactly, and observations are encoded once each with unchanged results."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_saf.networks import unique
+from sb3_saf.networks.row_encoder import RowEncoder
 from sb3_saf.networks.unique import UniqueRows, every_row, unique_rows
-from sb3_saf.networks.views import ViewEncoder
 
 Finder = Callable[[th.Tensor], UniqueRows]
 
@@ -29,7 +30,7 @@ FINDERS = pytest.mark.parametrize("find", [on_cpu, on_device])
 
 
 def reference(x: th.Tensor) -> tuple[list[int], list[int]]:
-    """Distinct rows by a dict of their bytes."""
+    """Unique rows by a dict of their bytes."""
     seen: dict[bytes, int] = {}
     index: list[int] = []
     inverse: list[int] = []
@@ -125,7 +126,7 @@ def test_input_is_left_alone_and_may_need_gradients() -> None:
     assert x.grad is not None and x.grad.sum() == 60
 
 
-def test_every_row_takes_each_row_for_a_distinct_one() -> None:
+def test_every_row_takes_each_row_for_a_unique_one() -> None:
     found = every_row(th.zeros(3, 2))
     assert found.index.tolist() == found.inverse.tolist() == [0, 1, 2]
 
@@ -141,48 +142,36 @@ class Counter:
         return observations.float().flatten(1) * 2.0
 
 
-def a_b_teams() -> th.Tensor:
-    """Three rows of two teams with the views 1, 2 and 3, 1."""
-    return th.tensor([[[1], [2]], [[1], [2]], [[3], [1]]])
+#: Three rows of two teams that see 1, 2 and 3, 1; and whose rows they are.
+JOINT, AGENT = th.tensor([[[1], [2]], [[1], [2]], [[3], [1]]]), th.tensor([0, 1, 0])
 
 
-def test_own_views_are_encoded_once_each() -> None:
+def test_rows_are_encoded_once_each() -> None:
     counter = Counter()
-    own = ViewEncoder(counter).own(th.tensor([[1], [2], [1], [3]]))
+    own = RowEncoder(counter).rows(th.tensor([[1], [2], [1], [3]]))
     assert [call.tolist() for call in counter.calls] == [[[1], [2], [3]]]
-    assert own.features[own.rows].tolist() == [[2.0], [4.0], [2.0], [6.0]]
+    assert own.of_rows().tolist() == [[2.0], [4.0], [2.0], [6.0]]
 
 
-def test_teams_encode_only_what_is_not_known_yet() -> None:
+@pytest.mark.parametrize(
+    ("seen", "once", "calls"),
+    [
+        ([[1], [1], [1]], True, [[[1]], [[2], [3]]]),
+        ([[3], [2], [1]], True, [[[3], [2], [1]]]),
+        ([[1], [1], [1]], False, [[[1], [1], [1]], [[1], [2], [1], [2], [3], [1]]]),
+    ],
+    ids=["some known", "all known", "every row"],
+)
+def test_joint_rows_encode_only_what_is_not_known_yet(seen: list[list[int]], once: bool, calls: Any) -> None:
     counter = Counter()
-    encoder = ViewEncoder(counter)
-    own = encoder.own(th.tensor([[1], [1], [1]]))
-    views = encoder.teams(a_b_teams(), own)
-    assert [call.tolist() for call in counter.calls] == [[[1]], [[2], [3]]]
-    assert views.teams.tolist() == [[0, 1], [2, 0]]
-    assert views.rows.tolist() == [0, 0, 1]
-    assert th.equal(views.features[views.teams[views.rows]], 2.0 * a_b_teams())
+    encoder = RowEncoder(counter, once)
+    teams = encoder.joint_rows(JOINT, AGENT, encoder.rows(th.tensor(seen)))
+    assert [call.tolist() for call in counter.calls] == calls
+    assert th.equal(teams.features[teams.members], 2.0 * (JOINT if not once else JOINT[[0, 2]]))
+    assert teams.of_rows(teams.features[teams.members]).tolist() == [[2.0], [4.0], [6.0]]
 
 
-def test_teams_without_known_views_and_with_all_known() -> None:
-    counter = Counter()
-    encoder = ViewEncoder(counter)
-    encoder.teams(a_b_teams())
-    assert [call.tolist() for call in counter.calls] == [[[1], [2], [3]]]
-    encoder.teams(a_b_teams(), encoder.own(th.tensor([[3], [2], [1]])))
-    assert len(counter.calls) == 2
-
-
-def test_naive_encoder_encodes_every_row_and_every_member() -> None:
-    counter = Counter()
-    encoder = ViewEncoder(counter, encode_once=False)
-    own = encoder.own(th.tensor([[1], [1], [1]]))
-    views = encoder.teams(a_b_teams(), own)
-    assert [len(call) for call in counter.calls] == [3, 6]
-    assert th.equal(views.features[views.teams[views.rows]], 2.0 * a_b_teams())
-
-
-def test_heads_are_applied_once_per_view_and_agent() -> None:
+def test_heads_are_applied_once_per_observation_and_agent() -> None:
     calls: list[list[float]] = []
 
     def head(features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
@@ -190,8 +179,8 @@ def test_heads_are_applied_once_per_view_and_agent() -> None:
         calls.append(values.tolist())
         return values
 
-    encoder = ViewEncoder(Counter())
-    own = encoder.own(th.tensor([[1], [1], [1], [3]]))
-    assert encoder.per_agent(head, own, None).tolist() == [2, 2, 2, 6]
-    assert encoder.per_agent(head, own, th.tensor([0, 1, 0, 0])).tolist() == [2, 102, 2, 6]
+    encoder = RowEncoder(Counter())
+    own = encoder.rows(th.tensor([[1], [1], [1], [3]]))
+    assert encoder.apply(head, own, None).tolist() == [2, 2, 2, 6]
+    assert encoder.apply(head, own, th.tensor([0, 1, 0, 0])).tolist() == [2, 102, 2, 6]
     assert calls == [[2, 6], [2, 102, 6]]

@@ -10,9 +10,10 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
-from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, TensorDict
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_saf.buffers.minibatch import RolloutReturns, TeamMinibatch, WholeTeams
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -24,7 +25,6 @@ from sb3_saf.envs.teams import (
     TeamSpaces,
     check_whole_teams,
 )
-from sb3_saf.networks.value_normalizer import Rescaling, update_statistics
 
 #: Arrays with one entry per step and row, beside the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
@@ -34,17 +34,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     """
     SB3's rollout buffer for the observations of ``CentralizedValueWrapper``, through ``rollout_buffer_class``.
 
-    - **Memory**: the own observations of a team are stored once, ``(T, E, N, *shape)`` in their own dtype; ``team`` and
-      ``agent`` are rebuilt when a minibatch is drawn. SB3's buffer stores N + 1 observations per row. A row of HECOGrid
-      with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes of action, reward, value and so on,
-      where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. The large arrays are made once and reused by all
-      rollouts.
-    - **Minibatches** hold whole teams, agents in index order, so no team is encoded in two minibatches. ``batch_size``
-      counts rows and must be a multiple of N; the last minibatch may be smaller.
+    - **Memory**: own observations are stored once, ``(T, E, N, *shape)`` in their own dtype. SB3's buffer stores N + 1
+      observations per row. A row of HECOGrid with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes
+      of action, reward, value and so on, where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Arrays are made
+      once and reused by all rollouts.
+    - **Minibatches** hold whole teams, agents in index order (:class:`~sb3_saf.buffers.minibatch.TeamMinibatch`), so no
+      team is encoded in two minibatches, and critics need not look for it. ``batch_size`` counts rows and must be a
+      multiple of N; the last minibatch may be smaller.
     - **Advantages** are SB3's, computed by its code.
-    - **Value normalisation**: a policy with ``normalize_values=True`` gets the returns of each rollout into its
-      statistics. Minibatches then give as old values what the unchanged critic says under the new statistics, so that
-      PPO's ``clip_range_vf`` starts from no difference; advantages and :attr:`values` are those of the rollout.
+    - **Value normalisation**: minibatches carry the returns of the rollout to a policy with ``normalize_values=True``;
+      advantages and :attr:`values` are those of the rollout.
     - **Agents that take no part** (``"active"``, where observations have it): minibatches leave their rows out, so that
       loss, entropy and the normalisation of advantages see active rows only; ``batch_size`` is then an upper bound. An
       agent's own end is the end of its return, see :meth:`compute_returns_and_advantage`.
@@ -78,7 +77,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
         self._allocated = False
-        self._rescaling: Rescaling | None = None
+        self._returns = RolloutReturns(np.zeros(0))
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
     def reset(self) -> None:
@@ -166,21 +165,19 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         V_T ``last_values``: the policies of this package give zero to agents that take no part, which stands for c_T.
         Advantages of rows that take no part are never read.
 
-        Then the returns of rows that take part go into the statistics of a policy that normalises values.
-
-        :param last_values: (B,) or (B, 1) values after the last step, as they come from the policy
+        :param last_values: (B,) or (B, 1) values after the last step
         :param dones: (B,) whether an episode ended with the last step
         """
         if self.active is None:
             super().compute_returns_and_advantage(last_values, dones)
-            self._rescaling = update_statistics(last_values, self.returns)
+            self._returns = RolloutReturns(self.returns)
             return
         starts = self.episode_starts
         idle = self.active.reshape(self.buffer_size, self.n_envs) == 0
         self.episode_starts = np.where(idle, np.float32(1), starts)
         super().compute_returns_and_advantage(last_values, dones)
         self.episode_starts = starts
-        self._rescaling = update_statistics(last_values, self.returns[~idle])
+        self._returns = RolloutReturns(self.returns[~idle])
 
     def _check_rows(self, obs: dict[str, Array]) -> None:
         own, team, agents = (np.asarray(obs[key]) for key in (OBS_KEY, TEAM_KEY, AGENT_KEY))
@@ -223,7 +220,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         if not self.full:
             raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
-        teams_per_batch = self._teams_per_batch(batch_size)
+        teams_per_batch = self.buffer_size * self.n_games
+        if batch_size is not None:
+            self.check_batch_size(batch_size)
+            teams_per_batch = batch_size // self.n_agents
         teams = self._playing_teams()
         # SB3 seeds NumPy's global generator, and no other, from the run's seed.
         order = teams[np.random.permutation(len(teams))]  # noqa: NPY002
@@ -242,15 +242,18 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             )
         return playing
 
-    def _teams_per_batch(self, batch_size: int | None) -> int:
-        if batch_size is None:
-            return self.buffer_size * self.n_games
+    def check_batch_size(self, batch_size: int) -> None:
+        """
+        Check that minibatches can hold whole teams.
+
+        :param batch_size: rows per minibatch
+        :raises ValueError: if N does not divide it, with the nearest sizes that do
+        """
         if batch_size < 1 or batch_size % self.n_agents:
             raise ValueError(
                 f"batch_size counts rows and must be a multiple of n_agents={self.n_agents}, because TeamRolloutBuffer "
                 f"gives whole teams, got {batch_size}; use batch_size={self._nearest_batch_sizes(batch_size)}"
             )
-        return batch_size // self.n_agents
 
     def _nearest_batch_sizes(self, batch_size: int) -> str:
         """What somebody may have meant."""
@@ -270,57 +273,47 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param env: unused, as in SB3's buffers for rollouts
         :return: K * N rows, less those of agents that take no part
         """
-        samples = DictRolloutBufferSamples(
-            observations=self._rebuild(batch_inds),
-            actions=self._take(self.actions, batch_inds).float().flatten(end_dim=1),
-            old_values=self._old_values(batch_inds),
-            old_log_prob=self._take(self.log_probs, batch_inds).flatten(),
-            advantages=self._take(self.advantages, batch_inds).flatten(),
-            returns=self._take(self.returns, batch_inds).flatten(),
+        parts = {
+            name: self._gather(getattr(self, name), batch_inds).flatten(end_dim=1)
+            for name in ("actions", "values", "log_probs", "advantages", "returns")
+        }
+        own = self._gather(self.observations[OBS_KEY], batch_inds)
+        entries = {OBS_KEY: own.flatten(end_dim=1), **self._entries(batch_inds)}
+        active = None if self.active is None else self._of_team_steps(self.active, batch_inds)
+        rows = None
+        if active is not None and not active.all():
+            rows = th.as_tensor(np.flatnonzero(active), device=self.device)
+            parts, entries = ({key: part[rows] for key, part in some.items()} for some in (parts, entries))
+        teams = WholeTeams(
+            own.reshape(*own.shape[:2], *self.team_spaces.own_shape),
+            rows,
+            None if active is None else self.to_torch(active != 0, copy=False),
         )
-        if self.active is None:
-            return samples
-        active = self._of_team_steps(self.active, batch_inds)
-        if active.all():
-            return samples
-        rows = th.as_tensor(np.flatnonzero(active), device=self.device)
-        observations = {key: entry[rows] for key, entry in samples.observations.items()}
-        return DictRolloutBufferSamples(observations, *(part[rows] for part in samples[1:]))
+        return DictRolloutBufferSamples(
+            observations=TeamMinibatch(teams, entries, self._returns, parts["values"]),
+            actions=parts["actions"].float(),
+            old_values=parts["values"],
+            old_log_prob=parts["log_probs"],
+            advantages=parts["advantages"],
+            returns=parts["returns"],
+        )
 
     def _of_team_steps(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
         """(T, E, ...) -> (K, ...)."""
         return array.reshape(self.buffer_size * self.n_games, *array.shape[2:])[team_steps]
 
-    def _old_values(self, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
-        values = self._take(self.values, team_steps).flatten()
-        if self._rescaling is None:
-            return values
-        return values * self._rescaling.scale + self._rescaling.shift
-
-    def _take(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
+    def _gather(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
         """(T, B, ...) -> (K, N, ...); rows lie game-major, so each team step is one stretch of memory."""
         by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
         return self.to_torch(by_team[team_steps], copy=False)
 
-    def _rebuild(self, team_steps: npt.NDArray[np.int64]) -> TensorDict:
-        """
-        The Dict observation of all rows of some teams, in the shapes of SB3's buffer.
-
-        :param team_steps: (K,)
-        """
-        own = self._take(self.observations[OBS_KEY], team_steps)
-        n_teams, n_agents = own.shape[:2]
-        shape = self.team_spaces.own_shape
-        team = own.reshape(n_teams, 1, n_agents, *shape).expand(n_teams, n_agents, n_agents, *shape)
-        rows = {
-            OBS_KEY: own.flatten(end_dim=1),
-            TEAM_KEY: team.reshape(n_teams * n_agents, n_agents, *shape),
-            AGENT_KEY: th.arange(n_agents, device=own.device).repeat(n_teams).unsqueeze(1),
-        }
+    def _entries(self, team_steps: npt.NDArray[np.int64]) -> dict[str, th.Tensor]:
+        """Entries of the rows' observations, beside what agents see, in the shapes of SB3's buffer."""
+        entries = {AGENT_KEY: th.arange(self.n_agents, device=self.device).repeat(len(team_steps)).unsqueeze(1)}
         if ACTION_MASK_KEY in self.observations:
-            rows[ACTION_MASK_KEY] = self._take(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
+            entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
                 by_game = self.to_torch(self._of_team_steps(array, team_steps), copy=False)
-                rows[key] = by_game.repeat_interleave(n_agents, dim=0)
-        return rows
+                entries[key] = by_game.repeat_interleave(self.n_agents, dim=0)
+        return entries

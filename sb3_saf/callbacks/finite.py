@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Iterator
 from functools import partial
-from types import FrameType
 from typing import Any, Final
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from torch.utils.hooks import RemovableHandle
 
@@ -26,12 +23,11 @@ class FiniteCallback(BaseCallback):
     """
     Stop training at NaN or infinity, with the step and the tensor's name, while the weights are still good.
 
-    Looked at are gradients before every step of the optimiser, weights after it, rollouts before every update, losses
-    and the policy's statistics after it. Observations and rewards of teams are looked at when the environment gives
-    them, by ``CentralizedValueWrapper``.
+    It checks gradients before every step of the optimiser, weights after it, rollouts before every update, losses and
+    the policy's statistics after it. ``CentralizedValueWrapper`` checks observations and rewards of teams.
 
-    Sums are what is looked at: NaN and infinity stay in them, and memory is read once. Per gradient step that is two
-    numbers of each parameter, and two that leave the GPU.
+    It checks sums: NaN and infinity stay in them, and memory is read once. Per gradient step that is two numbers of
+    each parameter, and two that leave the GPU.
 
     ``resumable_learn`` uses it by itself.
     """
@@ -41,10 +37,12 @@ class FiniteCallback(BaseCallback):
         self._handles: list[RemovableHandle] = []
         self._sums: dict[str, th.Tensor] = {}
         self._weights: dict[str, th.Tensor] = {}
-        self._checked_update = -1
+        self._losses: dict[str, float] = {}
+        self._n_optimizer_steps = 0
+        self._n_checked = -1
 
     def _on_training_start(self) -> None:
-        self._let_go()
+        self._remove_hooks()
         policy: Any = self.model.policy
         learning = {name: weight for name, weight in policy.named_parameters() if weight.requires_grad}
         for name, parameter in learning.items():
@@ -55,9 +53,9 @@ class FiniteCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._check_update()
-        self._let_go()
+        self._remove_hooks()
 
-    def _let_go(self) -> None:
+    def _remove_hooks(self) -> None:
         while self._handles:
             self._handles.pop().remove()
 
@@ -77,10 +75,10 @@ class FiniteCallback(BaseCallback):
             return
         for name, value in sums.items():  # from the loss backwards, so the first is the nearest to it
             if not bool(value.isfinite()):
-                losses = ", ".join(f"{loss} {number:.3g}" for loss, number in _losses(self.model).items())
-                self._stop(f"the gradient of {name}", float(value), losses and f"; {losses}")
+                self._stop(f"the gradient of {name}", float(value))
 
     def _check_weights(self, *_: object) -> None:
+        self._n_optimizer_steps += 1
         with th.no_grad():
             if math.isfinite(float(th.stack([weight.sum() for weight in self._weights.values()]).sum())):
                 return
@@ -95,11 +93,13 @@ class FiniteCallback(BaseCallback):
 
     def _check_update(self) -> None:
         """Once per update: an algorithm off-policy begins a rollout at every step."""
-        if self.model._n_updates == self._checked_update:
+        if self._n_optimizer_steps == self._n_checked:
             return
-        self._checked_update = self.model._n_updates
-        for name, value in self.model.logger.name_to_value.items():
-            if name.startswith("train/") and "loss" in name and not math.isfinite(value):
+        self._n_checked = self._n_optimizer_steps
+        logged = self.model.logger.name_to_value.items()
+        self._losses = {name: value for name, value in logged if name.startswith("train/") and "loss" in name}
+        for name, value in self._losses.items():
+            if not math.isfinite(value):
                 self._stop(name, value)
         with th.no_grad():
             for name, parameter in self.model.policy.state_dict().items():
@@ -113,13 +113,15 @@ class FiniteCallback(BaseCallback):
             if not math.isfinite(value):
                 self._stop(f"{name} of the rollout", value)
 
-    def _stop(self, name: str, value: float, more: str = "") -> None:
+    def _stop(self, name: str, value: float) -> None:
         steps = game_steps(self.model)
         when = f"step {self.model.num_timesteps:,}" if steps is None else f"game step {steps:,}"
+        losses = ", ".join(f"{loss} {number:.3g}" for loss, number in self._losses.items())
+        before = f" (the update before had {losses})" if losses else ""
         raise NonFiniteError(
-            f"{name} must be finite, got {value} at {when}, after {self.model._n_updates} updates{more}; training "
-            "stops here, for learning from it would ruin the model: look for a learning rate that is too high, rewards "
-            "that are too large, or an encoder or loss of your own that divides by zero"
+            f"{name} must be finite, got {value} at {when}, after {self._n_optimizer_steps} steps of the "
+            f"optimizer{before}; training stops here, for learning from it would ruin the model: look for a learning "
+            "rate that is too high, rewards that are too large, or an encoder or loss of your own that divides by zero"
         )
 
 
@@ -131,18 +133,3 @@ def _floats(buffer: object) -> Iterator[tuple[str, np.ndarray[Any, np.dtype[np.f
         for key, array in parts:
             if isinstance(array, np.ndarray) and array.dtype.kind == "f":
                 yield f"{name} {key}".strip(), array
-
-
-def _losses(model: BaseAlgorithm) -> dict[str, float]:
-    """Losses of the update that is going on. SB3 has them in variables of ``train`` alone."""
-    frame: FrameType | None = inspect.currentframe()
-    while frame is not None:
-        if frame.f_code.co_name == "train" and frame.f_locals.get("self") is model:
-            found = frame.f_locals.items()
-            return {name: value.item() for name, value in found if "loss" in name and _is_number(value)}
-        frame = frame.f_back
-    return {}
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, th.Tensor) and value.numel() == 1

@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import (
 )
 
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
+from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.checks import check_keys, check_list, check_real, check_whole, refused
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import (
@@ -51,7 +52,7 @@ _COUNTERS: Final[dict[Any, dict[str, _Kind]]] = {
 }
 
 #: A run may go on without them, or with them: progress bars of a terminal, looks into the policy.
-_ONLY_SHOWING: Final = (ProgressBarCallback, InspectionCallback)
+_ONLY_SHOWING: Final = (ProgressBarCallback, InspectionCallback, GameStepsCallback)
 
 Callbacks = BaseCallback | Iterable[BaseCallback] | None
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.finite import FiniteCallback
+from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run, newest_checkpoint
 from sb3_saf.checkpoints.callbacks import all_callbacks, check_callback_states, load_callback_states
 from sb3_saf.checkpoints.checks import refused
@@ -138,7 +139,8 @@ def resumable_learn(
     others = list(all_callbacks(callback))
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
     checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, others, exact, verbose=model.verbose)
-    before: list[BaseCallback] = [FiniteCallback()] if finite else []  # first: what is written has been looked at
+    # First: what is written has been looked at.
+    before: list[BaseCallback] = [FiniteCallback(), GameStepsCallback()] if finite else [GameStepsCallback()]
     checkpoints.store.acquire()
     try:
         if checkpoints.store.checkpoints():

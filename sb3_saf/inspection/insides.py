@@ -22,7 +22,7 @@ from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
-from sb3_saf.policies.saf_critic import SAFCritic, SAFStates
+from sb3_saf.policies.saf import SAFCritic, SAFStates
 
 Tensors = dict[str, th.Tensor]
 
@@ -137,7 +137,8 @@ class Insides:
 
     def _pool_view(self, obs: Tensors, latent: th.Tensor, action_masks: npt.NDArray[np.bool_] | None) -> PoolView:
         assert self.pool is not None
-        log_weights, actions = self.pool.evaluate(latent)
+        agent = self.policy._agent(obs) if self.pool.reads_agent else None
+        log_weights, actions = self.pool.evaluate(latent, agent)
         legal = self.policy._action_mask(obs)
         if action_masks is not None:
             allowed = th.as_tensor(action_masks, dtype=th.bool, device=latent.device).reshape(len(latent), -1)
@@ -147,12 +148,13 @@ class Insides:
         return PoolView(log_weights.exp(), actions)
 
     def _source_view(self, source: SAFStates, obs: Tensors, starts: th.Tensor | None) -> SourceView:
-        views = self.policy.views.teams(self.policy._team(obs), None, self.policy._active(obs))
-        known, exchanged = source.communicate(views.features, views.teams, views.active)
-        # Equal teams were computed once; from here on, games count.
-        team = views.rows[:: self.policy.team_spaces.n_agents]
+        _, teams = self.policy.encode_teams(obs)
+        known, exchanged = source.communicate(teams.features, teams.members, teams.active)
+        # Rows that are no whole teams in order have equal teams computed once; from here on, games count.
+        n_agents = self.policy.team_spaces.n_agents
+        team = th.arange(len(known)) if teams.rows is None else teams.rows[::n_agents] // n_agents
         states, read = known[team], exchanged.read[team]
-        active = None if views.active is None else views.active[team]
+        active = None if teams.active is None else teams.active[team]
         messages: dict[Replacement, th.Tensor] = {"zero": th.zeros_like(read)}
         if len(team) > 1:
             messages["shuffled"] = read.roll(1, dims=0)

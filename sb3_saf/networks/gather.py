@@ -1,4 +1,4 @@
-"""Rows of a tensor by their numbers, in a way that repeats."""
+"""Select rows of a tensor, with gradients that repeat."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch as th
 
 def gather(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
     """
-    ``x[rows]``, with a gradient that is the same every time.
+    Return ``x[rows]``, with a gradient that is the same every time.
 
     On the CPU, PyTorch adds up the gradient of ``x[rows]`` in parallel, in an order that changes from run to run; that
     of ``index_select`` is added in order, and in a third of the time.
@@ -21,7 +21,7 @@ def gather(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
 
 def gather_agents(x: th.Tensor, teams: th.Tensor, agent: th.Tensor) -> th.Tensor:
     """
-    ``x[teams, agent]``, see :func:`gather`.
+    Return ``x[teams, agent]``, see :func:`gather`.
 
     :param x: (G, N, *shape)
     :param teams: (B,) int64

@@ -1,16 +1,15 @@
 """
 Value normalisation: the critic learns returns of mean 0 and variance 1, everybody else sees values on the raw scale.
 
-Stock PPO has no place for it, so this is how it gets in, all explained here:
+How it works inside stock PPO:
 
-1. The policy owns a :class:`ValueNormalizer` and sends every output of its critic through it. So *all* values that
-   leave the policy are de-normalised: those in the buffer, in the advantages, in the bootstrap of a time limit.
-2. SB3 trains with its squared error on the raw scale. The gradient of a de-normalised value is rescaled on its way
-   back, which makes it the gradient of the squared error of normalised numbers (:meth:`ValueNormalizer.forward`).
-3. The statistics need the returns, which the rollout buffer computes and the policy never sees. SB3 hands the policy's
-   last values to the buffer as they are, so de-normalised values carry a reference to their normaliser, and a buffer
-   calls :func:`update_statistics` with those last values and its returns, once per rollout. ``TeamRolloutBuffer`` does;
-   with a buffer that does not, the first gradient raises a ValueError.
+1. The policy sends every output of its critic through its :class:`ValueNormalizer`, so *all* values that leave the
+   policy are on the raw scale: those in the buffer, in the advantages, in the bootstrap of a time limit.
+2. SB3 trains with its squared error on the raw scale. The gradient of a value is rescaled on its way back, which makes
+   it the gradient of the squared error of normalised numbers (:meth:`ValueNormalizer.forward`).
+3. The statistics need the returns, which the rollout buffer computes. The minibatches of ``TeamRolloutBuffer`` carry
+   them (``sb3_saf.buffers.minibatch``); the policy takes them in when it sees the first minibatch of a rollout, before
+   anything is learned from it. Training on minibatches of other buffers raises a ValueError.
 
 Letters: B rows.
 """
@@ -18,7 +17,6 @@ Letters: B rows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -29,12 +27,10 @@ from torch import nn
 #: Returns that hardly vary are not blown up to a variance of 1.
 MIN_STD: Final = 1e-2
 
-_CARRIED: Final = "_value_normalizer"
-
 
 class Rescaling(NamedTuple):
     """
-    What new statistics make of values that the critic gave under the old ones: ``scale * value + shift``.
+    How new statistics change values that the critic gave under the old ones: ``scale * value + shift``.
 
     :param scale: new standard deviation / old
     :param shift: in the units of returns
@@ -60,8 +56,6 @@ class ValueNormalizer(nn.Module):
         self.register_buffer("mean", th.tensor(0.0))
         self.register_buffer("var", th.tensor(1.0))
         self.register_buffer("count", th.tensor(0, dtype=th.int64))
-        # Of this process, so not saved: a loaded model that goes on with another buffer must fail, too.
-        self._ever_updated = False
 
     @property
     def std(self) -> th.Tensor:
@@ -80,30 +74,14 @@ class ValueNormalizer(nn.Module):
 
         :param outputs: (B, ...) of the critic
         :param active: (B, ...) bool, rows that take part; the values of others are exactly zero. All do if None
-        :return: (B, ...) values on the scale of returns, which carry a reference to this normaliser
-        :raises ValueError: in backward, if the module is in training mode and the statistics were never updated
+        :return: (B, ...) values on the scale of returns
         """
         std = self.std
         values = self.mean + std * outputs
         if values.requires_grad:
-            values.register_hook(self._rescaled_by(std**-2))
-        if active is not None:
-            values = values * active
-        setattr(values, _CARRIED, self)
-        return values
-
-    def _rescaled_by(self, factor: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
-        def rescale(gradient: th.Tensor) -> th.Tensor:
-            if self.training and not self._ever_updated:
-                raise ValueError(
-                    "normalize_values=True needs a rollout buffer that updates the statistics of returns, but values "
-                    "are being trained and none did; pass rollout_buffer_class=sb3_saf.TeamRolloutBuffer (or, in a "
-                    "buffer of your own, call sb3_saf.networks.value_normalizer.update_statistics), or leave "
-                    "normalize_values=False"
-                )
-            return gradient * factor
-
-        return rescale
+            factor = std**-2
+            values.register_hook(lambda gradient: gradient * factor)
+        return values if active is None else values * active
 
     def update(self, returns: npt.NDArray[np.floating]) -> Rescaling:
         """
@@ -119,7 +97,6 @@ class ValueNormalizer(nn.Module):
         old_mean, old_std = float(self.mean), float(self.std)
         if returns.size:
             self._merge(float(returns.mean()), float(returns.var()), returns.size)
-        self._ever_updated = True
         scale = float(self.std) / old_std
         return Rescaling(scale, float(self.mean) - scale * old_mean)
 
@@ -132,15 +109,3 @@ class ValueNormalizer(nn.Module):
         self.mean.fill_(old_mean + share * (mean - old_mean))
         self.var.fill_(math.fsum([(1.0 - share) * old_var, share * var, between]))
         self.count.fill_(n_old + count)
-
-
-def update_statistics(last_values: th.Tensor, returns: npt.NDArray[np.floating]) -> Rescaling | None:
-    """
-    What a rollout buffer does when it has computed its returns.
-
-    :param last_values: the values that ``compute_returns_and_advantage`` was given, as they came from the policy
-    :param returns: all returns of the rollout that are trained on
-    :return: how stored values change; None if the policy does not normalise values
-    """
-    normalizer: ValueNormalizer | None = getattr(last_values, _CARRIED, None)
-    return None if normalizer is None else normalizer.update(returns)

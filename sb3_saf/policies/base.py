@@ -1,19 +1,18 @@
 """
-What the policies of SAF, MAPPO and IPPO share, for rows that carry their team's joint view: all of their construction
-(``TeamPolicy``), and SB3's ActorCriticPolicy of them (``TeamActorCriticPolicy``).
+What the policies of SAF, MAPPO and IPPO share: their construction (``TeamPolicy``), and SB3's ActorCriticPolicy of them
+(``TeamActorCriticPolicy``).
 
-The actor reads ``obs`` (and ``agent``, with one head per agent); only the critic reads ``team``. Letters: B rows, N
+The actor reads ``obs`` (and ``agent``, where it reads who acts); only the critic reads ``team``. Letters: B rows, N
 agents.
 """
 
 from __future__ import annotations
 
 import warnings
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from functools import partial
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple, NoReturn
 
 import torch as th
 from gymnasium import spaces
@@ -23,13 +22,14 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_saf.buffers.minibatch import TeamMinibatch
 from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.gather import gather_agents
 from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
+from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams
 from sb3_saf.networks.value_normalizer import ValueNormalizer
-from sb3_saf.networks.views import OwnViews
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import NetworkSpec, TeamParts
@@ -41,15 +41,27 @@ NetArch = list[int] | dict[str, list[int]]
 _SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
 
 
+class Encoded(NamedTuple):
+    """
+    Encoded rows.
+
+    :param own: own observations of the rows
+    :param teams: those of their teams; None if the critic does not read them
+    """
+
+    own: EncodedRows
+    teams: EncodedTeams | None
+
+
 class TeamPolicy(TeamRowsPolicy):
     """
     Base of policies on rows of teams: one row is one agent in one game at one step.
 
-    It goes in front of one of the actor-critic policies of SB3 or sb3-contrib, whose networks it replaces by its own.
+    It is inherited together with one of the actor-critic policies of SB3 or sb3-contrib, whose networks it replaces.
 
     A row's observation is that of ``CentralizedValueWrapper``: ``obs``, ``team`` and ``agent``. The actor reads
-    ``obs`` alone: what other agents see cannot change an action's probability by a bit. Each distinct observation of
-    a batch is encoded once, so extractors must treat views one by one (no batch normalisation).
+    ``obs`` alone: what other agents see cannot change an action's probability by a bit. Equal observations of a batch
+    are encoded once, so extractors must treat observations one by one (no batch normalisation).
 
     Where observations have ``action_mask``, illegal actions have probability zero: in every policy of a pool, so also
     in their mixture; entropies are over legal actions. ``predict`` then needs the mask beside ``obs``. Where they have
@@ -61,8 +73,9 @@ class TeamPolicy(TeamRowsPolicy):
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
-    :param encode_once: False encodes every row, which gives the same numbers slowly
-    :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
+    :param encode_once: whether equal observations of a batch are encoded once; False encodes every row, which gives
+        the same numbers
+    :param chunk_size: observations encoded at once on the CPU, few enough for the cache; None for all
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
         ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. Values that the policy
         gives, ``train/value_loss`` and ``clip_range_vf`` are on the raw scale either way
@@ -86,7 +99,7 @@ class TeamPolicy(TeamRowsPolicy):
     activation_fn: type[nn.Module]
     log_std_init: float
     ortho_init: bool
-    #: Whether ``normalize_values`` may be used: the algorithm takes a rollout buffer that updates the statistics.
+    #: Whether the algorithm takes TeamRolloutBuffer, which ``normalize_values`` needs.
     normalizes_values: ClassVar[bool] = False
 
     def __init__(
@@ -107,7 +120,7 @@ class TeamPolicy(TeamRowsPolicy):
     ):
         _refuse(use_sde=use_sde, share_features_extractor=share_features_extractor)
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
-        self._warned_of_idle_rows = False
+        self._warned_of_minibatch = False
         self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
         if normalize_values and not self.normalizes_values:
             raise ValueError(
@@ -194,76 +207,105 @@ class TeamPolicy(TeamRowsPolicy):
         :param obs: rows
         :return: (B, 1)
         """
-        return self._values(obs, None)
+        return self._values(obs, self._encoded(obs))
 
-    def _warn_of_idle_rows(self, obs: PyTorchObs) -> None:
-        """Rows of agents that take no part come from buffers that do not leave them out."""
-        if self.team_spaces.active is None or self._warned_of_idle_rows:
+    def _check_minibatch(self, obs: PyTorchObs) -> None:
+        """Warn once of minibatches that TeamRolloutBuffer would give better."""
+        if self._warned_of_minibatch or not self.training or isinstance(obs, TeamMinibatch):
             return
-        active = self._active(obs)
-        assert active is not None
-        takes_part = active.gather(1, self._agent(obs).unsqueeze(1)).squeeze(1)
-        if (active.any(dim=1) & ~takes_part).any():  # rows of a padding have no team
-            self._warned_of_idle_rows = True
-            advice = (
-                "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which leaves them out."
-                if self.normalizes_values
-                else f"The buffers of {type(self).__name__}'s algorithms cannot leave them out; PPO with "
-                "sb3_saf.TeamRolloutBuffer can."
-            )
-            warnings.warn(
+        active, takes_part = self._active(obs), self._takes_part(obs)
+        if active is not None and takes_part is not None and (active.any(dim=1) & ~takes_part.squeeze(1)).any():
+            # Rows of a padding have no team.
+            message = (
                 "The minibatch has rows of agents that take no part (dead, or not joined yet); they enter the loss, "
-                f"the entropy and the normalisation of advantages. {advice}",
-                UserWarning,
-                stacklevel=3,
+                f"the entropy and the normalisation of advantages. {self._advice()}"
             )
+        elif self.normalizes_values:
+            message = (
+                f"{type(self).__name__} is trained on minibatches of SB3's own rollout buffer, which stores "
+                f"{self.team_spaces.n_agents + 1} observations per row and splits teams: slower, with the same result. "
+                "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer; PPO(policy, env, "
+                "**sb3_saf.ppo_settings(env)) sets it, with a batch size of whole teams"
+            )
+        else:
+            return
+        self._warned_of_minibatch = True
+        warnings.warn(message, UserWarning, stacklevel=3)
+
+    def _advice(self) -> str:
+        if self.normalizes_values:
+            return "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which leaves them out."
+        return (
+            f"The buffers of {type(self).__name__}'s algorithms cannot leave them out; PPO with "
+            "sb3_saf.TeamRolloutBuffer can."
+        )
+
+    def _encoded(self, obs: PyTorchObs) -> Encoded:
+        """Encode what actor and critic read of rows."""
+        if self._critic_reads_teams:
+            return Encoded(*self.encode_teams(obs))
+        return Encoded(self.encode_own(obs), None)
+
+    @property
+    def _critic_reads_teams(self) -> bool:
+        return isinstance(self.value_net, TeamCritic)
 
     def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
         """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
         return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
 
-    def _distribution(self, obs: PyTorchObs, own: OwnViews, action_masks: th.Tensor | None = None) -> Distribution:
+    def _distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: th.Tensor | None = None) -> Distribution:
         """Over actions that both the rows' own masks and ``action_masks``, (B, M) bool, allow."""
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs)
         if action_masks is not None:
             masks = action_masks if masks is None else masks & action_masks
         if masks is None:
-            return actor_distribution(self.actor, self.action_space, self.views.per_agent(self.actor, own, agent))
-        unmixed = self.views.per_agent(self.actor.unmixed, own, agent)
+            parameters = self.row_encoder.apply(self.actor, own, agent)
+            return actor_distribution(self.actor, self.action_space, parameters)
+        unmixed = self.row_encoder.apply(self.actor.unmixed, own, agent)
         return actor_distribution(self.actor, self.action_space, unmixed, masks)
 
-    def _values(self, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
-        """(B, 1) values; ``own`` are the rows' own views if they were encoded before."""
-        critic, active = self.value_net, self._active(obs)
+    def _values(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
+        """(B, 1) values."""
+        critic, teams = self.value_net, encoded.teams
         if isinstance(critic, TeamCritic):
-            views = self.views.teams(self._team(obs), own, active)
-            of_teams = critic(views.features, views.teams, views.active)
-            values = gather_agents(of_teams, views.rows, self._agent(obs))
+            assert teams is not None
+            values = teams.of_rows(critic(teams.features, teams.members, teams.active))
         elif isinstance(critic, StateCritic):
             values = self._values_of_states(obs, critic)
         else:
-            own = self.views.own(self._own(obs)) if own is None else own
-            values = self.views.per_agent(critic, own, self._agent(obs) if critic.reads_agent else None)
+            values = self.row_encoder.apply(critic, encoded.own, self._agent(obs) if critic.reads_agent else None)
         return self._raw_values(obs, values)
 
     def _raw_values(self, obs: PyTorchObs, outputs: th.Tensor) -> th.Tensor:
         """(B, 1) values on the raw scale, of the critic's outputs (B,)."""
-        values, active = outputs.unsqueeze(1), self._active(obs)
-        # Whoever takes no part expects nothing: an agent's own end is the end of its return.
-        takes_part = None if active is None else active.gather(1, self._agent(obs).unsqueeze(1))
-        if self.value_normalizer is not None:
-            return self.value_normalizer(values, takes_part)
-        return values if takes_part is None else values * takes_part
+        # The value of who takes no part is zero: an agent's own end is the end of its return.
+        values, takes_part = outputs.unsqueeze(1), self._takes_part(obs)
+        if self.value_normalizer is None:
+            return values if takes_part is None else values * takes_part
+        if isinstance(obs, TeamMinibatch):
+            obs.update_statistics(self.value_normalizer)
+        elif self.training and outputs.requires_grad:
+            outputs.register_hook(_refuse_to_train)
+        return self.value_normalizer(values, takes_part)
 
     def _values_of_states(self, obs: PyTorchObs, critic: StateCritic) -> th.Tensor:
-        """(B,) values, each distinct state encoded once."""
+        """(B,) values, equal states encoded once."""
         space = self.team_spaces.state
         assert space is not None
         states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
-        found = self.views.find(states)
+        found = self.row_encoder.find(states)
         values = self._in_chunks(critic, states[found.index], space)
         return gather_agents(values, found.inverse, self._agent(obs))
+
+
+def _refuse_to_train(gradient: th.Tensor) -> NoReturn:
+    raise ValueError(
+        "normalize_values=True needs a rollout buffer that updates the statistics of returns, but values are being "
+        "trained and none did; pass rollout_buffer_class=sb3_saf.TeamRolloutBuffer (or, in a buffer of your own, give "
+        "sb3_saf.buffers.minibatch.TeamMinibatch), or leave normalize_values=False"
+    )
 
 
 def _with_fused_steps(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -278,11 +320,6 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
 
     normalizes_values: ClassVar[bool] = True
 
-    @classmethod
-    @abstractmethod
-    def paper_table_kwargs(cls) -> dict[str, Any]:
-        """Arguments with which the policy has as many parameters as in the paper's table."""
-
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         Act and estimate values.
@@ -291,11 +328,11 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
         :param deterministic: whether to take the most likely actions
         :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
         """
-        own = self.views.own(self._own(obs))
-        distribution = self._distribution(obs, own)
+        encoded = self._encoded(obs)
+        distribution = self._distribution(obs, encoded.own)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
-        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, own), log_prob
+        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, encoded), log_prob
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """
@@ -305,10 +342,10 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
         :param actions: (B, ...) actions
         :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
         """
-        self._warn_of_idle_rows(obs)
-        own = self.views.own(self._own(obs))
-        distribution = self._distribution(obs, own)
-        return self._values(obs, own), distribution.log_prob(actions), distribution.entropy()
+        self._check_minibatch(obs)
+        encoded = self._encoded(obs)
+        distribution = self._distribution(obs, encoded.own)
+        return self._values(obs, encoded), distribution.log_prob(actions), distribution.entropy()
 
     def get_distribution(self, obs: PyTorchObs) -> Distribution:
         """
@@ -316,7 +353,7 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
 
         :param obs: rows, or own observations alone (B, ...)
         """
-        return self._distribution(obs, self.views.own(self._own(obs)))
+        return self._distribution(obs, self.encode_own(obs))
 
 
 def _refuse(use_sde: bool, share_features_extractor: bool) -> None:

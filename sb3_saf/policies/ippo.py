@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, Final
+
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
 
 from sb3_saf.networks.critic import OwnValueHead
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.ippo_critic import OwnCritic
+from sb3_saf.policies.declaration import AlgorithmSpec, Declaration, PaperTable, team_policies
+from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.parts import NetworkSpec, TeamParts
+from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 
 
 @dataclass(frozen=True)
@@ -17,23 +22,38 @@ class IPPOParts(TeamParts):
     IPPO's actor and critic.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
+    :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts
     """
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead:
         """V_i from z_i."""
-        return OwnCritic(spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn, self.heads)
+        return OwnValueHead(spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn, self.heads)
 
 
 class IPPOPolicy(TeamActorCriticPolicy):
-    """
-    Policy of independent PPO for teams: ``PPO("IPPOPolicy", env)``.
-
-    It takes the arguments of :class:`TeamActorCriticPolicy` and, by keyword, those of :class:`IPPOParts`.
-    """
+    """Policy of independent PPO, ``PPO("IPPOPolicy", env)``; takes the fields of :class:`IPPOParts` by keyword."""
 
     parts_class: ClassVar[type[TeamParts]] = IPPOParts
 
-    @classmethod
-    def paper_table_kwargs(cls) -> dict[str, Any]:
-        """Arguments with which the parameter count is the paper's: one head per agent."""
-        return {"heads": "per_agent"}
+
+class IPPOLstmPolicy(TeamRecurrentPolicy):
+    """IPPO's parts for RecurrentPPO; takes the fields of :class:`IPPOParts` by keyword."""
+
+    parts_class: ClassVar[type[TeamParts]] = IPPOParts
+
+
+class IPPOMaskablePolicy(TeamMaskablePolicy):
+    """IPPO's parts for MaskablePPO; takes the fields of :class:`IPPOParts` by keyword."""
+
+    parts_class: ClassVar[type[TeamParts]] = IPPOParts
+
+
+DECLARATION: Final = Declaration(
+    "IPPO",
+    team_policies(IPPOPolicy, IPPOLstmPolicy, IPPOMaskablePolicy),
+    {
+        "ippo": AlgorithmSpec(PPO, "IPPOPolicy", "ippo"),
+        "ippo-lstm": AlgorithmSpec(RecurrentPPO, "IPPOLstmPolicy", "ippo-lstm"),
+    },
+    PaperTable({"heads": "per_agent"}, 1_740_016),
+)

@@ -2,16 +2,101 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
+import torch as th
 from gymnasium import spaces
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
+from torch import nn
 
 from sb3_saf.envs.teams import STATE_KEY
-from sb3_saf.networks.critic import JointStates, OwnValueHead, StateCritic, TeamCritic, TeamStates
+from sb3_saf.networks.critic import (
+    Heads,
+    JointStates,
+    JointValueHead,
+    OwnValueHead,
+    StateCritic,
+    TeamCritic,
+    TeamStates,
+)
+from sb3_saf.networks.gather import gather
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.mappo_critic import JointCritic, JointStateCritic
+from sb3_saf.policies.declaration import AlgorithmSpec, Declaration, PaperTable, team_policies
+from sb3_saf.policies.extractors import ObservationEncoder
+from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.parts import CriticInput, NetworkSpec, TeamParts, check_choice
+from sb3_saf.policies.recurrent import TeamRecurrentPolicy
+
+
+class JointCritic(TeamCritic):
+    """
+    V_i from the features of all agents side by side, [z_1, ..., z_N].
+
+    :param features_dim: d
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param heads: one head for all agents, or one for each
+    :param agent_identity: whether a shared head reads whose value is asked
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        n_agents: int,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        heads: Heads,
+        agent_identity: bool,
+    ):
+        super().__init__()
+        self.value_head = JointValueHead(features_dim, n_agents, hidden, activation_fn, heads, agent_identity)
+
+    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamCritic`; features of agents that take no part are read as zeros."""
+        members = gather(features, teams)
+        if active is not None:
+            members = members * active.unsqueeze(2)
+        values: th.Tensor = self.value_head(members)
+        return values
+
+
+class JointStateCritic(StateCritic):
+    """
+    V_i from the encoded state of the game.
+
+    :param state_space: space of the state
+    :param features_dim: size of the encoded state
+    :param n_agents: N
+    :param hidden: sizes of the hidden layers
+    :param activation_fn: activation of the hidden layers
+    :param heads: one head for all agents, or one for each
+    :param agent_identity: whether a shared head reads whose value is asked
+    """
+
+    def __init__(
+        self,
+        state_space: spaces.Space[Any],
+        features_dim: int,
+        n_agents: int,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        heads: Heads,
+        agent_identity: bool,
+    ):
+        super().__init__()
+        self.encoder = ObservationEncoder(state_space, features_dim)
+        self.value_head = JointValueHead(
+            features_dim, n_agents, hidden, activation_fn, heads, agent_identity, joint_dim=features_dim
+        )
+
+    def forward(self, states: th.Tensor) -> th.Tensor:
+        """See :class:`StateCritic`."""
+        values: th.Tensor = self.value_head(self.encoder(states))
+        return values
 
 
 @dataclass(frozen=True)
@@ -20,6 +105,7 @@ class MAPPOParts(TeamParts):
     MAPPO's actor and critic.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
+    :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts
     :param agent_identity: whether a shared critic on joint features reads, as a one-hot vector, whose value is asked;
         without it all agents of a team get the same value
     :param critic_input: whether the critic reads what the whole ``"team"`` sees, or the ``"state"`` of the game
@@ -75,15 +161,29 @@ def _required(state_space: spaces.Space[Any] | None) -> spaces.Space[Any]:
 
 
 class MAPPOPolicy(TeamActorCriticPolicy):
-    """
-    Policy of multi-agent PPO with a central critic: ``PPO("MAPPOPolicy", env)``.
-
-    It takes the arguments of :class:`TeamActorCriticPolicy` and, by keyword, those of :class:`MAPPOParts`.
-    """
+    """Policy of PPO with a central critic, ``PPO("MAPPOPolicy", env)``; takes the fields of :class:`MAPPOParts`."""
 
     parts_class: ClassVar[type[TeamParts]] = MAPPOParts
 
-    @classmethod
-    def paper_table_kwargs(cls) -> dict[str, Any]:
-        """Arguments with which the parameter count is the paper's: one head per agent."""
-        return {"heads": "per_agent"}
+
+class MAPPOLstmPolicy(TeamRecurrentPolicy):
+    """MAPPO's parts for RecurrentPPO; takes the fields of :class:`MAPPOParts` by keyword."""
+
+    parts_class: ClassVar[type[TeamParts]] = MAPPOParts
+
+
+class MAPPOMaskablePolicy(TeamMaskablePolicy):
+    """MAPPO's parts for MaskablePPO; takes the fields of :class:`MAPPOParts` by keyword."""
+
+    parts_class: ClassVar[type[TeamParts]] = MAPPOParts
+
+
+DECLARATION: Final = Declaration(
+    "MAPPO",
+    team_policies(MAPPOPolicy, MAPPOLstmPolicy, MAPPOMaskablePolicy),
+    {
+        "mappo": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo"),
+        "mappo-lstm": AlgorithmSpec(RecurrentPPO, "MAPPOLstmPolicy", "mappo-lstm"),
+    },
+    PaperTable({"heads": "per_agent"}, 2_477_296),
+)

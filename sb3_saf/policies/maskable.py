@@ -1,13 +1,12 @@
 """
-Policies for MaskablePPO: one mask of actions per row, that is, per agent.
+The base of policies for MaskablePPO: one mask of actions per row, that is, per agent.
 
-sb3-contrib asks the environment: ``venv.env_method("action_masks")`` gives one mask per row. The wrappers of this
-package pass the question on, and the SuperSuit bridge asks each game once. Letters: B rows, M choices.
+sb3-contrib asks the environment: ``venv.env_method("action_masks")`` gives one mask per row.
+
+Letters: B rows, M choices.
 """
 
 from __future__ import annotations
-
-from typing import ClassVar
 
 import numpy as np
 import torch as th
@@ -15,12 +14,8 @@ from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_saf.networks.views import OwnViews
+from sb3_saf.networks.row_encoder import EncodedRows
 from sb3_saf.policies.base import TeamPolicy
-from sb3_saf.policies.ippo import IPPOParts
-from sb3_saf.policies.mappo import MAPPOParts
-from sb3_saf.policies.parts import TeamParts
-from sb3_saf.policies.saf import SAFParts
 
 Masks = np.ndarray | th.Tensor
 
@@ -49,11 +44,11 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
         :param action_masks: (B, M); None allows everything
         :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
         """
-        own = self.views.own(self._own(obs))
-        distribution = self._masked_distribution(obs, own, action_masks)
+        encoded = self._encoded(obs)
+        distribution = self._masked_distribution(obs, encoded.own, action_masks)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
-        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, own), log_prob
+        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, encoded), log_prob
 
     def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: Masks | None = None
@@ -66,10 +61,10 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
         :param action_masks: (B, M); None allows everything
         :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
         """
-        self._warn_of_idle_rows(obs)
-        own = self.views.own(self._own(obs))
-        distribution = self._masked_distribution(obs, own, action_masks)
-        return self._values(obs, own), self._likelihood(distribution, actions), distribution.entropy()
+        self._check_minibatch(obs)
+        encoded = self._encoded(obs)
+        distribution = self._masked_distribution(obs, encoded.own, action_masks)
+        return self._values(obs, encoded), self._likelihood(distribution, actions), distribution.entropy()
 
     def get_distribution(  # type: ignore[override]
         self, obs: PyTorchObs, action_masks: Masks | None = None
@@ -80,28 +75,10 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
         :param obs: rows, or own observations alone (B, ...)
         :param action_masks: (B, M); None allows everything
         """
-        return self._masked_distribution(obs, self.views.own(self._own(obs)), action_masks)
+        return self._masked_distribution(obs, self.encode_own(obs), action_masks)
 
-    def _masked_distribution(self, obs: PyTorchObs, own: OwnViews, action_masks: Masks | None) -> Distribution:
+    def _masked_distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None) -> Distribution:
         if action_masks is None:
             return self._distribution(obs, own)
-        masks = th.as_tensor(action_masks, dtype=th.bool, device=own.rows.device)
-        return self._distribution(obs, own, masks.reshape(len(own.rows), -1))
-
-
-class IPPOMaskablePolicy(TeamMaskablePolicy):
-    """IPPO's parts for MaskablePPO; takes the fields of :class:`IPPOParts`, too."""
-
-    parts_class: ClassVar[type[TeamParts]] = IPPOParts
-
-
-class MAPPOMaskablePolicy(TeamMaskablePolicy):
-    """MAPPO's parts for MaskablePPO; takes the fields of :class:`MAPPOParts`, too."""
-
-    parts_class: ClassVar[type[TeamParts]] = MAPPOParts
-
-
-class SAFMaskablePolicy(TeamMaskablePolicy):
-    """SAF's parts for MaskablePPO; takes the fields of :class:`SAFParts`, too."""
-
-    parts_class: ClassVar[type[TeamParts]] = SAFParts
+        masks = th.as_tensor(action_masks, dtype=th.bool, device=own.inverse.device)
+        return self._distribution(obs, own, masks.reshape(len(own.inverse), -1))

@@ -51,22 +51,31 @@ class TeamParts(ABC):
     Base of all parts: the actor that MAPPO and IPPO share.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
+    :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts: for teams whose agents have
+        roles that their observations do not tell
     """
 
     heads: Heads = "shared"
+    actor_identity: bool = False
 
     def __post_init__(self) -> None:
         check_choice("heads", self.heads, get_args(Heads))
 
+    def n_identities(self, spec: NetworkSpec) -> int:
+        """Return N if a shared actor reads who acts, else 0."""
+        return spec.n_agents if self.actor_identity else 0
+
     def actor(self, spec: NetworkSpec) -> ActorNetwork:
-        """Make the actor."""
+        """Make the actor; with one for each agent there is nothing to tell them."""
+        per_agent = self.heads == "per_agent"
         return SinglePolicy(
             spec.features_dim,
             spec.action_space,
             spec.actor_hidden,
             spec.activation_fn,
             spec.log_std_init,
-            n_agents=spec.n_agents if self.heads == "per_agent" else None,
+            n_agents=spec.n_agents if per_agent else None,
+            n_identities=0 if per_agent else self.n_identities(spec),
         )
 
     @abstractmethod
@@ -74,7 +83,7 @@ class TeamParts(ABC):
         """Make the critic."""
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """Make what the critic knows of each agent before it judges; None if it is the features of its own view."""
+        """Make what a critic with memory reads of each agent; None for the features of its own observation."""
         return None
 
 

@@ -1,5 +1,5 @@
 """
-Policies for RecurrentPPO: actors and critics that remember (the paper's policies condition on histories).
+The base of policies for RecurrentPPO: actors and critics that remember (the paper's policies condition on histories).
 
 Letters: B rows (sequences one after another, padded by sb3-contrib to one length), N agents, S size of a critic's
 state, H size of the LSTMs' output.
@@ -8,7 +8,7 @@ state, H size of the LSTMs' output.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -20,14 +20,10 @@ from torch import nn
 
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
-from sb3_saf.networks.gather import gather, gather_agents
-from sb3_saf.networks.views import OwnViews
-from sb3_saf.policies.base import NetArch, TeamPolicy
+from sb3_saf.networks.row_encoder import EncodedRows
+from sb3_saf.policies.base import Encoded, NetArch, TeamPolicy
 from sb3_saf.policies.distributions import actor_distribution
-from sb3_saf.policies.ippo import IPPOParts
-from sb3_saf.policies.mappo import MAPPOParts
-from sb3_saf.policies.parts import TeamParts, check_at_least_one
-from sb3_saf.policies.saf import SAFParts
+from sb3_saf.policies.parts import check_at_least_one
 
 LstmStates = tuple[th.Tensor, ...]
 
@@ -36,7 +32,7 @@ class RecurrentCritic(nn.Module):
     """
     An LSTM over what the critic knows of the row's agent at each step, then a value head.
 
-    :param team_states: makes the LSTM's input, (B, S) of the rows' agents; None for the features of their own views
+    :param team_states: makes the LSTM's input, (B, S) of the rows' agents; None for the features of what they see
     :param lstm: S to H
     :param head: H to values
     """
@@ -60,7 +56,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     makes of it at each step. For SAF that is s_i^SAF, so the knowledge source comes first and memory second; for MAPPO
     [z_1, ..., z_N] and whose value is asked; for IPPO z_i. A value head on the LSTM's output follows.
 
-    Distinct views and teams are encoded once, as in other team policies; from the LSTMs on, every row counts.
+    Equal observations are encoded once, as in other team policies; from the LSTMs on, every row counts.
 
     Takes the arguments of :class:`TeamPolicy` and, by keyword, the fields of its parts.
 
@@ -106,13 +102,13 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
             net_arch,
             lstm_hidden_size=lstm_hidden_size,
             n_lstm_layers=n_lstm_layers,
-            # Of sb3-contrib's three ways, the one that makes no network for its critic: ours comes below.
+            # sb3-contrib makes no network for the critic of a shared LSTM: ours comes below.
             shared_lstm=True,
             enable_critic_lstm=False,
             lstm_kwargs=dict(lstm_kwargs or {}),
             **kwargs,
         )
-        self.shared_lstm, self.enable_critic_lstm = False, enable_critic_lstm
+        self.critic_remembers = enable_critic_lstm
         self._build_critic(lr_schedule)
 
     # --- construction -----------------------------------------------------------------------------------------------
@@ -125,7 +121,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         return self.parts.actor(self._network_spec()._replace(features_dim=self.lstm_output_dim))
 
     def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic | RecurrentCritic:  # type: ignore[override]
-        if not self.enable_critic_lstm:
+        if not self.critic_remembers:
             return super()._make_critic()
         spec = self._network_spec()
         team_states = self.parts.team_states(spec)
@@ -143,7 +139,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         return super()._get_constructor_parameters() | {
             "lstm_hidden_size": self.lstm_actor.hidden_size,
             "n_lstm_layers": self.lstm_actor.num_layers,
-            "enable_critic_lstm": self.enable_critic_lstm,
+            "enable_critic_lstm": self.critic_remembers,
             "lstm_kwargs": self.lstm_kwargs,
         }
 
@@ -161,9 +157,9 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         :param deterministic: whether to take the most likely actions
         :return: actions (B, ...), values (B, 1), log-likelihoods (B,) and the next states
         """
-        own = self.views.own(self._own(obs))
-        distribution, actor_states = self._recall_distribution(obs, own, lstm_states.pi, episode_starts)
-        values, critic_states = self._recall_values(obs, own, lstm_states.vf, episode_starts)
+        encoded = self._encoded(obs)
+        distribution, actor_states = self._recall_distribution(obs, encoded.own, lstm_states.pi, episode_starts)
+        values, critic_states = self._recall_values(obs, encoded, lstm_states.vf, episode_starts)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
         actions = actions.reshape((-1, *(self.action_space.shape or ())))
@@ -181,10 +177,10 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         :param episode_starts: (B,)
         :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
         """
-        self._warn_of_idle_rows(obs)
-        own = self.views.own(self._own(obs))
-        distribution, _ = self._recall_distribution(obs, own, lstm_states.pi, episode_starts)
-        values, _ = self._recall_values(obs, own, lstm_states.vf, episode_starts)
+        self._check_minibatch(obs)
+        encoded = self._encoded(obs)
+        distribution, _ = self._recall_distribution(obs, encoded.own, lstm_states.pi, episode_starts)
+        values, _ = self._recall_values(obs, encoded, lstm_states.vf, episode_starts)
         return values, self._likelihood(distribution, actions), distribution.entropy()
 
     def get_distribution(  # type: ignore[override]
@@ -198,7 +194,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         :param episode_starts: (B,)
         :return: distribution and the actor's next states
         """
-        return self._recall_distribution(obs, self.views.own(self._own(obs)), lstm_states, episode_starts)
+        return self._recall_distribution(obs, self.encode_own(obs), lstm_states, episode_starts)
 
     def predict_values(  # type: ignore[override]
         self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
@@ -211,11 +207,11 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         :param episode_starts: (B,)
         :return: (B, 1)
         """
-        return self._recall_values(obs, None, lstm_states, episode_starts)[0]
+        return self._recall_values(obs, self._encoded(obs), lstm_states, episode_starts)[0]
 
     def remember(self, features: th.Tensor, lstm_states: LstmStates) -> tuple[th.Tensor, LstmStates]:
         """
-        One step of the actor's LSTM, in the midst of an episode.
+        Take one step of the actor's LSTM within an episode.
 
         :param features: (B, d) of own observations
         :param lstm_states: of the actor, (layers, B, H) each
@@ -225,10 +221,17 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
 
     # --- memory -----------------------------------------------------------------------------------------------------
 
+    @property
+    def _critic_reads_teams(self) -> bool:
+        critic = self.value_net
+        if isinstance(critic, RecurrentCritic):
+            return critic.team_states is not None
+        return super()._critic_reads_teams
+
     def _recall_distribution(
-        self, obs: PyTorchObs, own: OwnViews, lstm_states: LstmStates, episode_starts: th.Tensor
+        self, obs: PyTorchObs, own: EncodedRows, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> tuple[Distribution, LstmStates]:
-        latent, states = self._process(gather(own.features, own.rows), lstm_states, episode_starts, self.lstm_actor)
+        latent, states = self._process(own.of_rows(), lstm_states, episode_starts, self.lstm_actor)
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs, padded=True)
         if masks is None:
@@ -237,24 +240,14 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         return actor_distribution(self.actor, self.action_space, unmixed, masks), states
 
     def _recall_values(
-        self, obs: PyTorchObs, own: OwnViews | None, lstm_states: LstmStates, episode_starts: th.Tensor
+        self, obs: PyTorchObs, encoded: Encoded, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> tuple[th.Tensor, LstmStates]:
         critic = self.value_net
         if not isinstance(critic, RecurrentCritic):
-            return self._values(obs, own), lstm_states
-        latent, states = self._process(self._critic_inputs(critic, obs, own), lstm_states, episode_starts, critic.lstm)
+            return self._values(obs, encoded), lstm_states
+        latent, states = self._process(_critic_inputs(critic, encoded), lstm_states, episode_starts, critic.lstm)
         agent = self._agent(obs) if critic.head.reads_agent else None
         return self._raw_values(obs, critic.head(latent, agent)), states
-
-    def _critic_inputs(self, critic: RecurrentCritic, obs: PyTorchObs, own: OwnViews | None) -> th.Tensor:
-        """(B, S)"""
-        if critic.team_states is None:
-            own = self.views.own(self._own(obs)) if own is None else own
-            return gather(own.features, own.rows)
-        views = self.views.teams(self._team(obs), own, self._active(obs))
-        return gather_agents(
-            critic.team_states.states(views.features, views.teams, views.active), views.rows, self._agent(obs)
-        )
 
     def _process(
         self, inputs: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor, lstm: nn.LSTM
@@ -264,19 +257,10 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         return outputs, states  # type: ignore[return-value]  # sb3-contrib's annotation says one tensor
 
 
-class IPPOLstmPolicy(TeamRecurrentPolicy):
-    """IPPO's parts for RecurrentPPO; takes the fields of :class:`IPPOParts`, too."""
-
-    parts_class: ClassVar[type[TeamParts]] = IPPOParts
-
-
-class MAPPOLstmPolicy(TeamRecurrentPolicy):
-    """MAPPO's parts for RecurrentPPO; takes the fields of :class:`MAPPOParts`, too."""
-
-    parts_class: ClassVar[type[TeamParts]] = MAPPOParts
-
-
-class SAFLstmPolicy(TeamRecurrentPolicy):
-    """SAF's parts for RecurrentPPO; takes the fields of :class:`SAFParts`, too."""
-
-    parts_class: ClassVar[type[TeamParts]] = SAFParts
+def _critic_inputs(critic: RecurrentCritic, encoded: Encoded) -> th.Tensor:
+    """(B, S) inputs of the critic's LSTM."""
+    teams = encoded.teams
+    if critic.team_states is None:
+        return encoded.own.of_rows()
+    assert teams is not None
+    return teams.of_rows(critic.team_states.states(teams.features, teams.members, teams.active))

@@ -1,4 +1,4 @@
-"""How policies read rows that carry their team's joint view. Letters: B rows, N agents, K views, A actions."""
+"""How policies read rows of teams. Letters: B rows, N agents, K unique own observations, A actions, d features."""
 
 from __future__ import annotations
 
@@ -13,38 +13,26 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_saf.envs.teams import (
-    ACTION_MASK_KEY,
-    ACTIVE_KEY,
-    AGENT_KEY,
-    OBS_KEY,
-    TEAM_KEY,
-    TeamSpaces,
-)
-from sb3_saf.networks.gather import gather
-from sb3_saf.networks.views import ViewEncoder
+from sb3_saf.buffers.minibatch import TeamMinibatch
+from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, ALL_KEYS, OBS_KEY, TEAM_KEY, TeamSpaces
+from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.policies.parts import check_at_least_one
-
-#: For those who pass what a PettingZoo environment gives.
-_HOW_TO_STACK: Final = (
-    ". Of observations by agent, as a ParallelEnv gives them, pass one agent's, model.predict(observations[{0!r}]), or "
-    "stack them, model.predict(np.stack(list(observations.values()))): row i of the actions is then that of the i-th "
-    "agent. sb3_saf.export_actors gives each agent an actor of its own"
-)
 
 #: How PettingZoo's environments give masks.
 _CLASSIC: Final = {"observation", ACTION_MASK_KEY}
 
+Observation = np.ndarray | Mapping[str, Any]
+
 
 class TeamRowsPolicy(BasePolicy):
     """
-    Base of everything that acts on rows of teams: it knows their parts, and encodes each distinct view once.
+    Base of everything that acts on rows of teams: it reads their entries and encodes them.
 
     Subclasses call :meth:`_read_rows_of` before they call SB3's constructor.
     """
 
     team_spaces: TeamSpaces
-    views: ViewEncoder
+    row_encoder: RowEncoder
     encode_once: bool
     chunk_size: int | None
 
@@ -61,8 +49,8 @@ class TeamRowsPolicy(BasePolicy):
         :param observation_space: Dict of ``obs``, ``team``, ``agent``, and perhaps ``active``, ``action_mask``,
             ``state``
         :param action_space: one agent's action space
-        :param encode_once: False encodes every row, which gives the same numbers slowly
-        :param chunk_size: views encoded at once on the CPU, few enough for the cache; None for all
+        :param encode_once: whether equal observations of a batch are encoded once
+        :param chunk_size: observations encoded at once on the CPU, few enough for the cache; None for all
         :raises ValueError: if the space is not that of a team
         """
         if chunk_size is not None:
@@ -71,7 +59,7 @@ class TeamRowsPolicy(BasePolicy):
         _check_masks(self.team_spaces, action_space)
         self.chunk_size = chunk_size
         self.encode_once = encode_once
-        self.views = ViewEncoder(self._encode, encode_once)
+        self.row_encoder = RowEncoder(self._encode, encode_once)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Make the encoder, for the observations of one agent."""
@@ -87,10 +75,50 @@ class TeamRowsPolicy(BasePolicy):
         """
         if features_extractor is not None and features_extractor is not self.features_extractor:
             raise ValueError("a team policy encodes with its own features_extractor; call the other extractor directly")
-        own = self.views.own(self._own(obs))
-        return gather(own.features, own.rows)
+        return self.encode_own(obs).of_rows()
 
-    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+    # --- what users pass to predict ---------------------------------------------------------------------------------
+
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+        """
+        Act, as SB3's ``predict``; also on the observations of a PettingZoo environment.
+
+        :param observation: rows, some of their entries, own observations alone, or ``{agent: observation}`` as a
+            ParallelEnv gives them. Where an actor reads who acts, these must be all agents in index order
+        :param args: state, episode_start, deterministic as in SB3
+        :param kwargs: the same, and ``action_masks`` of MaskablePPO
+        :return: actions and the next state; ``{agent: action}`` for ``{agent: observation}``
+        """
+        if not self._is_by_agent(observation):
+            return super().predict(observation, *args, **kwargs)
+        rows = self._stacked(observation)
+        actions, state = super().predict(rows, *args, **kwargs)
+        return dict(zip(observation, actions, strict=True)), state
+
+    def _is_by_agent(self, observation: object) -> bool:
+        return isinstance(observation, Mapping) and bool(observation) and not (set(observation) & (ALL_KEYS | _CLASSIC))
+
+    def _stacked(self, observations: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Make rows of observations by agent."""
+        n_agents, first = self.team_spaces.n_agents, next(iter(observations.values()))
+        if len(observations) > n_agents:
+            raise ValueError(f"expected observations of at most {n_agents} agents, got {len(observations)}")
+        if isinstance(first, Mapping):
+            entries = [self._renamed(one) for one in observations.values()]
+            rows = {key: np.stack([np.asarray(entry[key]) for entry in entries]) for key in entries[0]}
+        else:
+            rows = {OBS_KEY: np.stack([np.asarray(one) for one in observations.values()])}
+        if len(observations) == n_agents:
+            rows.setdefault(AGENT_KEY, np.arange(n_agents))
+        return rows
+
+    def _renamed(self, entries: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Give PettingZoo's entries the names of ours."""
+        if set(entries) != _CLASSIC or self.team_spaces.action_mask is None:
+            return entries
+        return {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
+
+    def obs_to_tensor(self, observation: Observation) -> tuple[PyTorchObs, bool]:
         """
         Make tensors of NumPy observations.
 
@@ -98,16 +126,11 @@ class TeamRowsPolicy(BasePolicy):
             there are masks, also in PettingZoo's form {"observation", "action_mask"}
         :return: dict of tensors with a batch axis, and whether the observation was a batch
         """
-        entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
-        if set(entries) == _CLASSIC and self.team_spaces.action_mask is not None:
-            entries = {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
+        entries = self._renamed(observation if isinstance(observation, Mapping) else {OBS_KEY: observation})
         keys = self.team_spaces.keys
         unknown = [key for key in entries if key not in keys]
         if unknown:
-            hint = _HOW_TO_STACK.format(unknown[0]) if len(unknown) == len(entries) else ""
-            raise ValueError(
-                f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}{hint}"
-            )
+            raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
         arrays = {key: np.asarray(value) for key, value in entries.items()}
         if AGENT_KEY in arrays:
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
@@ -118,7 +141,14 @@ class TeamRowsPolicy(BasePolicy):
             raise ValueError(f"expected as many rows under each key of an observation, got {lengths}")
         return tensors, is_batch
 
-    # --- reading rows -----------------------------------------------------------------------------------------------
+    def _checked_agent(self, agent: np.ndarray) -> np.ndarray:
+        n_agents = self.team_spaces.n_agents
+        agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
+        if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
+            raise ValueError(f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}")
+        return agent
+
+    # --- entries of rows --------------------------------------------------------------------------------------------
 
     def _own(self, obs: PyTorchObs) -> th.Tensor:
         """(B, *shape) own observations."""
@@ -139,6 +169,11 @@ class TeamRowsPolicy(BasePolicy):
             return None
         return entry_of(obs, ACTIVE_KEY, "the critic").reshape(-1, self.team_spaces.n_agents) != 0
 
+    def _takes_part(self, obs: PyTorchObs) -> th.Tensor | None:
+        """(B, 1) bool, whether the rows' own agents take part; None if all always do."""
+        active = self._active(obs)
+        return None if active is None else active.gather(1, self._agent(obs).unsqueeze(1))
+
     def _action_mask(self, obs: PyTorchObs, padded: bool = False) -> th.Tensor | None:
         """(B, A) bool, the rows' legal actions; None if all always are. Only rows of a padding may have none."""
         if self.team_spaces.action_mask is None:
@@ -158,12 +193,53 @@ class TeamRowsPolicy(BasePolicy):
             )
         return mask
 
-    def _checked_agent(self, agent: np.ndarray) -> np.ndarray:
+    # --- encoding ---------------------------------------------------------------------------------------------------
+
+    def encode_own(self, obs: PyTorchObs) -> EncodedRows:
+        """
+        Encode the rows' own observations.
+
+        :param obs: rows, or own observations alone
+        """
+        return self.row_encoder.rows(self._own(obs))
+
+    def encode_teams(self, obs: PyTorchObs) -> tuple[EncodedRows, EncodedTeams]:
+        """
+        Encode the rows' own observations and those of their teams.
+
+        Whole teams need no search: those of TeamRolloutBuffer's minibatches, and the rows of a step. The rows of SB3's
+        shuffled minibatches find their teams by the joint observation.
+
+        :param obs: rows
+        """
+        if isinstance(obs, TeamMinibatch):
+            observations, rows, active = obs.teams
+            members = self.row_encoder.rows(observations.flatten(0, 1))
+            own = members if rows is None else members.at(rows)
+            return own, EncodedTeams(members.features, members.inverse.view(observations.shape[:2]), rows, active)
+        own, active = self.encode_own(obs), self._active(obs)
+        if not self._are_whole_teams(obs):
+            return own, self.row_encoder.joint_rows(self._team(obs), self._agent(obs), own, active)
         n_agents = self.team_spaces.n_agents
-        agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
-        if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
-            raise ValueError(f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}")
-        return agent
+        members_of_teams = own.inverse.view(-1, n_agents)
+        return own, EncodedTeams(own.features, members_of_teams, None, None if active is None else active[::n_agents])
+
+    def _are_whole_teams(self, obs: PyTorchObs) -> bool:
+        """Whether rows are those of whole teams, agents in index order: as in a step of all games."""
+        n_agents, team, agent, own = self.team_spaces.n_agents, self._team(obs), self._agent(obs), self._own(obs)
+        if len(agent) % n_agents or team.requires_grad or own.dtype != team.dtype:
+            return False
+        n_teams, shape = len(agent) // n_agents, self.team_spaces.own_shape
+        in_order = th.arange(n_agents, device=agent.device).expand(n_teams, -1)
+        if not th.equal(agent.view(n_teams, n_agents), in_order):
+            return False
+        active = self._active(obs)
+        if active is not None:
+            by_team = active.view(n_teams, n_agents, n_agents)
+            if not th.equal(by_team, by_team[:, :1].expand_as(by_team)):
+                return False
+        by_team = team.view(n_teams, n_agents, n_agents, *shape)
+        return th.equal(by_team, own.view(n_teams, 1, n_agents, *shape).expand_as(by_team))
 
     def _encode(self, observations: th.Tensor) -> th.Tensor:
         """(K, d) features of own observations (K, *shape)."""
@@ -172,7 +248,7 @@ class TeamRowsPolicy(BasePolicy):
     def _in_chunks(
         self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
     ) -> th.Tensor:
-        """(K, ...) what a module makes of preprocessed observations (K, *shape)."""
+        """(K, ...) outputs of a module for preprocessed observations (K, *shape)."""
         on_cpu = observations.device.type == "cpu"
         parts = th.split(observations, self.chunk_size if self.chunk_size and on_cpu else max(1, len(observations)))
         results = [module(preprocess_obs(part, space, self.normalize_images)) for part in parts]
@@ -189,8 +265,8 @@ def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:
 
 
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
-    """A part of rows, or the complaint that ``reader`` cannot do without it."""
-    if isinstance(obs, th.Tensor) or key not in obs:
+    """Return an entry of rows, or raise the error that ``reader`` needs it."""
+    if isinstance(obs, th.Tensor) or (key not in obs and not isinstance(obs, TeamMinibatch)):
         raise ValueError(
             f"expected the observation to have {key!r}, which {reader} reads, got "
             f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs))}; pass whole rows of "
@@ -200,5 +276,5 @@ def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
 
 
 def pop_named(kwargs: dict[str, Any], names: set[str]) -> dict[str, Any]:
-    """Take named entries out of ``kwargs``."""
+    """Remove named entries from ``kwargs`` and return them."""
     return {name: kwargs.pop(name) for name in list(kwargs) if name in names}

@@ -72,7 +72,7 @@ class _Views(NamedTuple):
         """Find the distinct observations of a batch."""
         shape = samples.now.own.shape[:2]
         both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
-        found: UniqueRows = policy.views.find(both)
+        found: UniqueRows = policy.row_encoder.find(both)
         now, after = found.inverse.view(2, *shape)
         return cls(both[found.index], now, after, int(now.max()) + 1)
 

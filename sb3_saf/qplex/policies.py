@@ -173,7 +173,7 @@ class QPLEXPolicy(TeamRowsPolicy):
     def encode_states(self, encoder: nn.Module, states: th.Tensor) -> th.Tensor:
         """(G, d) features of states (G, *state), each distinct one encoded once."""
         assert self.team_spaces.state is not None
-        found = self.views.find(states)
+        found = self.row_encoder.find(states)
         return gather(self._in_chunks(encoder, states[found.index], self.team_spaces.state), found.inverse)
 
     # --- acting -----------------------------------------------------------------------------------------------------
@@ -185,9 +185,9 @@ class QPLEXPolicy(TeamRowsPolicy):
         :param obs: rows, or own observations alone
         :return: (B, A)
         """
-        own = self.views.own(self._own(obs))
+        own = self.encode_own(obs)
         agent = self._agent(obs) if self.actor.reads_agent else None
-        values = self.views.per_agent(partial(q_values, self.actor), own, agent)
+        values = self.row_encoder.apply(partial(q_values, self.actor), own, agent)
         masks = self._action_mask(obs)
         return values if masks is None else values.masked_fill(~masks, -th.inf)
 
@@ -228,8 +228,8 @@ class QPLEXPolicy(TeamRowsPolicy):
     def _recall_and_act(
         self, memory: AgentMemory, obs: PyTorchObs, state: State | None, episode_start: np.ndarray | None
     ) -> tuple[np.ndarray, State]:
-        own = self.views.own(self._own(obs))
-        features = gather(own.features, own.rows)
+        own = self.encode_own(obs)
+        features = own.of_rows()
         last = th.full((len(features),), -1, dtype=th.long, device=features.device)
         remembered = memory.empty(len(features), features)
         if state is not None:

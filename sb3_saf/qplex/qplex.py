@@ -26,6 +26,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -243,6 +244,11 @@ class QPLEX(OffPolicyAlgorithm):
         """Count the multiples of ``interval`` game steps that the last step of all games has reached."""
         steps = self._game_steps()
         return steps // interval - (steps - self.n_games) // interval
+
+    def dump_logs(self) -> None:
+        """Write log data, game steps among them."""
+        self.logger.record(GAME_STEPS_TAG, self._game_steps())
+        super().dump_logs()
 
     # --- playing ----------------------------------------------------------------------------------------------------
 

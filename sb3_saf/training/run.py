@@ -20,6 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.finite import FiniteCallback
+from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback
@@ -171,7 +172,7 @@ class Training:
             arguments["log_interval"] = options.log_interval or None
         checkpoint_freq = self._every(options.checkpoint_freq, CHECKPOINTS_PER_RUN)
         if self.folder is None or checkpoint_freq == 0:
-            self.model.learn(total, [FiniteCallback(), *self.callbacks], **arguments)
+            self.model.learn(total, [FiniteCallback(), GameStepsCallback(), *self.callbacks], **arguments)
             return
         resumable_learn(
             self.model,
