@@ -23,6 +23,7 @@ from torch import nn
 
 from sb3_saf import (
     CentralizedValueWrapper,
+    GameStepsCallback,
     InspectionCallback,
     TeamMonitor,
     TeamRolloutBuffer,
@@ -82,7 +83,8 @@ def learn(
         policy_kwargs=sizes | policy_kwargs,
         **extra,
     )
-    return model.learn(5 * env.num_envs * n_updates, callback=callback)
+    callbacks = [GameStepsCallback()] if callback is None else [GameStepsCallback(), callback]
+    return model.learn(5 * env.num_envs * n_updates, callback=callbacks)
 
 
 def level_games() -> CentralizedValueWrapper:
