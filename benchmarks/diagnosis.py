@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_saf
 from hecogrid_envs.constants import Command
-from hecogrid_envs.params import TaskName, check_task
+from hecogrid_envs.task import TaskName, check_task
 from sb3_saf.experiments.cells import Cell
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.results import Results

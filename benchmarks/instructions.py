@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds
-from hecogrid_envs.core.sharing import RESET
+from hecogrid_envs.core.types import RESET
 
 RECORD: Final = Path(__file__).parent / "instructions.json"
 #: How much more than recorded is a failure: releases of Python differ by some instructions per call.
@@ -109,8 +109,8 @@ def _play_step(
 
 def _draw_levels(batch: GameBatch) -> None:
     """New levels without what :meth:`GameBatch.reset` does in Python."""
-    batch._fresh[...] = True
-    batch._shares.play(RESET)
+    batch._buffers.fresh[...] = True
+    batch._play_all(RESET)
 
 
 def _play() -> None:

@@ -1,5 +1,5 @@
 """
-HECOGrid: three cooperative gridworlds with dials for coordination and heterogeneity (arXiv 2210.03022).
+HECOGrid: cooperative gridworlds with dials for coordination and heterogeneity (arXiv 2210.03022).
 
 PettingZoo environments (:func:`parallel_env`, :func:`env`) and Stable-Baselines3 vector environments
 (:func:`make_vec_env`). Importing this package imports neither torch nor Stable-Baselines3.
@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from hecogrid_envs.batch import GameBatch
 from hecogrid_envs.parallel_env import HECOGridEnv
-from hecogrid_envs.params import TASK_NAMES, HECOGridParams
+from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.registry import env, parallel_env, register_with_pettingzoo
 from hecogrid_envs.seeding import game_seeds
 from hecogrid_envs.state import StateMapping
-from hecogrid_envs.tasks import TASKS, KeyForTreasureEnv, TeamSupportEnv, TeamTogetherEnv
+from hecogrid_envs.tasks import TASKS
+from hecogrid_envs.tasks.key_for_treasure import KeyForTreasureEnv
+from hecogrid_envs.tasks.team_support import TeamSupportEnv
+from hecogrid_envs.tasks.team_together import TeamTogetherEnv
 from hecogrid_envs.tiles import TileSpace, tile_atlas
 
 if TYPE_CHECKING:
@@ -39,6 +42,9 @@ __all__ = [
     "parallel_env",
     "tile_atlas",
 ]
+
+#: Names of all tasks.
+TASK_NAMES = tuple(TASKS)
 
 register_with_pettingzoo()
 

@@ -1,4 +1,4 @@
-"""The arrays of a batch at its start: the rule book, and games that have not begun."""
+"""The arrays of a batch at its start: what its games share, and games that have not begun."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain
 from hecogrid_envs.core.occupancy import plane_offset
-from hecogrid_envs.core.types import Games, RuleBook
-from hecogrid_envs.params import TASK_NAMES, HECOGridParams, TaskName
-from hecogrid_envs.tiles import FIRST_TERRAIN
+from hecogrid_envs.core.types import Games, World
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams
+from hecogrid_envs.task import DECLARED, TaskName
+from hecogrid_envs.tiles import FIRST_TERRAIN, turned_atlases
 
 #: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
 SLACK: Final = 64
@@ -42,9 +43,9 @@ def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) 
     return array
 
 
-def rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
+def world_of(task: TaskName, params: HECOGridParams) -> World:
     """
-    What all games of a batch share.
+    Return what all games of a batch share.
 
     :param task: of all games
     :param params: of all games
@@ -55,9 +56,10 @@ def rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
     zone_of_column = params.zone_of_column()
     n_zones = int(zone_of_column.max()) + 1
     released = params.rules == "released"
+    atlases = turned_atlases(task, params.rules, params.view_tile_size)
     spread = [sum(0xFF << (8 * i) for i in range(8) if bits >> i & 1) for bits in range(256)]
-    book = RuleBook(
-        task=TASK_NAMES.index(task),
+    world = World(
+        condition=list(DECLARED).index(task),
         released=released,
         random_order=params.agent_order == "random",
         n_agents=params.n_agents,
@@ -66,7 +68,7 @@ def rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
         support_radius=params.support_radius,
         n_treasures=params.n_treasures,
         n_clutter=params.n_clutter,
-        n_keys=params.n_keys if task == "KeyForTreasure" else 0,
+        n_keys=params.n_keys if DECLARED[task].has_keys else 0,
         max_cycles=params.max_cycles,
         view_size=view,
         view_offset=offset,
@@ -83,12 +85,15 @@ def rule_book(task: TaskName, params: HECOGridParams) -> RuleBook:
         blank_bits=np.zeros(0, dtype=np.uint8),
         spread=np.array(spread, dtype=np.uint64),
         swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
+        tile=params.view_tile_size,
+        atlas=np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)]),
+        turn_bytes=0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size,
     )
-    return _with_blank_map(book)
+    return _with_blank_map(world)
 
 
 def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
-    """The table that :class:`~hecogrid_envs.core.types.RuleBook` calls ``swept``."""
+    """Return the table that :class:`~hecogrid_envs.core.types.World` calls ``swept``."""
     cells, own = 1 << size, size // 2
     clear, seen = np.divmod(np.arange(cells * cells), cells)
     following = np.zeros_like(seen)
@@ -99,27 +104,27 @@ def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
     return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
 
 
-def _with_blank_map(book: RuleBook) -> RuleBook:
+def _with_blank_map(world: World) -> World:
     """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
-    planes = np.full((4, book.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
-    bits = np.zeros((4, book.bits_bytes), dtype=np.uint8)
-    outer = np.ones((book.width, book.width), dtype=bool)
+    planes = np.full((4, world.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
+    bits = np.zeros((4, world.bits_bytes), dtype=np.uint8)
+    outer = np.ones((world.width, world.width), dtype=bool)
     outer[1:-1, 1:-1] = False
     x, y = np.nonzero(outer)
     for facing in range(4):
-        cells = plane_offset.py_func(book, facing, x, y)  # type: ignore[attr-defined]
+        cells: npt.NDArray[Any] = plane_offset(world, facing, x, y)  # type: ignore[arg-type, assignment] # of all at once
         planes[facing, cells] = FIRST_TERRAIN + Terrain.WALL
         np.bitwise_or.at(bits[facing], cells >> 3, np.uint8(1) << (cells & 7).astype(np.uint8))
-    return book._replace(blank_planes=planes.reshape(-1), blank_bits=bits.reshape(-1))
+    return world._replace(blank_planes=planes.reshape(-1), blank_bits=bits.reshape(-1))
 
 
-def empty_games(book: RuleBook, n_games: int) -> Games:
+def empty_games(world: World, n_games: int) -> Games:
     """
-    Games that have not begun.
+    Return games that have not begun.
 
     :param n_games: E
     """
-    agents, cells = (n_games, book.n_agents), (n_games, book.width * book.width)
+    agents, cells = (n_games, world.n_agents), (n_games, world.width * world.width)
     games = Games(
         rng=aligned(n_games, np.uint64),
         terrain=aligned(cells, np.uint8),
@@ -134,14 +139,14 @@ def empty_games(book: RuleBook, n_games: int) -> Games:
         has_key=aligned(agents, np.uint8),
         colour=aligned(agents, np.uint8),
         order=aligned(agents, np.int32),
-        sight=aligned(n_games * book.n_agents * book.view_size, np.uint64),
+        sight=aligned(n_games * world.n_agents * world.view_size, np.uint64),
         sight_known=aligned(agents, np.uint8),
-        planes=aligned(n_games * 4 * book.plane_bytes, np.uint8),
-        wall_bits=aligned(n_games * 4 * book.bits_bytes, np.uint8),
+        planes=aligned(n_games * 4 * world.plane_bytes, np.uint8),
+        wall_bits=aligned(n_games * 4 * world.bits_bytes, np.uint8),
         steps=aligned(n_games, np.int32),
         collected=aligned(n_games, np.int32),
-        paid=aligned(n_games, np.int32),
+        collected_now=aligned(n_games, np.int32),
     )
-    games.order[...] = np.arange(book.n_agents)
-    games.planes.reshape(n_games, -1)[...] = book.blank_planes  # the outer wall and what lies beyond it stay
+    games.order[...] = np.arange(world.n_agents)
+    games.planes.reshape(n_games, -1)[...] = world.blank_planes  # the outer wall and what lies beyond it stay
     return games

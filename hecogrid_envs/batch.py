@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from itertools import pairwise
+from threading import Timer
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import typeof
 
-from hecogrid_envs.arrays import SLACK, aligned, empty_games, rule_book
-from hecogrid_envs.constants import Terrain, TreasureState
-from hecogrid_envs.core.generation import begin
-from hecogrid_envs.core.sharing import PICTURES, RESET, RESTART, STEP, TILES, Workspace
+from hecogrid_envs.arrays import aligned, empty_games, world_of
+from hecogrid_envs.constants import N_ACTIONS, Terrain, TreasureState
+from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers
 from hecogrid_envs.fields_of_view import seen_cells
-from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName, check_task
+from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.seeding import fresh_seed, generator_word
 from hecogrid_envs.snapshots import check_snapshot, load_snapshot, take_snapshot
 from hecogrid_envs.state import StateMapping, check_state
-from hecogrid_envs.threads import NOTHING, Shares
-from hecogrid_envs.tiles import INVISIBLE, turned_atlases
+from hecogrid_envs.task import TaskName, check_task
+from hecogrid_envs.tiles import INVISIBLE
 
 U8 = npt.NDArray[np.uint8]
+
+#: In place of views that are not wanted.
+_NO_VIEWS: Final[U8] = np.zeros(0, dtype=np.uint8)
+_SECONDS_WITHOUT_A_WORD: Final = 2.0
 
 
 class GameBatch:
     """
     Games that share a task and parameters, but neither levels nor randomness.
 
-    :param task: ``"TeamTogether"``, ``"TeamSupport"`` or ``"KeyForTreasure"``
+    :param task: a name in :data:`hecogrid_envs.TASK_NAMES`, such as ``"TeamSupport"``
     :param params: parameters of all games
     :param n_games: E
     :param n_threads: threads that share steps and views, the calling one included; results do not depend on it
@@ -40,41 +51,67 @@ class GameBatch:
         self.params = params
         self.n_games = _positive("n_games", n_games)
         self.n_threads = _positive("n_threads", n_threads)
-        atlases = turned_atlases(self.task, params.rules, params.view_tile_size)
-        self._book = rule_book(self.task, params)
-        self._games = empty_games(self._book, self.n_games)
+        self._world = world_of(self.task, params)
+        self._games = empty_games(self._world, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
         self._begun = False
         n, v, pixels = params.n_agents, params.view_size, params.view_pixels
         tiles = params.observation == "tiles"
         self._view_task = TILES if tiles else PICTURES
         self._view_shape = (n, v, v) if tiles else (n, pixels, pixels, 3)
-        self._actions = aligned((self.n_games, n), np.uint8)
-        self._fresh = aligned(self.n_games, np.bool_)
-        self._codes = aligned((self.n_games, n, v, v), np.uint8)
-        self._atlas = np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)])
-        self._turn_bytes = 0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size
-        self._shares = self._new_shares()
-
-    def _new_shares(self) -> Shares:
-        work = Workspace(
-            actions=self._actions.reshape(-1),
-            fresh=self._fresh.view(np.uint8),
-            codes=self._codes.reshape(-1),
-            facing=self._games.direction.reshape(-1),
-            atlas=self._atlas,
-            turn_bytes=self._turn_bytes,
-            tile=self.params.view_tile_size,
+        self._buffers = Buffers(
+            actions=aligned(self.n_games * n, np.uint8),
+            fresh=aligned(self.n_games, np.uint8),
+            codes=aligned(self.n_games * n * v * v, np.uint8),
         )
-        return Shares(self._games, self._book, work, self.n_threads)
+        edges = np.linspace(0, self.n_games, min(self.n_threads, self.n_games) + 1).astype(int).tolist()
+        #: First game, and one beyond the last, of each thread.
+        self._parts = list(pairwise(edges))
+        self._pool: ThreadPoolExecutor | None = None
+        self._pool_process = 0
+        self._kernel = self._compiled_kernel()
+
+    def _compiled_kernel(self) -> Callable[..., None]:
+        # Needs all tasks, whose conditions are part of the kernels and whose games are made of batches.
+        from hecogrid_envs.core.play import play
+
+        arguments = (self._games, self._world, self._buffers, 0, _NO_VIEWS, _NO_VIEWS, 0, 0)
+        with _announced_compilation():
+            # The code for these types, to be called without looking at the types of some 40 arrays each time.
+            kernel: Callable[..., None] = play.compile(tuple(map(typeof, arguments)))
+        return kernel
 
     def __getstate__(self) -> dict[str, Any]:
         # Threads and compiled code stay with the process; a copy makes its own.
-        return {name: value for name, value in self.__dict__.items() if name != "_shares"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_pool", "_kernel")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._shares = self._new_shares()
+        self.__dict__.update(state, _pool=None)
+        self._kernel = self._compiled_kernel()
+
+    def _play(self, task: int, views: U8, last_views: U8, first: int, end: int) -> None:
+        """
+        Do one task for games ``first`` to ``end - 1``; see :func:`hecogrid_envs.core.play.play`.
+
+        :param views: (end - first, ...), or empty
+        :param last_views: (end - first, ...), or empty
+        """
+        own, last = views.reshape(-1), last_views.reshape(-1)
+        self._kernel(self._games, self._world, self._buffers, task, own, last, first, end)
+
+    def _play_all(self, task: int, views: U8 = _NO_VIEWS, last_views: U8 = _NO_VIEWS) -> None:
+        """Do one task for all games, each thread for a part of them; arguments as of :meth:`_play`."""
+        (first, end), *others = self._parts
+        if not others:
+            self._play(task, views, last_views, first, end)
+            return
+        if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
+            self._pool = ThreadPoolExecutor(len(others), "hecogrid")
+            self._pool_process = os.getpid()
+        running = [self._pool.submit(self._play, task, views[i:j], last_views[i:j], i, j) for i, j in others]
+        self._play(task, views[first:end], last_views[first:end], first, end)
+        for part in running:
+            part.result()
 
     def reset(self, which: npt.NDArray[np.bool_] | None = None, seeds: Sequence[int | None] | None = None) -> None:
         """
@@ -88,8 +125,8 @@ class GameBatch:
             raise ValueError(f"which must have shape ({self.n_games},), one per game, got {chosen.shape}")
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
-        self._fresh[...] = chosen
-        self._shares.play(RESET)
+        self._buffers.fresh[...] = chosen
+        self._play_all(RESET)
 
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:
@@ -105,8 +142,8 @@ class GameBatch:
 
         :param actions: (E, N) integers from 0 to 6
         """
-        self._take(actions)
-        self._shares.play(STEP)
+        self._accept(actions)
+        self._play_all(STEP)
 
     def observe(self, out: U8 | None = None) -> U8:
         """
@@ -116,7 +153,7 @@ class GameBatch:
         :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
         """
         out = self._array_for_views("out", out)
-        self._shares.play(self._view_task, out.reshape(-1))
+        self._play_all(self._view_task, out)
         return out
 
     def advance(
@@ -135,20 +172,22 @@ class GameBatch:
         :return: views as of :meth:`observe`, and (E,) whether the step was the last of an episode
         :raises ValueError: for actions or arrays that do not fit, or a game that has not begun
         """
-        self._take(actions)
+        self._accept(actions)
         out = self._array_for_views("out", out)
-        last_views = NOTHING if last is None else self._array_for_views("last", last).reshape(-1)
-        self._shares.play(STEP | RESTART | self._view_task, out.reshape(-1), last_views)
-        return out, self._fresh.copy()
+        last_views = _NO_VIEWS if last is None else self._array_for_views("last", last)
+        self._play_all(STEP | RESTART | self._view_task, out, last_views)
+        return out, self._buffers.fresh.astype(bool)
 
-    def _take(self, actions: npt.NDArray[np.integer[Any]]) -> None:
+    def _accept(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         """Check and keep the actions of a step."""
         actions = np.asarray(actions)
-        if actions.shape != self._actions.shape:
-            raise ValueError(f"actions must have shape {self._actions.shape}, (games, agents), got {actions.shape}")
+        shape = (self.n_games, self.params.n_agents)
+        if actions.shape != shape:
+            raise ValueError(f"actions must have shape {shape}, (games, agents), got {actions.shape}")
+        check_actions(actions)
         if not self._begun:
             self._check_begun()
-        self._actions[...] = actions
+        self._buffers.actions[...] = actions.reshape(-1)
 
     def _check_begun(self) -> None:
         if not self._seeded.all():
@@ -160,29 +199,42 @@ class GameBatch:
         shape = (self.n_games, *self._view_shape)
         if given is None:
             return np.empty(shape, dtype=np.uint8)
+        if not isinstance(given, np.ndarray):
+            raise ValueError(f"{name} must be a contiguous uint8 array of shape {shape}, got {type(given).__name__}")
         if given.shape != shape or given.dtype != np.uint8 or not given.flags.c_contiguous:
             raise ValueError(
                 f"{name} must be a contiguous uint8 array of shape {shape}, got {given.dtype} {given.shape}"
             )
+        if not given.flags.writeable:
+            raise ValueError(f"{name} must be an array that can be written to, got a read-only one")
         return given
 
     def observe_game(self, game: int) -> U8:
         """
-        Views of the agents of one game.
+        Return the views of the agents of one game.
 
         :return: as :meth:`observe` without its first axis
         """
-        self._shares.play_game(TILES, game, self._codes.reshape(-1))
-        if self._view_task == TILES:
-            return self._codes[game].copy()
-        out = np.empty(self._view_shape, dtype=np.uint8)
-        self._shares.draw(self._codes[game].reshape(-1), self._games.direction[game], out.reshape(-1))
+        return self._views_of_game(self._checked(game), self._view_task, self._view_shape)
+
+    def _views_of_game(self, game: int, task: int, shape: tuple[int, ...]) -> U8:
+        out = np.empty(shape, dtype=np.uint8)
+        self._play(task, out, _NO_VIEWS, game, game + 1)
         return out
+
+    def _checked(self, game: int) -> int:
+        if (
+            isinstance(game, (bool, np.bool_))
+            or not isinstance(game, (int, np.integer))
+            or not 0 <= game < self.n_games
+        ):
+            raise ValueError(f"game must be an integer from 0 to {self.n_games - 1}, got {game!r}")
+        return int(game)
 
     @property
     def rewards(self) -> npt.NDArray[np.float64]:
         """(E,) what each agent of a game received in the last step: treasures collected / N."""
-        return self._games.paid / self.params.n_agents
+        return self._games.collected_now / self.params.n_agents
 
     @property
     def truncated(self) -> npt.NDArray[np.bool_]:
@@ -211,6 +263,7 @@ class GameBatch:
 
     def get_state(self, game: int = 0) -> StateMapping:
         """Copy the state of one game (see :class:`~hecogrid_envs.state.StateMapping`)."""
+        game = self._checked(game)
         games, width = self._games, self.params.grid_size
         terrain = games.terrain[game].reshape(width, width).T
         treasures = np.zeros((width, width), dtype=np.uint8)
@@ -232,6 +285,7 @@ class GameBatch:
         :param mapping: see :class:`~hecogrid_envs.state.StateMapping`
         :raises ValueError: naming the first fault of an inconsistent mapping
         """
+        game = self._checked(game)
         state = check_state(mapping, self.params)
         games, width = self._games, self.params.grid_size
         self._seed(game, None)
@@ -244,7 +298,7 @@ class GameBatch:
         games.x[game], games.y[game] = state["agent_pos"].T
         games.direction[game] = state["agent_dir"]
         games.has_key[game] = state["agent_has_key"]
-        begin(games, self._book, game)
+        self._play(BEGIN, _NO_VIEWS, _NO_VIEWS, game, game + 1)
 
     def snapshot(self) -> dict[str, npt.NDArray[Any]]:
         """
@@ -271,7 +325,8 @@ class GameBatch:
         :raises ValueError: see :meth:`check_snapshot`; nothing is changed then
         """
         self.check_snapshot(snapshot)
-        load_snapshot(self._games, self._book, snapshot)
+        load_snapshot(self._games, self._world, snapshot)
+        self._play_all(REDRAW)
         self._seeded[...] = snapshot["seeded"]
         self._begun = False  # looked up at the next step
 
@@ -281,10 +336,10 @@ class GameBatch:
 
         :return: (N, W, H)
         """
-        self._shares.play_game(TILES, game, self._codes.reshape(-1))
-        state = self.get_state(game)
+        view = (self.params.n_agents, self.params.view_size, self.params.view_size)
+        state, codes = self.get_state(game), self._views_of_game(self._checked(game), TILES, view)
         return seen_cells(
-            self._codes[game] != INVISIBLE,
+            codes != INVISIBLE,
             state["agent_pos"],
             state["agent_dir"],
             self.params.view_offset,
@@ -292,7 +347,34 @@ class GameBatch:
         )
 
 
+def check_actions(actions: npt.NDArray[Any]) -> None:
+    """
+    Check the actions of a step.
+
+    :param actions: integers from 0 to 6, game-major, then agent
+    :raises ValueError: for another type, or naming the first row with a value out of range
+    """
+    if actions.dtype.kind not in "iu":
+        raise ValueError(f"actions must be integers, got {actions.dtype}")
+    if actions.max() >= N_ACTIONS or (actions.dtype.kind == "i" and actions.min() < 0):
+        rows = actions.reshape(-1)
+        row = int(np.flatnonzero((rows < 0) | (rows >= N_ACTIONS))[0])
+        raise ValueError(f"actions must be from 0 to {N_ACTIONS - 1}, got {rows[row]} in row {row}")
+
+
 def _positive(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
+
+
+@contextmanager
+def _announced_compilation() -> Iterator[None]:
+    """Say on standard error that something is being compiled, if it takes time: numba keeps what it has compiled."""
+    text = "hecogrid_envs: loading the kernels; once on this machine they are compiled, about 10 seconds"
+    timer = Timer(_SECONDS_WITHOUT_A_WORD, partial(print, text, file=sys.stderr, flush=True))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -69,6 +69,9 @@ YELLOW: Final[Colour] = (255, 255, 0)
 GREEN: Final[Colour] = (0, 255, 0)
 GREY: Final[Colour] = (100, 100, 100)
 BLACK: Final[Colour] = (0, 0, 0)
+#: Colours of treasures in pictures for people.
+EMERALD: Final[Colour] = (38, 222, 129)
+GOLD: Final[Colour] = (255, 205, 60)
 
 #: Colour of an agent by its zone, repeating beyond the last.
 ZONE_COLOURS: Final[tuple[Colour, ...]] = (

@@ -10,12 +10,14 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from hecogrid_envs.batch import GameBatch
 from hecogrid_envs.constants import N_ACTIONS, ZONE_COLOURS, Colour, RenderMode
 from hecogrid_envs.page import COMMON_PAGE
-from hecogrid_envs.params import HECOGridParams, TaskName
+from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import STATE_PLANES, StateMapping, central_view, state_option
+from hecogrid_envs.task import DECLARED, Task, TaskName
 from hecogrid_envs.tiles import observation_space
 
 Observations = dict[str, npt.NDArray[np.uint8]]
@@ -34,7 +36,7 @@ class StepResult(NamedTuple):
 
 class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
     """
-    What the three tasks share; the classes in :mod:`hecogrid_envs.tasks` document the games.
+    What all tasks share; the classes in :mod:`hecogrid_envs.tasks` document the games.
 
     :param render_mode: ``"rgb_array"``, ``"human"`` (a window), ``"ansi"`` (text) or None
     :param params: the fields of :class:`~hecogrid_envs.params.HECOGridParams`
@@ -47,17 +49,28 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         "render_fps": 8,
         "is_parallelizable": True,
     }
+    #: What makes the task; a class with its own declares a task.
+    declaration: ClassVar[Task]
     task: ClassVar[TaskName]
     #: What the team's return counts.
     return_unit: ClassVar[str] = "treasures"
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        if "declaration" not in cls.__dict__:
+            return
+        cls.task = cls.declaration.name
+        DECLARED[cls.task] = cls.declaration
         # Each task's docstring is its documentation page; what all tasks share is written once.
         cls.__doc__ = f"{cleandoc(cls.__doc__ or '')}\n\n{COMMON_PAGE}"
 
     def __init__(self, render_mode: RenderMode | None = None, **params: Any):
         self._setup(GameBatch(self.task, HECOGridParams.from_kwargs(params)), 0, render_mode)
+
+    @classmethod
+    def turn_based(cls, render_mode: RenderMode | None = None, **params: Any) -> Any:
+        """Make the game in PettingZoo's turn-based (AEC) form."""
+        return parallel_to_aec(cls(render_mode=render_mode, **params))
 
     @classmethod
     def of_batch(cls, batch: GameBatch, game: int, render_mode: RenderMode | None = None) -> HECOGridEnv:

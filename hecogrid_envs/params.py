@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from numbers import Real
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +18,7 @@ from hecogrid_envs.constants import (
     Rules,
     action_permutations,
 )
-
-TaskName = Literal["TeamTogether", "TeamSupport", "KeyForTreasure"]
-TASK_NAMES: tuple[TaskName, ...] = get_args(TaskName)
+from hecogrid_envs.task import DECLARED, TaskName, did_you_mean
 
 #: Largest view whose rows still fit into one unaligned 64-bit word of wall bits.
 MAX_VIEW_SIZE = 57
@@ -95,7 +92,7 @@ class HECOGridParams:
         for name in params:
             if name not in known:
                 raise ValueError(
-                    f"unknown parameter {name!r}{_did_you_mean(name, known)}; the parameters are {', '.join(known)}"
+                    f"unknown parameter {name!r}{did_you_mean(name, known)}; the parameters are {', '.join(known)}"
                 )
         return cls(**params)
 
@@ -131,7 +128,7 @@ class HECOGridParams:
         value = getattr(self, name)
         if value not in allowed:
             choices = " or ".join(repr(choice) for choice in allowed)
-            raise ValueError(f"{name} must be {choices}, got {value!r}{_did_you_mean(value, list(allowed))}")
+            raise ValueError(f"{name} must be {choices}, got {value!r}{did_you_mean(value, list(allowed))}")
 
     def check_fits(self, task: TaskName) -> None:
         """
@@ -139,7 +136,7 @@ class HECOGridParams:
 
         :raises ValueError: with the number of cells wanted and available
         """
-        n_keys = self.n_keys if task == "KeyForTreasure" else 0
+        n_keys = self.n_keys if DECLARED[task].has_keys else 0
         wanted = self.n_treasures + self.n_clutter + n_keys
         if wanted > self.n_interior_cells:
             raise ValueError(
@@ -196,22 +193,3 @@ class HECOGridParams:
         stride = ZONE_STRIDE if few else len(table) // self.heterogeneity
         action_of = table[(stride * np.arange(n_zones)) % len(table)]
         return np.argsort(action_of, axis=1).astype(np.uint8)
-
-
-def _did_you_mean(value: object, known: list[str]) -> str:
-    close = get_close_matches(str(value), known, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
-
-
-def check_task(task: object) -> TaskName:
-    """
-    Check a task's name.
-
-    :raises ValueError: with the nearest name that exists
-    """
-    for name in TASK_NAMES:
-        if task == name:
-            return name
-    raise ValueError(
-        f"unknown task {task!r}{_did_you_mean(task, list(TASK_NAMES))}; the tasks are {', '.join(TASK_NAMES)}"
-    )

@@ -21,8 +21,9 @@ import numpy.typing as npt
 
 from hecogrid_envs.constants import N_ACTIONS, Command, Direction
 from hecogrid_envs.fields_of_view import seen_cells
-from hecogrid_envs.params import HECOGridParams, TaskName, check_task
+from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.rendering import Picture, Scene, fit_tile_size, render_scene
+from hecogrid_envs.task import TaskName, check_task
 from hecogrid_envs.text import render_text
 from hecogrid_envs.tiles import INVISIBLE
 from hecogrid_envs.window import HumanWindow

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.constants import AGENT_PALETTE, KEY_CARRIER_INDEX, ZONE_COLOURS, Colour, TreasureState
-from hecogrid_envs.params import HECOGridParams, TaskName
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.task import TaskName
 
 Picture = npt.NDArray[np.uint8]
 #: A state mapping; see :class:`hecogrid_envs.state.StateMapping`.

@@ -16,17 +16,16 @@ import numpy.typing as npt
 
 from hecogrid_envs.arrays import empty_games
 from hecogrid_envs.constants import AGENT_PALETTE, Terrain, TreasureState
-from hecogrid_envs.core.occupancy import plane_offset
-from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.core.occupancy import arrive
+from hecogrid_envs.core.types import Games, World
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import check_state
-from hecogrid_envs.tiles import FIRST_AGENT, FIRST_KEY, FIRST_TERRAIN
 
 Snapshot = Mapping[str, npt.NDArray[Any]]
 
 #: Arrays of a batch that are stored as they are.
 _STORED: Final = (
-    *("rng", "terrain", "x", "y", "direction", "has_key", "colour", "order", "steps", "collected", "paid"),
+    *("rng", "terrain", "x", "y", "direction", "has_key", "colour", "order", "steps", "collected", "collected_now"),
 )
 _NOBODY: Final = -1
 
@@ -90,7 +89,7 @@ def _check_values(snapshot: Snapshot, n_agents: int) -> None:
         "steps": (0, np.iinfo(np.int32).max - 1),
         "collected": (0, collected),
         # Of the last step, which may have been in the episode before.
-        "paid": (0, snapshot["terrain"].shape[1]),
+        "collected_now": (0, snapshot["terrain"].shape[1]),
     }
     for name, (low, high) in limits.items():
         wrong = (snapshot[name] < low) | (snapshot[name] > high)
@@ -125,57 +124,20 @@ def _check_game(snapshot: Snapshot, game: int, params: HECOGridParams) -> None:
             raise ValueError(f"a snapshot has in 'rank' {ranks.tolist()} for the agents of one cell of game {game}")
 
 
-def load_snapshot(games: Games, book: RuleBook, snapshot: Snapshot) -> None:
+def load_snapshot(games: Games, world: World, snapshot: Snapshot) -> None:
     """
-    Let games go on from a snapshot that passed :func:`check_snapshot`.
+    Let games go on from a snapshot that passed :func:`check_snapshot`; their cells must be redrawn afterwards.
 
     :param games: E games, overwritten
-    :param book: of the games
+    :param world: of the games
     :param snapshot: copied
     """
-    blank = empty_games(book, len(games.rng))
+    blank = empty_games(world, len(games.rng))
     for name, empty in blank._asdict().items():
         getattr(games, name)[...] = empty
     for name in _STORED:
         getattr(games, name)[...] = snapshot[name]
+    cells = games.y * world.width + games.x
     for game in np.flatnonzero(snapshot["seeded"]).tolist():
-        _place_agents(games, book, game, snapshot["rank"][game])
-        _draw(games, book, game)
-
-
-def _place_agents(games: Games, book: RuleBook, game: int, ranks: npt.NDArray[np.int32]) -> None:
-    """Link the agents of each cell in order of arrival."""
-    cells = games.y[game] * book.width + games.x[game]
-    for agent in np.argsort(ranks, kind="stable").tolist():
-        cell = int(cells[agent])
-        last = int(games.tail[game, cell])
-        if last == _NOBODY:
-            games.head[game, cell] = agent
-        else:
-            games.after[game, last] = agent
-        games.before[game, agent] = last
-        games.tail[game, cell] = agent
-        games.crowd[game, cell] += 1
-
-
-def _draw(games: Games, book: RuleBook, game: int) -> None:
-    """Write tile codes and walls of all cells inside the outer wall, in the four orientations."""
-    inside = np.arange(1, book.width - 1)
-    x, y = (part.reshape(-1) for part in np.meshgrid(inside, inside))
-    cells = y * book.width + x
-    ground, first = games.terrain[game, cells].astype(np.int64), games.head[game, cells].astype(np.int64)
-    low, turn, step = FIRST_TERRAIN + ground, np.zeros_like(ground), np.zeros_like(ground)
-    is_key, is_taken = ground == Terrain.KEY, first != _NOBODY
-    low[is_key], turn[is_key], step[is_key] = FIRST_KEY, 1, 1
-    agents = first[is_taken]
-    layer = (ground == Terrain.TREASURE) + 2 * (ground == Terrain.COLLECTED)
-    low[is_taken] = FIRST_AGENT + (layer[is_taken] * len(AGENT_PALETTE) + games.colour[game, agents]) * 4
-    turn[is_taken], step[is_taken] = games.direction[game, agents] + 3, -1
-    planes = games.planes.reshape(len(games.rng), 4, -1)[game]
-    bits = games.wall_bits.reshape(len(games.rng), 4, -1)[game]
-    bits[...] = book.blank_bits.reshape(4, -1)
-    for facing in range(4):
-        places = plane_offset.py_func(book, facing, x, y)  # type: ignore[attr-defined]
-        planes[facing, places] = low + ((turn + step * facing) & 3)
-        walls = places[ground == Terrain.WALL]
-        np.bitwise_or.at(bits[facing], walls >> 3, np.uint8(1) << (walls & 7).astype(np.uint8))
+        for agent in np.argsort(snapshot["rank"][game], kind="stable").tolist():
+            arrive(games, game, agent, int(cells[game, agent]))

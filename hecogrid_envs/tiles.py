@@ -19,18 +19,16 @@ from hecogrid_envs.constants import (
     AGENT_PALETTE,
     BLACK,
     EMPTY_COLOUR,
-    GREEN,
-    GREY,
     INVISIBLE_COLOUR,
     KEY_COLOUR,
     WALL_COLOUR,
-    YELLOW,
     Colour,
     Direction,
     Rules,
     Terrain,
 )
-from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, TaskName
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams
+from hecogrid_envs.task import DECLARED, TaskName
 
 Image = npt.NDArray[np.uint8]
 Shape = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.bool_]]
@@ -57,11 +55,10 @@ class TreasureColours(NamedTuple):
 
 
 def treasure_colours(task: TaskName, rules: Rules) -> TreasureColours:
-    """Colours of the treasures of a task."""
-    together = task == "TeamTogether"
+    """Return the colours of a task's treasures in observations."""
+    declared = DECLARED[task]
     return TreasureColours(
-        available=YELLOW if together else GREEN,
-        collected=BLACK if together and rules == "released" else GREY,
+        declared.treasure, declared.collected_released if rules == "released" else declared.collected
     )
 
 

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn, tile_images
 
-from hecogrid_envs.batch import GameBatch
+from hecogrid_envs.batch import GameBatch, check_actions
 from hecogrid_envs.constants import N_ACTIONS, RenderMode
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
@@ -46,7 +46,7 @@ class NativeVecEnv(VecEnv):
         self.n_agents = batch.params.n_agents
         env_class = TASKS[batch.task]
         self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
-        self._actions: npt.NDArray[np.integer[Any]] | None = None
+        self._actions: U8 | None = None
         self._running = False
         #: Seeds of the games as they were last chosen, by which evaluation is told from training.
         self.seeded_with: tuple[int | None, ...] = (None,) * batch.n_games
@@ -104,12 +104,8 @@ class NativeVecEnv(VecEnv):
                 f"actions must have shape ({self.num_envs},), one per agent of {self.n_games} games x {self.n_agents} "
                 f"agents, got {actions.shape}"
             )
-        if actions.dtype.kind not in "iu":
-            raise ValueError(f"actions must be integers, got {actions.dtype}")
-        if actions.min() < 0 or actions.max() >= N_ACTIONS:
-            row = int(np.flatnonzero((actions < 0) | (actions >= N_ACTIONS))[0])
-            raise ValueError(f"actions must be from 0 to {N_ACTIONS - 1}, got {actions[row]} in row {row}")
-        self._actions = actions
+        check_actions(actions)
+        self._actions = actions.astype(np.uint8)
 
     def step_wait(self) -> VecEnvStepReturn:
         """

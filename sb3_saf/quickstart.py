@@ -14,7 +14,8 @@ import numpy as np
 from stable_baselines3 import PPO
 
 import hecogrid_envs
-from hecogrid_envs.params import TASK_NAMES, check_task
+from hecogrid_envs import TASK_NAMES
+from hecogrid_envs.task import check_task
 from sb3_saf import EvaluationResult, LightEncoder, RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 
 #: The ``small`` size of the experiments: 5 agents, grid 15, 25 treasures.

@@ -2,71 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
 
-import numba
-import numpy as np
-import pytest
+import hecogrid_envs
 
-from hecogrid_envs.core import jit
-from hecogrid_envs.core.occupancy import plane_offset
-from hecogrid_envs.core.sharing import is_asleep
-
-_ARGUMENTS = (np.zeros(32, dtype=np.int64), 1)
-
-
-@pytest.fixture
-def fresh_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], Any]:
-    """Makes a kernel as a new process would, with compiled code in a folder of the user's choice."""
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-
-    def make() -> Any:
-        jit._announce_compilation.cache_clear()
-        return jit.hot_entry(is_asleep.py_func)  # type: ignore[attr-defined]
-
-    return make
+PACKAGE = Path(hecogrid_envs.__file__).parent
+CODE = """
+import hecogrid_envs
+from hecogrid_envs.core import play
+hecogrid_envs.GameBatch("TeamSupport", hecogrid_envs.HECOGridParams())
+print(sum(play.play.stats.cache_hits.values()))
+"""
 
 
-def test_it_says_so_when_it_compiles_and_only_then(
-    fresh_start: Callable[[], Any], capfd: pytest.CaptureFixture[str]
-) -> None:
-    compiled = jit.entry_point(fresh_start(), *_ARGUMENTS)
-    assert capfd.readouterr().err.count("compiling the kernels") == 1
-    assert not compiled(*_ARGUMENTS)
-
-    kernel = fresh_start()
-    assert not jit.entry_point(kernel, *_ARGUMENTS)(*_ARGUMENTS)
-    assert capfd.readouterr().err == ""
-    assert sum(kernel.stats.cache_hits.values()) == 1
+def start(package: Path) -> tuple[str, bool]:
+    """How often compiled code was found on disk, and whether compiling was announced, in a new process."""
+    environment = {**os.environ, "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1"}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    process = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=True)
+    return process.stdout.strip(), "once on this machine they are compiled" in process.stderr
 
 
-def test_a_change_of_any_file_of_the_kernels_compiles_anew(
-    fresh_start: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    jit.entry_point(fresh_start(), *_ARGUMENTS)
-    capfd.readouterr()
-    monkeypatch.setattr(jit, "_FINGERPRINT", "of other files")
-    kernel = fresh_start()
-    jit.entry_point(kernel, *_ARGUMENTS)
-    assert "compiling the kernels" in capfd.readouterr().err
-    assert not kernel.stats.cache_hits
-
-
-def test_the_fingerprint_reads_every_file_of_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    read: list[str] = []
-
-    def read_bytes(path: Path) -> bytes:
-        read.append(path.name)
-        return b""
-
-    monkeypatch.setattr(Path, "read_bytes", read_bytes)
-    jit._fingerprint()
-    core = {path.name for path in Path(jit.__file__).parent.glob("*.py")}
-    assert core | {"constants.py", "tiles.py"} == set(read)
-
-
-def test_what_only_kernels_call_says_so() -> None:
-    with pytest.raises(TypeError, match="plane_offset is compiled for kernels only: mark it as an entry to call it"):
-        plane_offset(None, 0, 1, 1)  # type: ignore[arg-type]
+def test_kernels_are_compiled_once_and_anew_after_a_change(tmp_path: Path) -> None:
+    package = tmp_path / "hecogrid_envs"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    assert start(package) == ("0", True)
+    assert start(package)[0] == "1"
+    with (package / "tasks" / "team_support.py").open("a") as file:
+        file.write("# Another condition.\n")
+    assert start(package)[0] == "0"

@@ -154,3 +154,13 @@ def test_steps_do_not_overwrite_earlier_observations() -> None:
     venv.step(np.full(6, 1))
     np.testing.assert_array_equal(first, kept)
     np.testing.assert_array_equal(second, kept_second)
+
+
+def test_actions_are_those_of_the_call_and_not_of_later() -> None:
+    first, second = (make_vec_env("TeamSupport", 2, seed=0, n_agents=3) for _ in range(2))
+    actions = np.full(6, 2)
+    for venv in (first, second):
+        venv.reset()
+    first.step_async(actions)
+    actions[:] = 200
+    np.testing.assert_array_equal(first.step_wait()[0], second.step(np.full(6, 2))[0])

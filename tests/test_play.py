@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from hecogrid_envs import parallel_env, play
-from hecogrid_envs.params import HECOGridParams, TaskName
+from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.play import Playable, Session, line_keys, make_session, play_text, play_window, terminal_keys
+from hecogrid_envs.task import TaskName
 from hecogrid_envs.text import parse_level
 from hecogrid_envs.window import HumanWindow, _import_pygame
 

@@ -17,8 +17,9 @@ import pytest
 from hecogrid_envs import rendering, window
 from hecogrid_envs.constants import KEY_CARRIER_COLOUR, ZONE_COLOURS
 from hecogrid_envs.fields_of_view import seen_cells
-from hecogrid_envs.params import HECOGridParams, TaskName
+from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.rendering import Scene, fit_tile_size, header_height, render_scene
+from hecogrid_envs.task import TaskName
 from hecogrid_envs.window import HumanWindow
 
 pytest.importorskip("PIL")

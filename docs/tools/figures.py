@@ -18,8 +18,8 @@ from PIL import Image
 from hecogrid_envs import TASK_NAMES, parallel_env
 from hecogrid_envs.constants import Command
 from hecogrid_envs.parallel_env import HECOGridEnv
-from hecogrid_envs.params import TaskName
 from hecogrid_envs.rendering import Scene, render_scene
+from hecogrid_envs.task import TaskName
 
 Picture = npt.NDArray[np.uint8]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hecogrid_envs.constants import AGENT_PALETTE, Terrain
 from hecogrid_envs.core.jit import inlined
-from hecogrid_envs.core.types import Games, RuleBook
+from hecogrid_envs.core.types import Games, World, whole
 from hecogrid_envs.tiles import FIRST_AGENT, FIRST_KEY, FIRST_TERRAIN
 
 _N_COLOURS = len(AGENT_PALETTE)
@@ -43,12 +43,12 @@ def leave(games: Games, e: int, agent: int, cell: int) -> None:
 
 
 @inlined
-def count_around(games: Games, book: RuleBook, e: int, x: int, y: int) -> int:
+def count_around(games: Games, world: World, e: int, x: int, y: int) -> int:
     """Agents within ``support_radius`` (Chebyshev) of a cell."""
-    radius, width = book.support_radius, book.width
+    radius, width = world.support_radius, world.width
     total = 0
-    if (2 * radius + 1) * (2 * radius + 1) > book.n_agents:
-        for agent in range(book.n_agents):
+    if (2 * radius + 1) * (2 * radius + 1) > world.n_agents:
+        for agent in range(world.n_agents):
             if abs(games.x[e, agent] - x) <= radius and abs(games.y[e, agent] - y) <= radius:
                 total += 1
         return total
@@ -56,6 +56,28 @@ def count_around(games: Games, book: RuleBook, e: int, x: int, y: int) -> int:
         for column in range(max(0, x - radius), min(width, x + radius + 1)):
             total += games.crowd[e, row * width + column]
     return total
+
+
+@inlined
+def count_here(games: Games, world: World, e: int, agent: int) -> int:
+    """Agents on an agent's cell, itself included."""
+    return whole(games.crowd[e, games.y[e, agent] * world.width + games.x[e, agent]])
+
+
+@inlined
+def count_near(games: Games, world: World, e: int, agent: int, old_x: int, old_y: int) -> int:
+    """
+    Agents within ``support_radius`` of an agent, itself included.
+
+    The released rules count around the cell where its action began, (old_x, old_y), at that moment: the others have not
+    moved since.
+    """
+    x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
+    if not world.released:
+        return count_around(games, world, e, x, y)
+    radius = world.support_radius
+    still_near = abs(x - old_x) <= radius and abs(y - old_y) <= radius
+    return count_around(games, world, e, old_x, old_y) - still_near + 1
 
 
 @inlined
@@ -70,22 +92,22 @@ def agent_code(ground: int, colour: int, direction: int) -> int:
 
 
 @inlined
-def plane_offset(book: RuleBook, facing: int, x: int, y: int) -> int:
+def plane_offset(world: World, facing: int, x: int, y: int) -> int:
     """
     Where a cell lies in the plane that is turned for a viewer facing ``facing``.
 
     In each plane the viewer looks towards smaller rows and its right is towards larger columns, so opposite directions
     read the same plane from opposite ends.
     """
-    px, py = x + book.pad, y + book.pad
-    upright = py * book.stride + px if facing & 1 else px * book.stride + book.stride - 1 - py
-    return upright if facing >= 2 else book.stride * book.stride - 1 - upright
+    px, py = x + world.pad, y + world.pad
+    upright = py * world.stride + px if facing & 1 else px * world.stride + world.stride - 1 - py
+    return upright if facing >= 2 else world.stride * world.stride - 1 - upright
 
 
 @inlined
-def redraw_cell(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
+def redraw_cell(games: Games, world: World, e: int, x: int, y: int) -> None:
     """Write a cell's present tile code into the four planes."""
-    cell = y * book.width + x
+    cell = y * world.width + x
     ground = games.terrain[e, cell]
     first = games.head[e, cell]
     # Code of the cell as seen facing north, and by how much it turns for the other directions: a quarter each.
@@ -95,16 +117,16 @@ def redraw_cell(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
         low, turn, step = agent_code(ground, games.colour[e, first], 0), games.direction[e, first] + 3, -1
     elif ground == _KEY:
         low, turn, step = FIRST_KEY, 1, 1
-    plane = e * 4 * book.plane_bytes
+    plane = e * 4 * world.plane_bytes
     for facing in range(4):
         code = low + ((turn + step * facing) & 3)
-        games.planes[plane + plane_offset(book, facing, x, y)] = code
-        plane += book.plane_bytes
+        games.planes[plane + plane_offset(world, facing, x, y)] = code
+        plane += world.plane_bytes
 
 
 @inlined
-def set_wall_bits(games: Games, book: RuleBook, e: int, x: int, y: int) -> None:
+def set_wall_bits(games: Games, world: World, e: int, x: int, y: int) -> None:
     """Mark a cell as opaque in the four orientations."""
     for facing in range(4):
-        bit = plane_offset(book, facing, x, y)
-        games.wall_bits[(e * 4 + facing) * book.bits_bytes + (bit >> 3)] |= 1 << (bit & 7)
+        bit = plane_offset(world, facing, x, y)
+        games.wall_bits[(e * 4 + facing) * world.bits_bytes + (bit >> 3)] |= 1 << (bit & 7)

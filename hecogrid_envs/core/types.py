@@ -1,9 +1,9 @@
-"""The arrays that kernels work on: all games of a batch, and the rule book they share."""
+"""What kernels work on: the games of a batch, the world they share, and buffers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +19,21 @@ U64 = npt.NDArray[np.uint64]
 whole: Callable[[Any], int] = np.int64  # type: ignore[assignment]
 
 
-class RuleBook(NamedTuple):
-    """
-    What all games of a batch share. W = grid size, N = agents, V = view size, Z = zones.
+#: What :func:`hecogrid_envs.core.play.play` does: any sum of these, done in this order.
+STEP: Final = 1
+RESTART: Final = 2
+RESET: Final = 4
+BEGIN: Final = 8
+REDRAW: Final = 16
+TILES: Final = 32
+PICTURES: Final = 64
 
-    :param task: 0 TeamTogether, 1 TeamSupport, 2 KeyForTreasure
+
+class World(NamedTuple):
+    """
+    What all games of a batch share. W = grid size, N = agents, V = view size, t = tile size, Z = zones.
+
+    :param condition: number of the task's condition for collecting, in the order of the registered tasks
     :param released: whether the released rules hold
     :param random_order: whether agents act in an order drawn anew each step
     :param stride: side of a padded plane; a view never leaves it
@@ -40,9 +50,12 @@ class RuleBook(NamedTuple):
     :param spread: (256,) word whose byte i is 0xFF where bit i of the index is set
     :param swept: (4 ** V,) what light does in one row of a view of at most eight columns: the index is the row's clear
         cells times 2 ** V plus its lit cells before, the entry its lit cells after and, 8 bits higher, the next row's
+    :param tile: t
+    :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction, and slack for whole chunks
+    :param turn_bytes: bytes from one direction's tiles to the next; 0 if all directions may share the first
     """
 
-    task: int
+    condition: int
     released: bool
     random_order: bool
     n_agents: int
@@ -68,6 +81,9 @@ class RuleBook(NamedTuple):
     blank_bits: U8
     spread: U64
     swept: U16
+    tile: int
+    atlas: U8
+    turn_bytes: int
 
 
 class Games(NamedTuple):
@@ -93,7 +109,7 @@ class Games(NamedTuple):
     :param wall_bits: (E * 4 * bits_bytes,) the walls in the same four orientations, one bit a cell
     :param steps: (E,) game steps since the reset
     :param collected: (E,) treasures collected since the reset
-    :param paid: (E,) treasures collected in the last step
+    :param collected_now: (E,) treasures collected in the last step
     """
 
     rng: U64
@@ -115,4 +131,18 @@ class Games(NamedTuple):
     wall_bits: U8
     steps: I32
     collected: I32
-    paid: I32
+    collected_now: I32
+
+
+class Buffers(NamedTuple):
+    """
+    What a batch keeps beside its games. E games, N agents, V = view size.
+
+    :param actions: (E * N,) what agents do in the next step, 0 to 6
+    :param fresh: (E,) 1 for games that ``RESET`` is to give a new level, or to which ``RESTART`` gave one, 0 for others
+    :param codes: (E * N * V * V,) where views in tile codes are kept on the way to pixels
+    """
+
+    actions: U8
+    fresh: U8
+    codes: U8

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hecogrid_envs.core.jit import hot, hot_entry, inlined
+from hecogrid_envs.core.jit import hot, inlined
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
-from hecogrid_envs.core.types import U8, Games, RuleBook, whole
+from hecogrid_envs.core.types import U8, Games, World, whole
 from hecogrid_envs.core.words import copy_16, load_word, store_word
 
 _ONE = np.uint64(1)
@@ -16,11 +16,11 @@ _CHUNK_BYTES = 16
 
 
 @inlined
-def view_corner(games: Games, book: RuleBook, e: int, agent: int) -> int:
+def view_corner(games: Games, world: World, e: int, agent: int) -> int:
     """Offset of the top left cell of an agent's view in the plane turned for it."""
     facing, x, y = whole(games.direction[e, agent]), whole(games.x[e, agent]), whole(games.y[e, agent])
-    here = plane_offset(book, facing, x, y)
-    return here - (book.view_size - 1 - book.view_offset) * book.stride - book.view_size // 2
+    here = plane_offset(world, facing, x, y)
+    return here - (world.view_size - 1 - world.view_offset) * world.stride - world.view_size // 2
 
 
 @inlined
@@ -48,7 +48,7 @@ def _spread_left(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
 
 
 @inlined
-def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
+def look(games: Games, world: World, e: int, agent: int) -> None:
     """
     Compute which cells of its view an agent sees and keep it in ``games.sight``.
 
@@ -56,14 +56,14 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
     then from one beyond the agent's column down to column 1; a cell that is lit and clear lights its neighbour in the
     row, the cell in the next row and the diagonal between them.
     """
-    size = book.view_size
-    own_row, own_column = size - 1 - book.view_offset, size // 2
+    size = world.view_size
+    own_row, own_column = size - 1 - world.view_offset, size // 2
     every = (_ONE << np.uint64(size)) - _ONE
     rightwards = every & ~((_ONE << np.uint64(own_column)) - _ONE)
     leftwards = every & ((_ONE << np.uint64(own_column + 2)) - _ONE) & ~_ONE
-    words = (e * book.n_agents + agent) * size
-    bits = (e * 4 + games.direction[e, agent]) * book.bits_bytes
-    corner = view_corner(games, book, e, agent)
+    words = (e * world.n_agents + agent) * size
+    bits = (e * 4 + games.direction[e, agent]) * world.bits_bytes
+    corner = view_corner(games, world, e, agent)
     for row in range(size):
         games.sight[np.uint64(words + row)] = 0
     games.sight[np.uint64(words + own_row)] = _ONE << np.uint64(own_column)
@@ -73,12 +73,12 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
         row = own_row
         while (sweep == 0 and row >= 1) or (sweep == 1 and row < size):
             following = row - 1 if sweep == 0 else row + 1
-            bit = corner + row * book.stride
+            bit = corner + row * world.stride
             walls = load_word(games.wall_bits, bits + (bit >> 3)) >> np.uint64(bit & 7)
             clear = ~walls & every
             seen = games.sight[np.uint64(words + row)]
             if size <= _WORD_BYTES:
-                swept = np.uint64(book.swept[(clear << np.uint64(size)) | seen])
+                swept = np.uint64(world.swept[(clear << np.uint64(size)) | seen])
                 seen, lit = swept & _BYTE, swept >> np.uint64(_WORD_BYTES)
             else:
                 right = _spread_right(seen & rightwards, clear & rightwards, size)
@@ -94,28 +94,28 @@ def look(games: Games, book: RuleBook, e: int, agent: int) -> None:
 
 
 @hot
-def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) -> None:
+def observe_tiles(games: Games, world: World, out: U8, first: int, last: int) -> None:
     """
     Write the views of games ``first`` to ``last - 1`` as tile codes.
 
-    :param out: (E * N * V * V,)
+    :param out: (n * N * V * V,), n = last - first
     """
-    size = book.view_size
+    size = world.view_size
     n_words = (size + _WORD_BYTES - 1) // _WORD_BYTES
-    own = (size - 1 - book.view_offset) * size + size // 2
-    end = last * book.n_agents * size * size
+    own = (size - 1 - world.view_offset) * size + size // 2
+    end = (last - first) * world.n_agents * size * size
+    start = 0
     for e in range(first, last):
-        for agent in range(book.n_agents):
+        for agent in range(world.n_agents):
             if not games.sight_known[e, agent]:
-                look(games, book, e, agent)
-            words = (e * book.n_agents + agent) * size
-            start = words * size
-            source = (e * 4 + games.direction[e, agent]) * book.plane_bytes + view_corner(games, book, e, agent)
+                look(games, world, e, agent)
+            words = (e * world.n_agents + agent) * size
+            source = (e * 4 + games.direction[e, agent]) * world.plane_bytes + view_corner(games, world, e, agent)
             for row in range(size):
                 seen = games.sight[np.uint64(words + row)]
                 for k in range(n_words):
-                    mask = book.spread[(seen >> np.uint64(_WORD_BYTES * k)) & _BYTE]
-                    codes = load_word(games.planes, source + row * book.stride + _WORD_BYTES * k) & mask
+                    mask = world.spread[(seen >> np.uint64(_WORD_BYTES * k)) & _BYTE]
+                    codes = load_word(games.planes, source + row * world.stride + _WORD_BYTES * k) & mask
                     to = start + row * size + _WORD_BYTES * k
                     if to + _WORD_BYTES <= end:
                         # Writes past the row's end; the next row or view, written later, repairs it.
@@ -123,61 +123,62 @@ def observe_tiles(games: Games, book: RuleBook, out: U8, first: int, last: int) 
                     else:
                         for i in range(min(end - to, size - _WORD_BYTES * k)):
                             out[to + i] = np.uint8((codes >> np.uint64(8 * i)) & _BYTE)
-            ground = games.terrain[e, games.y[e, agent] * book.width + games.x[e, agent]]
+            ground = games.terrain[e, games.y[e, agent] * world.width + games.x[e, agent]]
             out[start + own] = agent_code(ground, games.colour[e, agent], 3)
+            start += size * size
 
 
-@hot_entry
-def draw_pictures(
-    codes: U8, facing: U8, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
-) -> None:
+@hot
+def draw_pictures(games: Games, world: World, codes: U8, out: U8, first: int, last: int) -> None:
     """
-    Turn views in tile codes into pixels.
+    Turn the views of games ``first`` to ``last - 1`` into pixels.
 
-    :param codes: (B * V * V,) codes of B views
-    :param facing: (B,) directions of the viewers
-    :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction, and slack for whole chunks
-    :param turn_bytes: bytes from one direction's tiles to the next; 0 if all directions may share the first
-    :param size: V
-    :param tile: t
-    :param out: (B * V t * V t * 3,)
-    :param first: first view to draw
-    :param last: one beyond the last view to draw
+    :param codes: (n * N * V * V,) their tile codes, n = last - first
+    :param out: (n * N * V t * V t * 3,)
     """
-    line, tile_bytes = 3 * tile, 3 * tile * tile
+    size, n_agents = world.view_size, world.n_agents
+    line, tile_bytes = 3 * world.tile, 3 * world.tile * world.tile
     # As many views as a chunk may reach into are drawn line by line: nothing repairs what lies beyond the last.
     repairing = 1 + (_CHUNK_BYTES - 1) // (size * size * tile_bytes)
-    quick = max(first, last - repairing) if line <= _CHUNK_BYTES else first
-    _draw_in_chunks(codes, facing, atlas, turn_bytes, size, tile, out, first, quick)
-    for view in range(quick, last):
-        turned = facing[view] * turn_bytes
-        to = view * size * size * tile_bytes
-        for row in range(size):
-            cell = (view * size + row) * size
-            for pixel_row in range(tile):
-                source = turned + pixel_row * line
-                for column in range(size):
-                    _copy_line(out, to, atlas, source + np.int64(codes[cell + column]) * tile_bytes, line)
-                    to += line
+    n_quick = (last - first) * n_agents - repairing if line <= _CHUNK_BYTES else 0
+    view = 0
+    for e in range(first, last):
+        for agent in range(n_agents):
+            turned = games.direction[e, agent] * world.turn_bytes
+            if view < n_quick:
+                _draw_in_chunks(world, codes, out, view, turned)
+            else:
+                _draw_in_lines(world, codes, out, view, turned)
+            view += 1
 
 
 @inlined
-def _draw_in_chunks(
-    codes: U8, facing: U8, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
-) -> None:
-    """As :func:`draw_pictures`, copying more than a tile's line; what comes next, written later, repairs it."""
-    line, tile_bytes = 3 * tile, 3 * tile * tile
-    for view in range(first, last):
-        turned = facing[view] * turn_bytes
-        to = view * size * size * tile_bytes
-        for row in range(size):
-            cell = (view * size + row) * size
-            for pixel_row in range(tile):
-                source = turned + pixel_row * line
-                for column in range(size):
-                    # An unsigned index spares the check for counting from the end.
-                    copy_16(out, to, atlas, source + np.int64(codes[np.uint64(cell + column)]) * tile_bytes)
-                    to += line
+def _draw_in_chunks(world: World, codes: U8, out: U8, view: int, turned: int) -> None:
+    """Draw a view, copying more than a tile's line; what comes next, written later, repairs it."""
+    size, line, tile_bytes = world.view_size, 3 * world.tile, 3 * world.tile * world.tile
+    to = view * size * size * tile_bytes
+    for row in range(size):
+        cell = (view * size + row) * size
+        for pixel_row in range(world.tile):
+            source = turned + pixel_row * line
+            for column in range(size):
+                # An unsigned index spares the check for counting from the end.
+                copy_16(out, to, world.atlas, source + whole(codes[np.uint64(cell + column)]) * tile_bytes)
+                to += line
+
+
+@inlined
+def _draw_in_lines(world: World, codes: U8, out: U8, view: int, turned: int) -> None:
+    """Draw a view, copying each line of a tile and nothing beyond it."""
+    size, line, tile_bytes = world.view_size, 3 * world.tile, 3 * world.tile * world.tile
+    to = view * size * size * tile_bytes
+    for row in range(size):
+        cell = (view * size + row) * size
+        for pixel_row in range(world.tile):
+            source = turned + pixel_row * line
+            for column in range(size):
+                _copy_line(out, to, world.atlas, source + whole(codes[cell + column]) * tile_bytes, line)
+                to += line
 
 
 @inlined

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from pettingzoo.utils.conversions import parallel_to_aec
-
-from hecogrid_envs.constants import RenderMode
+from hecogrid_envs.core.jit import inlined
+from hecogrid_envs.core.occupancy import count_here, count_near
+from hecogrid_envs.core.types import Games, World
 from hecogrid_envs.parallel_env import HECOGridEnv
-from hecogrid_envs.params import TaskName
+from hecogrid_envs.task import Task
+
+
+@inlined
+def _group_is_here_with_key(games: Games, world: World, e: int, agent: int, old_x: int, old_y: int) -> bool:
+    if not games.has_key[e, agent]:
+        return False
+    if world.released:
+        return count_near(games, world, e, agent, old_x, old_y) >= world.coordination
+    return count_here(games, world, e, agent) >= world.coordination
 
 
 class KeyForTreasureEnv(HECOGridEnv):
@@ -27,14 +36,8 @@ class KeyForTreasureEnv(HECOGridEnv):
     ```
     """
 
-    task: ClassVar[TaskName] = "KeyForTreasure"
+    declaration: ClassVar = Task("KeyForTreasure", _group_is_here_with_key, has_keys=True)
 
 
-def parallel_env(render_mode: RenderMode | None = None, **params: Any) -> KeyForTreasureEnv:
-    """KeyForTreasure as a ParallelEnv; parameters as in :class:`~hecogrid_envs.params.HECOGridParams`."""
-    return KeyForTreasureEnv(render_mode=render_mode, **params)
-
-
-def env(render_mode: RenderMode | None = None, **params: Any) -> Any:
-    """KeyForTreasure in turn-based (AEC) form."""
-    return parallel_to_aec(parallel_env(render_mode=render_mode, **params))
+parallel_env = KeyForTreasureEnv
+env = KeyForTreasureEnv.turn_based

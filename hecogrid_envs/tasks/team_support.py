@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from pettingzoo.utils.conversions import parallel_to_aec
-
-from hecogrid_envs.constants import RenderMode
+from hecogrid_envs.core.jit import inlined
+from hecogrid_envs.core.occupancy import count_near
+from hecogrid_envs.core.types import Games, World
 from hecogrid_envs.parallel_env import HECOGridEnv
-from hecogrid_envs.params import TaskName
+from hecogrid_envs.task import Task
+
+
+@inlined
+def _group_is_near(games: Games, world: World, e: int, agent: int, old_x: int, old_y: int) -> bool:
+    return count_near(games, world, e, agent, old_x, old_y) >= world.coordination
 
 
 class TeamSupportEnv(HECOGridEnv):
@@ -27,14 +32,8 @@ class TeamSupportEnv(HECOGridEnv):
     ```
     """
 
-    task: ClassVar[TaskName] = "TeamSupport"
+    declaration: ClassVar = Task("TeamSupport", _group_is_near)
 
 
-def parallel_env(render_mode: RenderMode | None = None, **params: Any) -> TeamSupportEnv:
-    """TeamSupport as a ParallelEnv; parameters as in :class:`~hecogrid_envs.params.HECOGridParams`."""
-    return TeamSupportEnv(render_mode=render_mode, **params)
-
-
-def env(render_mode: RenderMode | None = None, **params: Any) -> Any:
-    """TeamSupport in turn-based (AEC) form."""
-    return parallel_to_aec(parallel_env(render_mode=render_mode, **params))
+parallel_env = TeamSupportEnv
+env = TeamSupportEnv.turn_based

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from pettingzoo.utils.conversions import parallel_to_aec
-
-from hecogrid_envs.constants import RenderMode
+from hecogrid_envs.constants import BLACK, GOLD, YELLOW
+from hecogrid_envs.core.jit import inlined
+from hecogrid_envs.core.occupancy import count_here
+from hecogrid_envs.core.types import Games, World
 from hecogrid_envs.parallel_env import HECOGridEnv
-from hecogrid_envs.params import TaskName
+from hecogrid_envs.task import Task
+
+
+@inlined
+def _group_is_here(games: Games, world: World, e: int, agent: int, old_x: int, old_y: int) -> bool:
+    return count_here(games, world, e, agent) >= world.coordination
 
 
 class TeamTogetherEnv(HECOGridEnv):
@@ -27,14 +33,8 @@ class TeamTogetherEnv(HECOGridEnv):
     ```
     """
 
-    task: ClassVar[TaskName] = "TeamTogether"
+    declaration: ClassVar = Task("TeamTogether", _group_is_here, treasure=YELLOW, collected_released=BLACK, gem=GOLD)
 
 
-def parallel_env(render_mode: RenderMode | None = None, **params: Any) -> TeamTogetherEnv:
-    """TeamTogether as a ParallelEnv; parameters as in :class:`~hecogrid_envs.params.HECOGridParams`."""
-    return TeamTogetherEnv(render_mode=render_mode, **params)
-
-
-def env(render_mode: RenderMode | None = None, **params: Any) -> Any:
-    """TeamTogether in turn-based (AEC) form."""
-    return parallel_to_aec(parallel_env(render_mode=render_mode, **params))
+parallel_env = TeamTogetherEnv
+env = TeamTogetherEnv.turn_based

@@ -108,7 +108,7 @@ def _hecogrid(
 ) -> VecEnv:
     """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
     from hecogrid_envs import make_vec_env
-    from hecogrid_envs.params import check_task
+    from hecogrid_envs.task import check_task
 
     try:
         name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from hecogrid_envs.params import TaskName
+from hecogrid_envs.task import TaskName
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.names import unknown_name

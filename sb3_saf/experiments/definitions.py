@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Final, NamedTuple
 
-from hecogrid_envs.params import TaskName
+from hecogrid_envs.task import TaskName
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.yaml_files import Size
 

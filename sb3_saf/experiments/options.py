@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from hecogrid_envs.params import check_task
+from hecogrid_envs.task import check_task
 from sb3_saf.experiments.cells import Choice, Protocol
 from sb3_saf.experiments.definitions import DEFAULT_SEEDS, Level
 from sb3_saf.experiments.engine import Engine

@@ -15,8 +15,10 @@ from typing import Any, Final, get_args
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from hecogrid_envs import TASK_NAMES
 from hecogrid_envs.constants import RenderMode
-from hecogrid_envs.params import TASK_NAMES, HECOGridParams, TaskName
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.task import TaskName
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.make import make_team_env
