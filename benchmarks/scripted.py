@@ -25,8 +25,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from benchmarks.scripted_teams import TEAMS
+from hecogrid_envs import TASK_NAMES
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.params import TASK_NAMES, HECOGridParams
+from hecogrid_envs.params import HECOGridParams
 from sb3_saf.evaluation import confidence_interval
 
 #: Size ``small``, and twice as many agents at the same density.

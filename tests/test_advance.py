@@ -121,7 +121,7 @@ def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) 
 
 def test_arrays_of_games_share_no_cache_line() -> None:
     batch = batch_of()
-    arrays = [*batch._games, *batch._buffers]
+    arrays: list[Any] = [*batch._games, *batch._buffers]
     lines = [range(array.ctypes.data // 64, (array.ctypes.data + array.nbytes - 1) // 64 + 1) for array in arrays]
     assert all(array.ctypes.data % 64 == 0 for array in arrays)
     assert len({line for own in lines for line in own}) == sum(map(len, lines))

@@ -55,7 +55,7 @@ def test_pettingzoo_conformance(task: str) -> None:
 
 
 def test_max_cycles(task: str) -> None:
-    max_cycles_test(importlib.import_module(TASKS[task].__module__))  # type: ignore[index]
+    max_cycles_test(importlib.import_module(TASKS[task].__module__))
 
 
 def test_renders_in_every_mode(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,7 +69,7 @@ def test_renders_in_every_mode(task: str, monkeypatch: pytest.MonkeyPatch) -> No
 def test_made_by_name(task: str) -> None:
     register_with_pettingzoo()  # a second time is silent
     env = pettingzoo.make("parallel", f"hecogrid/{task}-v0", n_agents=3)
-    assert isinstance(env, TASKS[task])  # type: ignore[index]
+    assert isinstance(env, TASKS[task])
     assert len(env.possible_agents) == 3
     aec = pettingzoo.make("aec", f"hecogrid/{task}-v0", n_agents=2, max_cycles=7)
     aec.reset(seed=0)
@@ -177,7 +177,7 @@ def test_gymnasium_checks(task: str) -> None:
 
 
 def test_documentation_page(task: str) -> None:
-    page = TASKS[task].__doc__  # type: ignore[index]
+    page = TASKS[task].__doc__
     assert page is not None
     for heading in ("Description", "Actions", "Observation", "State", "Reward and end", "Arguments", "Version history"):
         assert f"## {heading}" in page
