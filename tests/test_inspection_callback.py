@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,9 @@ from sb3_saf import (
 from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.inspection import film
 from sb3_saf.inspection.calibration import calibrate, lambda_returns
-from sb3_saf.inspection.doors import zone_function
-from sb3_saf.inspection.episodes import Played, Player
-from sb3_saf.inspection.report import critic_scalars, message_scalars, pool_scalars
+from sb3_saf.inspection.games import zone_function
+from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
+from sb3_saf.inspection.scalars import critic_scalars, message_scalars, pool_scalars
 from sb3_saf.networks.actor import PoolOutput
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
@@ -155,6 +156,7 @@ class TestPage:
             *(f"pool_by_zone/zone_{zone}/policy_{policy}" for zone in range(2) for policy in range(3)),
             *(f"knowledge_source/{way}_entropy{of}" for way in ("write", "read") for of in ("", "_of_mean")),
             *(f"knowledge_source/read/slot_{slot}" for slot in range(2)),
+            "message/strength",
             *(f"message/value_error{without}" for without in ("", "_zeroed", "_shuffled")),
             *("critic/mean_value", "critic/mean_return", "critic/bias", "critic/error", "critic/td_error"),
             *("critic/slope", "critic/explained_variance", "critic/explained_variance_of_target"),
@@ -187,6 +189,9 @@ class TestPage:
         for word in (b"TeamSupport", b"n_policies", b"learning_rate"):
             assert word in told["_hparams_/session_start_info"]
         assert b"team/return" in told["_hparams_/experiment"]
+        text = page.Tensors("about/text_summary")[0].tensor_proto.string_val[0].decode()
+        explained = set(re.findall(r"`([a-z_]+)/", text))
+        assert groups(page.Tags()["scalars"]) <= explained
 
     def test_before_during_and_after_training(self, page: EventAccumulator) -> None:
         # 20 games' steps a rollout, three agents' steps each.
@@ -264,13 +269,12 @@ def test_reward_normalisation_is_that_of_training(tmp_path: Path) -> None:
     callback = InspectionCallback(ToyTeams(), n_eval_episodes=4, pictures=False)
     env = VecNormalize(ToyTeams(), norm_obs=False, clip_reward=1e9)
     learn(tmp_path, callback, env=env, n_updates=4)
-    plain, scale = Player(ToyTeams(), 4, 20_000, False, None), math.sqrt(env.ret_rms.var + env.epsilon)
-    model = callback.model
-    th.manual_seed(20_000)
-    game = plain.play(model.policy)  # type: ignore[arg-type]
+    model, scale = callback.model, math.sqrt(env.ret_rms.var + env.epsilon)
+    plain = record_episodes(model.policy, ToyTeams(), 4, gamma=0.9)
     found = scalars_of(tmp_path)
-    assert found["team/return"][-1] == pytest.approx(np.mean(game.returns), rel=1e-5)
-    mean_return = lambda_returns(game._replace(rewards=game.rewards / scale), 0.9)[game.counted].mean()
+    assert found["team/return"][-1] == pytest.approx(np.mean(plain.episode_returns), rel=1e-5)
+    returns = lambda_returns(plain.rewards / scale, plain.ends, plain.last_values, plain.values, 0.9)
+    mean_return = returns[plain.counted].mean()
     assert found["critic/mean_return"][-1] == pytest.approx(mean_return, rel=1e-4)
     assert abs(scale - 1) > 0.01
 
@@ -285,9 +289,8 @@ def hand_made(policy_class: type[TeamPolicy], env: Any, **kwargs: Any) -> Any:
     )
 
 
-def play(env: Any, policy: TeamPolicy, n_episodes: int = 64, zones: Any = None) -> Played:
-    th.manual_seed(0)
-    return Player(env, n_episodes, seed=3, deterministic=False, zones=zone_function(env, zones)).play(policy)
+def play(env: Any, policy: TeamPolicy, n_episodes: int = 64, zones: Any = None, gamma: float = 0.5) -> EpisodeRecording:
+    return record_episodes(policy, env, n_episodes, seed=3, zones=zones, gamma=gamma)
 
 
 class ExactCritic(nn.Module):
@@ -317,11 +320,11 @@ class TestCritic:
         policy = hand_made(IPPOPolicy, env)
         policy.value_net = ExactCritic()
         game = play(env, policy)
-        returns = lambda_returns(game, 0.5)
+        returns = game.returns
         assert set(np.abs(returns[game.counted]).tolist()) == {0.25, 0.5, 1.0}
         found = calibrate(game.values[game.counted], returns[game.counted])
         assert found == pytest.approx((1, 1, 0, 0))
-        scalars = critic_scalars(game, 0.5, 0.9)
+        scalars = critic_scalars(game, 0.9)
         assert scalars["critic/td_error"] == pytest.approx(0)
         assert scalars["critic/explained_variance_of_target"] == pytest.approx(1)
 
@@ -331,7 +334,7 @@ class TestCritic:
         env = make_team_env(ConstantReward(length=2), n_envs=4, time_limit=time_limit)
         policy = hand_made(IPPOPolicy, env)
         policy.value_net = Always(2.0)
-        assert critic_scalars(play(env, policy), 0.5, 1.0)["critic/bias"] == pytest.approx(bias)
+        assert critic_scalars(play(env, policy), 1.0)["critic/bias"] == pytest.approx(bias)
 
     def test_values_are_the_policys(self) -> None:
         env = ToyTeams()
@@ -350,8 +353,8 @@ class TestWhatCounts:
         env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
         game = play(env, hand_made(IPPOPolicy, env), n_episodes=3)
         assert game.counted[:, ::3].T.tolist() == [[True, True, True, False], [True] * 4]
-        assert game.returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1]
-        assert game.lengths == [2, 3, 2]
+        assert game.episode_returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1]
+        assert game.episode_lengths == [2, 3, 2]
 
     def test_agents_that_take_no_part_do_not_count(self) -> None:
         """Illegal actions stop this environment; agents die and join."""
@@ -363,12 +366,12 @@ class TestWhatCounts:
         # Agent 0 ends with step 3, and all with step 5; who is not there yet has nothing to end.
         assert game.ends[:, 0].tolist() == [False, False, True, True, True]
         assert game.ends[:, 2].tolist() == [False, False, False, False, True]
-        assert game.write is not None and game.actions is not None
-        assert ((game.write > 0) == active[:, np.newaxis, np.newaxis]).all()
+        assert game.write_attention is not None and game.pool_actions is not None
+        assert ((game.write_attention > 0) == active[:, np.newaxis, np.newaxis]).all()
         legal = np.array(
             [[(action + agent + step) % 2 == 0 for action in range(4)] for agent in (0,) for step in (0, 1)]
         )
-        assert ((game.actions[:2, 0, 0] > -1e7) == legal).all()
+        assert ((game.pool_actions[:2, 0, 0] > -1e7) == legal).all()
 
 
 class ZonedProbe(Probe):
@@ -443,7 +446,7 @@ class TestMessages:
     def test_a_critic_that_needs_messages_is_wrong_without(self) -> None:
         """The value is what the next agent sees, -1 or 1: no guess without the message has an error below 1."""
         policy = train_on_probe("SAFPolicy", Message(n_agents=3), n_updates=25)
-        scalars = message_scalars(play(make_team_env(Message(n_agents=3), n_envs=64), policy, 128), gamma=0.9)
+        scalars = message_scalars(play(make_team_env(Message(n_agents=3), n_envs=64), policy, 128, gamma=0.9))
         assert scalars["message/value_error"] < 0.3
         assert scalars["message/value_error_zeroed"] > 0.9
         assert scalars["message/value_error_shuffled"] > 0.9
@@ -456,17 +459,18 @@ class TestMessages:
         first = critic.combine_net[0]
         assert isinstance(first, nn.Linear)
         first.weight.data[:, 8:] = 0  # the half that reads m
-        scalars = message_scalars(play(env, policy), gamma=0.9)
+        scalars = message_scalars(play(env, policy, gamma=0.9))
         assert scalars["message/value_error_zeroed"] == pytest.approx(scalars["message/value_error"], rel=1e-5)
         assert scalars["message/value_error_shuffled"] == pytest.approx(scalars["message/value_error"], rel=1e-5)
 
     def test_a_critic_without_messages_reports_none(self) -> None:
         env = make_team_env(Message(n_agents=3), n_envs=4)
-        assert message_scalars(play(env, hand_made(IPPOPolicy, env)), gamma=0.9) == {}
+        assert message_scalars(play(env, hand_made(IPPOPolicy, env))) == {}
 
     def test_a_single_game_has_nobody_to_shuffle_with(self) -> None:
         env = make_team_env(Message(n_agents=3), n_envs=1)
-        assert set(message_scalars(play(env, hand_made(SAFPolicy, env), 4), 0.9)) == {
+        assert set(message_scalars(play(env, hand_made(SAFPolicy, env), 4))) == {
+            "message/strength",
             "message/value_error",
             "message/value_error_zeroed",
         }

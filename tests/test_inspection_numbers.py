@@ -10,10 +10,9 @@ import numpy.typing as npt
 import pytest
 from gymnasium import spaces
 
+from sb3_saf.inspection.attention import attention_of
 from sb3_saf.inspection.calibration import calibrate, lambda_returns, reliability
-from sb3_saf.inspection.doors import ReturnScale
-from sb3_saf.inspection.episodes import Played
-from sb3_saf.inspection.knowledge import attention_of
+from sb3_saf.inspection.games import ReturnScale
 from sb3_saf.inspection.pool import (
     chosen_by,
     differences,
@@ -21,65 +20,73 @@ from sb3_saf.inspection.pool import (
     selection_entropy,
     zone_dependence,
 )
-from sb3_saf.inspection.report import pool_scalars, team_scalars
+from sb3_saf.inspection.recording import EpisodeRecording
+from sb3_saf.inspection.scalars import pool_scalars, targets, team_scalars
 
 Array = npt.NDArray[Any]
 
 
-def played(**changes: Any) -> Played:
+def recorded(**changes: Any) -> EpisodeRecording:
     """Two agents of one game, one episode of three steps."""
-    usual = Played(
+    usual = EpisodeRecording(
         n_agents=2,
         of_team=False,
+        gamma=0.5,
+        observations=None,
+        actions=np.zeros((3, 2), dtype=np.int64),
+        action_probabilities=None,
         counted=np.ones((3, 2), dtype=bool),
         rewards=np.array([[1, 0], [2, 0], [4, 8]], dtype=np.float32),
         ends=np.array([[False] * 2, [False] * 2, [True] * 2]),
         last_values=np.zeros((3, 2), dtype=np.float32),
         values=np.zeros((3, 2), dtype=np.float32),
+        returns=np.zeros((3, 2)),
         zones=None,
-        weights=None,
-        actions=None,
-        write=None,
-        read=None,
+        pool_weights=None,
+        pool_actions=None,
+        write_attention=None,
+        read_attention=None,
+        message_strengths=None,
         values_without={},
-        returns=[15.0],
-        lengths=[3],
+        episode_returns=[15.0],
+        episode_lengths=[3],
         pictures=[],
     )
     return usual._replace(**changes)
 
 
 class TestReturns:
-    def test_discounted_returns(self) -> None:
-        returns = lambda_returns(played(), gamma=0.5)
-        # 1 + 2 / 2 + 4 / 4 and 8 / 4; 2 + 4 / 2 and 8 / 2; 4 and 8.
-        assert returns.tolist() == [[3, 2], [4, 4], [4, 8]]
+    LAST = np.array([[0, 0], [0, 0], [8, 16]], dtype=np.float32)
+    VALUES = np.array([[100, 200], [10, 20], [30, 40]], dtype=np.float32)
 
-    def test_nothing_comes_back_from_the_next_episode(self) -> None:
-        ends = np.array([[True] * 2, [False] * 2, [True] * 2])
-        assert lambda_returns(played(ends=ends), gamma=0.5).tolist() == [[1, 0], [4, 4], [4, 8]]
-
-    def test_a_time_limit_that_is_no_true_end_is_followed_by_a_value(self) -> None:
-        last = np.array([[0, 0], [0, 0], [8, 16]], dtype=np.float32)
-        assert lambda_returns(played(last_values=last), gamma=0.5).tolist() == [[4, 4], [6, 8], [8, 16]]
-
-    def test_an_agents_own_end_ends_its_return_alone(self) -> None:
-        ends = np.array([[False, True], [False, False], [True, True]])
-        assert lambda_returns(played(ends=ends), gamma=0.5).tolist() == [[3, 0], [4, 4], [4, 8]]
-
-    def test_one_step_targets(self) -> None:
-        values = np.array([[100, 200], [10, 20], [30, 40]], dtype=np.float32)
-        assert lambda_returns(played(values=values), gamma=0.5, lam=0).tolist() == [[6, 10], [17, 20], [4, 8]]
+    @pytest.mark.parametrize(
+        ("changes", "lam", "expected"),
+        [
+            # 1 + 2 / 2 + 4 / 4 and 8 / 4; 2 + 4 / 2 and 8 / 2; 4 and 8.
+            ({}, 1, [[3, 2], [4, 4], [4, 8]]),
+            # Nothing comes back from the next episode.
+            ({"ends": np.array([[True] * 2, [False] * 2, [True] * 2])}, 1, [[1, 0], [4, 4], [4, 8]]),
+            # A time limit that is no true end is followed by a value.
+            ({"last_values": LAST}, 1, [[4, 4], [6, 8], [8, 16]]),
+            # An agent's own end ends its return alone.
+            ({"ends": np.array([[False, True], [False, False], [True, True]])}, 1, [[3, 0], [4, 4], [4, 8]]),
+            # One step, then the value.
+            ({"values": VALUES}, 0, [[6, 10], [17, 20], [4, 8]]),
+        ],
+    )
+    def test_targets_by_hand(self, changes: dict[str, Any], lam: float, expected: list[list[float]]) -> None:
+        assert targets(recorded(**changes), lam).tolist() == expected
 
     def test_targets_in_between_are_gae_plus_values(self) -> None:
         rng = np.random.default_rng(0)
         values = rng.normal(size=(3, 2)).astype(np.float32)
-        targets = lambda_returns(played(values=values), gamma=0.9, lam=0.7)
+        one = recorded()
+        found = lambda_returns(one.rewards, one.ends, one.last_values, values, gamma=0.9, lam=0.7)
         advantage = np.zeros(2)
         for t in (2, 1, 0):
             following = values[t + 1] if t < 2 else np.zeros(2)
-            advantage = played().rewards[t] + 0.9 * following - values[t] + 0.9 * 0.7 * advantage * (t < 2)
-            np.testing.assert_allclose(targets[t], advantage + values[t], rtol=1e-6)
+            advantage = one.rewards[t] + 0.9 * following - values[t] + 0.9 * 0.7 * advantage * (t < 2)
+            np.testing.assert_allclose(found[t], advantage + values[t], rtol=1e-6)
 
 
 class TestCalibration:
@@ -136,11 +143,11 @@ class TestSelection:
     def test_a_pool_with_known_choices_has_these_scalars(self) -> None:
         weights = np.array([[[0.75, 0.25], [0, 1]], [[0.25, 0.75], [0, 1]], [[1, 0], [1, 0]]])
         counted = np.array([[True] * 2, [True] * 2, [False] * 2])
-        game = played(
+        game = recorded(
             counted=counted,
-            weights=weights,
+            pool_weights=weights,
             zones=np.array([[0, 1], [0, 1], [1, 0]]),
-            actions=np.zeros((3, 2, 2, 3)),
+            pool_actions=np.zeros((3, 2, 2, 3)),
         )
         scalars = pool_scalars(game, spaces.Discrete(3))
         expected = {
@@ -208,7 +215,7 @@ class TestAttention:
 
 
 def test_team_scalars() -> None:
-    game = played(returns=[10.0, 20.0], lengths=[3, 5])
+    game = recorded(episode_returns=[10.0, 20.0], episode_lengths=[3, 5])
     scalars = team_scalars(game, ReturnScale("treasures", 30))
     assert scalars["team/return"] == 15
     assert scalars["team/episode_length"] == 4
@@ -216,4 +223,4 @@ def test_team_scalars() -> None:
     # Student's t for one degree of freedom: 12.706 standard errors of 5.
     assert scalars["team/return_high"] == pytest.approx(15 + 12.7062 * 5, rel=1e-4)
     assert "team/share_of_best_return" not in team_scalars(game, ReturnScale(None, None))
-    assert "team/return_low" not in team_scalars(played(), ReturnScale(None, None))
+    assert "team/return_low" not in team_scalars(recorded(), ReturnScale(None, None))

@@ -13,9 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_saf import QPLEX, InspectionCallback, evaluate_team, make_team_env
-from sb3_saf.inspection.calibration import lambda_returns
-from sb3_saf.inspection.episodes import Player
-from sb3_saf.inspection.q_insides import QInsides
+from sb3_saf.inspection.reading import QReader
+from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.qplex.policies import QPLEXPolicy
 from tests.probe_envs import ConstantReward
@@ -82,7 +81,7 @@ def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
     env = telling()
     policy = policy_on(env, mixer="vdn")
     obs = rows_of(env)
-    view = QInsides(policy).look(obs, np.ones(12, dtype=bool))
+    view = QReader(policy).step(obs, np.ones(12, dtype=bool))
     best = policy.own_q_values(obs).max(dim=1).values.view(4, 3)
     best[:, 2] = 0  # joins later
     np.testing.assert_allclose(view.values.view(4, 3), best.sum(dim=1, keepdim=True).expand(4, 3), rtol=1e-6)
@@ -93,9 +92,9 @@ def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
 def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
     env = telling()
     team = policy_on(env, policy)
-    played = Player(env, 8, seed=3, deterministic=False, zones=None).play(team)
+    recording = record_episodes(team, env, 8, seed=3, gamma=0.5)
     env.seed(3)
-    assert played.returns == evaluate_team(team, env, 8).returns
+    assert recording.episode_returns == evaluate_team(team, env, 8).returns
 
 
 @pytest.mark.parametrize(("time_limit", "mean_return"), [("terminal", 2 * (1.5 + 1) / 2), ("bootstrap", None)])
@@ -103,22 +102,22 @@ def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> No
     """Two agents with 1 each at both steps; a time limit that is no end is followed by the value of what comes."""
     env = make_team_env(ConstantReward(n_agents=2, length=2), n_envs=4, time_limit=time_limit)
     team = policy_on(env)
-    played = Player(env, 4, seed=0, deterministic=False, zones=None).play(team)
-    assert played.returns == [4.0] * 4
-    assert (played.rewards == 2).all()
-    returns = lambda_returns(played, 0.5)
+    recording = record_episodes(team, env, 4, seed=0, gamma=0.5)
+    assert recording.episode_returns == [4.0] * 4
+    assert (recording.rewards == 2).all()
+    returns = recording.returns
     if mean_return is not None:
         assert returns.mean() == mean_return
         return
-    assert (played.last_values[1] != 0).all() and (played.last_values[0] == 0).all()
-    np.testing.assert_allclose(returns[1], 2 + 0.5 * played.last_values[1])
+    assert (recording.last_values[1] != 0).all() and (recording.last_values[0] == 0).all()
+    np.testing.assert_allclose(returns[1], 2 + 0.5 * recording.last_values[1])
 
 
 def test_an_agents_end_is_not_the_teams() -> None:
     env = telling()
-    played = Player(env, 4, seed=0, deterministic=False, zones=None).play(policy_on(env))
-    assert played.of_team
-    assert played.ends.all(axis=1).tolist() == played.ends.any(axis=1).tolist() == [False] * 4 + [True]
+    recording = record_episodes(policy_on(env), env, 4, seed=0, gamma=0.5)
+    assert recording.of_team
+    assert recording.ends.all(axis=1).tolist() == recording.ends.any(axis=1).tolist() == [False] * 4 + [True]
 
 
 @th.no_grad()
@@ -126,7 +125,7 @@ def test_heads_of_a_pool_differ_where_their_best_actions_do() -> None:
     env = telling(masks=None, joins={}, deaths={})
     team = policy_on(env, "QPLEXPoolPolicy", n_policies=2)
     obs = rows_of(env)
-    view = QInsides(team).look(obs, np.ones(12, dtype=bool))
+    view = QReader(team).step(obs, np.ones(12, dtype=bool))
     assert view.pool is not None
     np.testing.assert_allclose(view.pool.weights.sum(dim=1), 1, rtol=1e-5)
     assert isinstance(team.actor, PolicyPool)

@@ -1,5 +1,5 @@
 """
-Is the critic right? Its values against the discounted returns that followed.
+Calibration of a critic: its values against the discounted returns that followed.
 
 Letters: T game steps, B rows, n values.
 """
@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sb3_saf.inspection.episodes import Played
-
 Floats = npt.NDArray[np.floating[Any]]
 Doubles = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 
 #: Spread below which values or returns count as constant.
 _CONSTANT = 1e-9
@@ -52,9 +51,11 @@ class Bin(NamedTuple):
     std: float
 
 
-def lambda_returns(played: Played, gamma: float, lam: float = 1.0) -> Doubles:
+def lambda_returns(
+    rewards: Floats, ends: Bools, last_values: Floats, values: Floats, gamma: float, lam: float = 1.0
+) -> Doubles:
     """
-    What the critic is trained towards: TD(lambda) targets, with the discounted return as the case ``lam=1``.
+    Compute TD(lambda) targets, which the critic learns; with ``lam=1`` they are the discounted returns.
 
     ::
 
@@ -65,17 +66,20 @@ def lambda_returns(played: Played, gamma: float, lam: float = 1.0) -> Doubles:
     else 0. These are SB3's advantages by GAE plus values. Rows of episodes that were not played to their end are to be
     left out.
 
-    :param played: episodes
+    :param rewards: (T, B)
+    :param ends: (T, B)
+    :param last_values: (T, B)
+    :param values: (T, B)
     :param gamma: discount factor
     :param lam: lambda
     :return: (T, B)
     """
-    targets: Doubles = np.zeros(played.rewards.shape)
-    values = np.asarray(played.values, dtype=np.float64)
+    targets: Doubles = np.zeros(rewards.shape)
+    values = np.asarray(values, dtype=np.float64)
     ahead = next_value = np.zeros_like(values[0])
     for t in reversed(range(len(targets))):
         going_on = (1 - lam) * next_value + lam * ahead
-        targets[t] = played.rewards[t] + gamma * np.where(played.ends[t], played.last_values[t], going_on)
+        targets[t] = rewards[t] + gamma * np.where(ends[t], last_values[t], going_on)
         ahead, next_value = targets[t], values[t]
     return targets
 
@@ -100,7 +104,7 @@ def calibrate(values: Floats, returns: Floats) -> Calibration:
 
 def reliability(values: Floats, returns: Floats, n_bins: int = 10) -> list[Bin]:
     """
-    Mean return by size of the value, in bins of equally many values.
+    Compute the mean return by size of the value, in bins of equally many values.
 
     :param values: (n,)
     :param returns: (n,)
@@ -113,7 +117,7 @@ def reliability(values: Floats, returns: Floats, n_bins: int = 10) -> list[Bin]:
 
 def rmse(values: Floats, returns: Floats) -> float:
     """
-    Root mean square error of values.
+    Compute the root mean square error of values.
 
     :param values: (n,)
     :param returns: (n,)

@@ -1,4 +1,4 @@
-"""The callback that writes what is worth watching about a team policy to TensorBoard."""
+"""The callback that inspects a team policy while it trains, and writes what it finds to TensorBoard."""
 
 from __future__ import annotations
 
@@ -15,25 +15,24 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.teams import check_count, require_n_agents
-from sb3_saf.inspection.doors import Zones, check_zones, zone_function
-from sb3_saf.inspection.episodes import Player
-from sb3_saf.inspection.inspection import Inspection, inspect_with
-from sb3_saf.inspection.kinds import require_our_policy
-from sb3_saf.inspection.page import Page, hparams, hyperparameters
+from sb3_saf.inspection.games import Zones, check_zones
+from sb3_saf.inspection.inspection import Inspection, inspect_team
+from sb3_saf.inspection.reading import require_our_policy
+from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
 
 
 class InspectionCallback(BaseCallback):
     """
-    Look into SAF, MAPPO, IPPO and QPLEX while they train.
+    Inspect SAF, MAPPO, IPPO and QPLEX while they train.
 
-    Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes, and what
-    it does and thinks is written to the run's own TensorBoard file: team returns; which policy of the pool acts, by
-    zone and by agent; who writes to and reads from the slots of the knowledge source; the critic's calibration; how
-    much its values owe to messages; an episode as pictures; hyperparameters; and a layout of the custom scalars page.
-    ``docs/tensorboard.md`` says how to read it. What a policy or an environment lacks is left out.
+    Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes. The run's
+    own TensorBoard file gets team returns; which policy of the pool acts, by zone and by agent; attention and messages
+    of the knowledge source; the critic's calibration, with and without messages; an episode as pictures;
+    hyperparameters; a text that explains the tags; and a layout of the custom scalars page. ``docs/tensorboard.md``
+    says how to read it. What a policy or an environment lacks is left out.
 
-    Training goes on as if nothing had happened: no generator that it draws from moves.
+    Training is not affected: no generator that it draws from moves.
 
     :param eval_env: environment of teams of its own, for instance from ``make_team_env`` with ``n_envs=16`` and, for
         pictures of episodes, ``render_mode="rgb_array"``
@@ -75,7 +74,8 @@ class InspectionCallback(BaseCallback):
         self.eval_env = eval_env
         self.pictures = pictures
         self.hparams = dict(hparams or {})
-        self.player = Player(eval_env, n_eval_episodes, int(seed), deterministic, zone_function(eval_env, zones))
+        self.n_eval_episodes, self.seed, self.deterministic = n_eval_episodes, int(seed), deterministic
+        self.zones = zones
         #: Seconds spent so far.
         self.seconds = 0.0
         self._next = 0
@@ -93,15 +93,15 @@ class InspectionCallback(BaseCallback):
         self.seconds = 0.0
         if not self._page.has_tensorboard:
             warnings.warn(
-                "The model writes no TensorBoard file, so nobody will see what InspectionCallback draws: pass "
+                "The model writes no TensorBoard file, so nothing shows what InspectionCallback draws: pass "
                 "tensorboard_log='...' to the algorithm.",
                 UserWarning,
                 stacklevel=2,
             )
         scalars = self._inspect()
         policy = require_our_policy(self.model.policy)
-        self._page.arrange(scalars, value_based=isinstance(policy, QPLEXPolicy))
-        self._page.show("hparams", hparams(hyperparameters(self.model, policy, self.hparams), scalars))
+        self._page.explain(scalars, value_based=isinstance(policy, QPLEXPolicy))
+        self._page.show("hparams", hyperparameters(self.model, policy, self.hparams, scalars))
         self._page.write(self.num_timesteps)
 
     def _on_step(self) -> bool:
@@ -122,14 +122,25 @@ class InspectionCallback(BaseCallback):
     # --- what -------------------------------------------------------------------------------------------------------
 
     def _inspect(self) -> dict[str, float]:
-        """Play, write, and say what it cost."""
+        """Play, write, and return the scalars."""
         began = time.perf_counter()
         now = self._game_steps()
         self._last, self._next = now, (now // self.every_game_steps + 1) * self.every_game_steps
-        seen = inspect_with(self.player, self.model, self._reward_normalisation(), draw=self.pictures)
-        scalars = seen.scalars
+        if isinstance(self.eval_env, VecNormalize) and self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        inspection = inspect_team(
+            self.model,
+            self.eval_env,
+            self.n_eval_episodes,
+            self.seed,
+            self.deterministic,
+            self.zones,
+            pictures=self.pictures,
+            observations=False,
+        )
+        scalars = inspection.scalars
         if self.pictures and self._page.has_tensorboard:
-            self._draw(seen)
+            self._draw(inspection)
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began
         self._page.scalars(self._costs())
@@ -141,29 +152,20 @@ class InspectionCallback(BaseCallback):
             )
         return scalars
 
-    def _reward_normalisation(self) -> VecNormalize | None:
-        """What normalises the rewards that the critic learns from."""
-        normalising = self.model.get_vec_normalize_env()
-        if normalising is None:
-            return None
-        if isinstance(self.eval_env, VecNormalize):
-            sync_envs_normalization(self.training_env, self.eval_env)
-        return normalising
-
     def _costs(self) -> dict[str, float]:
         # At the start there is no training yet that it could be a share of.
         elapsed = time.perf_counter() - self._started
         costs = {"time/inspection_seconds": self.seconds}
         return costs | {"time/inspection_share": self.seconds / elapsed} if self._game_steps() else costs
 
-    def _draw(self, seen: Inspection) -> None:
-        self._page.show("team/return_of_each_episode", th.tensor(seen.played.returns))
+    def _draw(self, inspection: Inspection) -> None:
+        self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))
         if self.model.ep_info_buffer:
             recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
             self._page.show("rollout/team_return_of_each_episode", recent)
-        for tag, figure in seen.figures.items():
+        for tag, figure in inspection.figures.items():
             self._page.show(tag, Figure(figure, close=True))
-        strip, film = seen.strip, seen.film
+        strip, film = inspection.strip, inspection.film
         if strip is not None and film is not None:
             self._page.show("episode/strip", Image(strip, "HWC"))
             self._page.gif("episode/film", film, self.num_timesteps)

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from sb3_saf.inspection.doors import Picture
+from sb3_saf.inspection.games import Picture
 
 #: Pixels: height of a moment in the strip, and of the GIF.
 _HEIGHT: Final = 320
@@ -21,7 +21,7 @@ _COLOURS: Final = 64
 
 def strip(pictures: Sequence[Picture]) -> Picture:
     """
-    Six moments, evenly spread from the first to the last, in two rows; fewer in one where there are no more.
+    Join six moments, evenly spread from the first to the last, in two rows; fewer in one where there are no more.
 
     :param pictures: (height, width, 3) each
     :return: (height, width, 3)
@@ -33,7 +33,7 @@ def strip(pictures: Sequence[Picture]) -> Picture:
 
 
 def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
-    """With white gaps."""
+    """Join pictures with white gaps."""
     height, width, _ = pictures[0].shape
     gap = np.full((height, _GAP, 3) if axis == 1 else (_GAP, width, 3), 255, dtype=np.uint8)
     return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
@@ -41,7 +41,7 @@ def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
 
 def gif(pictures: Sequence[Picture]) -> bytes:
     """
-    All pictures, one after another, for ever.
+    Encode all pictures as a GIF that repeats.
 
     TensorBoard shows a GIF like any image; SB3's ``Video`` makes one, too, but needs moviepy for it.
 
@@ -62,7 +62,7 @@ def gif(pictures: Sequence[Picture]) -> bytes:
 
 
 def _scaled(picture: Picture) -> Picture:
-    """Not higher than ``_HEIGHT``."""
+    """Scale a picture down to ``_HEIGHT``."""
     from PIL import Image
 
     height, width, _ = picture.shape

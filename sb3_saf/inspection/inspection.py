@@ -1,4 +1,4 @@
-"""One look into a team: its episodes, as numbers, figures and a film."""
+"""Inspection of a team: its recorded episodes as numbers, figures and a film."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.envs.teams import check_count
-from sb3_saf.inspection import figures, film, report
-from sb3_saf.inspection.calibration import calibrate, lambda_returns
-from sb3_saf.inspection.doors import Picture, ReturnScale, Zones, check_zones, return_scale, zone_colours, zone_function
-from sb3_saf.inspection.episodes import Played, Player
-from sb3_saf.inspection.kinds import require_our_policy
+from sb3_saf.inspection import figures, film
+from sb3_saf.inspection import scalars as numbers
+from sb3_saf.inspection.calibration import calibrate
+from sb3_saf.inspection.games import Picture, ReturnScale, Zones, check_zones, return_scale, zone_colours
 from sb3_saf.inspection.pool import chosen_by, differences
-from sb3_saf.randomness import own_randomness
+from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,78 +23,78 @@ if TYPE_CHECKING:
 
 class Inspection(NamedTuple):
     """
-    What was seen of a team, and how to show it.
+    Recorded episodes of a team, and how to show them.
 
-    :param played: every step, as arrays
+    :param recording: every step, as arrays
     :param action_space: one agent's
-    :param scale: what team returns count
+    :param scale: unit of team returns
     :param colours: of the zones; None if the environment has none
-    :param gamma: discount of the returns that values are compared with
     :param gae_lambda: of the targets that the critic learns
     """
 
-    played: Played
+    recording: EpisodeRecording
     action_space: spaces.Space[Any]
     scale: ReturnScale
     colours: Sequence[figures.Colour] | None
-    gamma: float
     gae_lambda: float
 
     @property
     def scalars(self) -> dict[str, float]:
         """Everything that is a number, by the names that TensorBoard shows (``docs/tensorboard.md``)."""
         return {
-            **report.team_scalars(self.played, self.scale),
-            **report.pool_scalars(self.played, self.action_space),
-            **report.knowledge_scalars(self.played),
-            **report.critic_scalars(self.played, self.gamma, self.gae_lambda),
-            **report.message_scalars(self.played, self.gamma),
+            **numbers.team_scalars(self.recording, self.scale),
+            **numbers.pool_scalars(self.recording, self.action_space),
+            **numbers.knowledge_scalars(self.recording),
+            **numbers.critic_scalars(self.recording, self.gae_lambda),
+            **numbers.message_scalars(self.recording),
         }
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """What there is to draw, by the names that TensorBoard shows. Needs matplotlib."""
+        """Figures by the names that TensorBoard shows. Needs matplotlib."""
         return {"critic/calibration": self._calibration(), **self._of_the_pool(), **self._of_the_knowledge_source()}
 
     @property
     def film(self) -> bytes | None:
         """The first episode as a GIF; None if the environment draws no pictures. Needs Pillow."""
-        return film.gif(self.played.pictures) if self.played.pictures else None
+        return film.gif(self.recording.pictures) if self.recording.pictures else None
 
     @property
     def strip(self) -> Picture | None:
         """Six moments of the first episode, (height, width, 3); None if the environment draws no pictures."""
-        return film.strip(self.played.pictures) if self.played.pictures else None
+        return film.strip(self.recording.pictures) if self.recording.pictures else None
 
     def _calibration(self) -> Figure:
-        counted = self.played.counted
-        values, returns = self.played.values[counted], lambda_returns(self.played, self.gamma)[counted]
-        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if self.played.of_team else 'per agent'}"
+        counted = self.recording.counted
+        values, returns = self.recording.values[counted], self.recording.returns[counted]
+        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if self.recording.of_team else 'per agent'}"
         return figures.calibration(values, returns, calibrate(values, returns), unit)
 
     def _of_the_pool(self) -> dict[str, Figure]:
-        played, counted = self.played, self.played.counted
-        if played.weights is None or played.actions is None:
+        recording, counted = self.recording, self.recording.counted
+        if recording.pool_weights is None or recording.pool_actions is None:
             return {}
-        by_agent = chosen_by(played.weights[counted], report.counted_agents(played), played.n_agents)
+        weights = recording.pool_weights[counted]
+        by_agent = chosen_by(weights, numbers.counted_agents(recording), recording.n_agents)
+        apart = differences(self.action_space, recording.pool_actions[counted])
         drawn = {
             "pool/by_agent": figures.chosen_by_agent(by_agent),
-            "pool/differences": figures.policy_differences(differences(self.action_space, played.actions[counted])),
+            "pool/differences": figures.policy_differences(apart),
         }
-        if played.zones is not None:
-            zones = played.zones[counted]
+        if recording.zones is not None:
+            zones = recording.zones[counted]
             n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
-            by_zone = chosen_by(played.weights[counted], zones, n_zones)
-            drawn["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
+            drawn["pool/by_zone"] = figures.chosen_by_zone(chosen_by(weights, zones, n_zones), self.colours)
         return drawn
 
     def _of_the_knowledge_source(self) -> dict[str, Figure]:
-        write, read = report.write_attention(self.played), report.read_attention(self.played)
-        if write is None or read is None or self.played.write is None:
+        write, read = numbers.write_attention(self.recording), numbers.read_attention(self.recording)
+        if write is None or read is None or self.recording.write_attention is None:
             return {}
+        episode = _first_episode(self.recording, self.recording.write_attention)
         return {
             "knowledge_source/attention": figures.attention(write, read),
-            "knowledge_source/one_episode": figures.attention_over_time(_first_episode(self.played, self.played.write)),
+            "knowledge_source/one_episode": figures.attention_over_time(episode),
         }
 
 
@@ -107,13 +105,15 @@ def inspect_team(
     seed: int = 20_000,
     deterministic: bool = False,
     zones: Zones = None,
+    *,
+    pictures: bool = True,
+    observations: bool = True,
 ) -> Inspection:
     """
-    Look into a team: play episodes, and keep what its policy does and thinks.
+    Inspect a team: play episodes, and keep what its policy saw, did and computed.
 
-    The same as :class:`~sb3_saf.InspectionCallback` writes to TensorBoard, once and in hand. ``scalars`` of what comes
-    back are numbers by name, ``figures`` are drawn when asked for, ``film`` is the first episode as a GIF, ``played``
-    has every step as arrays.
+    :class:`~sb3_saf.InspectionCallback` writes the same to TensorBoard. Of the result, ``scalars`` are numbers by name,
+    ``figures`` are drawn when asked for, ``film`` is the first episode as a GIF, ``recording`` has every step.
 
     :param model: with a policy of this package
     :param eval_env: environment of teams, for instance from ``make_team_env`` with ``n_envs=16`` and, for a film,
@@ -122,44 +122,29 @@ def inspect_team(
     :param seed: of the episodes
     :param deterministic: whether the policy takes its most likely actions
     :param zones: as in :class:`~sb3_saf.InspectionCallback`
+    :param pictures: whether to draw the first game
+    :param observations: whether to keep the agents' own observations
     :raises ValueError: if the policy is none of this package's or ``eval_env`` is not made of teams
     """
-    require_our_policy(model.policy)
     check_zones(zones)
-    check_count("n_eval_episodes", n_eval_episodes)
-    player = Player(eval_env, n_eval_episodes, seed, deterministic, zone_function(eval_env, zones))
-    return inspect_with(player, model, model.get_vec_normalize_env())
-
-
-def inspect_with(
-    player: Player, model: BaseAlgorithm, normalising: VecNormalize | None, draw: bool = True
-) -> Inspection:
-    """
-    Play a player's episodes; no generator that training draws from moves.
-
-    :param player: plays
-    :param model: to look into
-    :param normalising: what normalises the rewards that the critic learns from, if anything does
-    :param draw: whether to draw the first game
-    """
-    policy = require_our_policy(model.policy)
-    training = policy.training
-    policy.set_training_mode(False)
-    with own_randomness(player.seed, model.device):
-        played = player.play(policy, normalising, draw=draw)
-    policy.set_training_mode(training)
-    return Inspection(
-        played,
-        policy.action_space,
-        return_scale(player.env),
-        zone_colours(player.env),
-        float(getattr(model, "gamma", 1.0)),
-        float(getattr(model, "gae_lambda", 1.0)),
+    recording = record_episodes(
+        model.policy,
+        eval_env,
+        n_eval_episodes,
+        seed,
+        deterministic,
+        gamma=float(getattr(model, "gamma", 1.0)),
+        zones=zones,
+        normalizer=model.get_vec_normalize_env(),
+        observations=observations,
+        pictures=pictures,
     )
+    gae_lambda = float(getattr(model, "gae_lambda", 1.0))
+    return Inspection(recording, model.policy.action_space, return_scale(eval_env), zone_colours(eval_env), gae_lambda)
 
 
-def _first_episode(played: Played, attention: np.ndarray) -> np.ndarray:
-    """(T', ...) of the first game that was played, up to the end of its first episode."""
-    game = int(np.flatnonzero(report.counted_games(played).any(axis=0))[0])
-    ends = played.ends.reshape(len(played.ends), -1, played.n_agents)[:, game].all(axis=1)
+def _first_episode(recording: EpisodeRecording, attention: np.ndarray) -> np.ndarray:
+    """Return (T', ...) of the first game that was played, up to the end of its first episode."""
+    game = int(np.flatnonzero(numbers.counted_games(recording).any(axis=0))[0])
+    ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
     return attention[: int(np.flatnonzero(ends)[0]) + 1, game]

@@ -1,5 +1,5 @@
 """
-What games may tell about themselves, through ``get_attr`` and ``env_method``: any environment can have these.
+Optional attributes of games that inspection reads through ``get_attr`` and ``env_method``.
 
 ================ ======================= ==============================================================================
 attribute        form                    meaning
@@ -37,7 +37,7 @@ _NO_ZONE = -1
 
 class ReturnScale(NamedTuple):
     """
-    What a team return counts.
+    The unit of team returns.
 
     :param unit: such as ``"treasures"``; None if the environment does not say
     :param best: the largest possible return; None if unknown
@@ -62,7 +62,7 @@ def check_zones(zones: object) -> None:
 
 def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
     """
-    How to learn the agents' zones.
+    Choose the function that gives the agents' zones.
 
     :param env: rows of teams
     :param zones: as the user gave it
@@ -77,7 +77,7 @@ def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
 
 def zones_by_attribute(env: VecEnv) -> Ints:
     """
-    Zones as the games tell them in their attribute ``agent_zones``.
+    Return the games' attribute ``agent_zones``.
 
     :return: (B,)
     """
@@ -86,7 +86,7 @@ def zones_by_attribute(env: VecEnv) -> Ints:
 
 def zones_now(zones: ZoneFunction, env: VecEnv) -> Ints:
     """
-    Zone of each row, checked.
+    Return the zone of each row, checked.
 
     :return: (B,)
     :raises ValueError: if they are not (B,) whole numbers of at least -1
@@ -102,14 +102,14 @@ def zones_now(zones: ZoneFunction, env: VecEnv) -> Ints:
 
 
 def zone_colours(env: VecEnv) -> list[tuple[float, float, float]] | None:
-    """Colours of the zones, 0 to 1; None if the environment has none."""
+    """Return the colours of the zones, 0 to 1; None if the environment has none."""
     if not env.has_attr("zone_colours"):
         return None
     return [(red / 255, green / 255, blue / 255) for red, green, blue in env.get_attr("zone_colours", indices=[0])[0]]
 
 
 def return_scale(env: VecEnv) -> ReturnScale:
-    """What the team return counts."""
+    """Return the unit of team returns."""
     unit, best = (
         env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None for name in ("return_unit", "best_return")
     )
@@ -117,16 +117,16 @@ def return_scale(env: VecEnv) -> ReturnScale:
 
 
 def draws_pictures(env: VecEnv) -> bool:
-    """Whether games can be drawn."""
+    """Return whether games can be drawn."""
     return env.render_mode == "rgb_array"
 
 
 def picture(env: VecEnv) -> Picture | None:
-    """The first game as it is now, (height, width, 3); None if it gives nothing that is a picture."""
+    """Return a picture of the first game, (height, width, 3); None if ``render`` gives none."""
     frame = np.asarray(env.env_method("render", indices=[0])[0])
     return frame if frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3 else None
 
 
 def _of_games(env: VecEnv, name: str) -> Sequence[Any]:
-    """An attribute of each game, asked once per game."""
+    """Return an attribute of each game, asked for once per game."""
     return env.get_attr(name, indices=range(0, env.num_envs, require_n_agents(env)))

@@ -1,0 +1,288 @@
+"""
+Recording of team episodes: everything that a policy saw, did and computed, step by step, as plain arrays.
+
+Figures, films, TensorBoard and reports read a recording and nothing else. Letters: T game steps, E games, N agents,
+B = E N rows, A actions, U policies, L slots, P parameters of an action distribution.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.envs.teams import ACTIVE_KEY, OBS_KEY, check_count, require_n_agents, team_dones
+from sb3_saf.inspection.calibration import lambda_returns
+from sb3_saf.inspection.games import Picture, ZoneFunction, Zones, draws_pictures, picture, zone_function, zones_now
+from sb3_saf.inspection.reading import (
+    OurPolicy,
+    PolicyReader,
+    QReader,
+    Replacement,
+    StepReading,
+    reader_of,
+    require_our_policy,
+    takes_masks,
+)
+from sb3_saf.randomness import own_randomness
+
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+
+
+class EpisodeRecording(NamedTuple):
+    """
+    Team episodes, step by step. Rows count while their agent takes part in an episode of the set.
+
+    :param n_agents: N; row ``e * N + i`` is agent ``i`` of game ``e``
+    :param of_team: whether values and rewards are the team's, the same in all its rows, not the agent's own
+    :param gamma: discount factor of the returns
+    :param observations: (T, B, *shape) own observations; None if they were not asked for
+    :param actions: (T, B, ...) as the games took them
+    :param action_probabilities: (T, B, A); None unless actions are Discrete
+    :param counted: (T, B) whether the row counts
+    :param rewards: (T, B) as the critic learns them
+    :param ends: (T, B) whether the episode ended with this step, or (unless values are the team's) the agent's own part
+    :param last_values: (T, B) value of what follows a time limit that is no true end, else 0
+    :param values: (T, B)
+    :param returns: (T, B) discounted returns that followed
+    :param zones: (T, B), -1 for none; None where there are no zones
+    :param pool_weights: (T, B, U) how likely each policy is chosen; None without a pool
+    :param pool_actions: (T, B, U, P) parameters of each policy's action distribution; None without a pool
+    :param write_attention: (T, E, L, N) attention of slots over agents; None without a knowledge source
+    :param read_attention: (T, E, N, L) attention of agents over slots; None without a knowledge source
+    :param message_strengths: (T, B) norm of the message that each agent read; None without a knowledge source
+    :param values_without: (T, B) each, values with another message in place of the one read
+    :param episode_returns: team return of each episode
+    :param episode_lengths: game steps of each episode
+    :param pictures: of the first game's first episode, one per step
+    """
+
+    n_agents: int
+    of_team: bool
+    gamma: float
+    observations: npt.NDArray[Any] | None
+    actions: npt.NDArray[Any]
+    action_probabilities: Floats | None
+    counted: Bools
+    rewards: Floats
+    ends: Bools
+    last_values: Floats
+    values: Floats
+    returns: Doubles
+    zones: Ints | None
+    pool_weights: Floats | None
+    pool_actions: Floats | None
+    write_attention: Floats | None
+    read_attention: Floats | None
+    message_strengths: Floats | None
+    values_without: dict[Replacement, Floats]
+    episode_returns: list[float]
+    episode_lengths: list[int]
+    pictures: list[Picture]
+
+
+@th.no_grad()
+def record_episodes(
+    policy: BasePolicy,
+    env: VecEnv,
+    n_eval_episodes: int = 16,
+    seed: int = 20_000,
+    deterministic: bool = False,
+    *,
+    gamma: float = 1.0,
+    zones: Zones = None,
+    normalizer: VecNormalize | None = None,
+    observations: bool = True,
+    pictures: bool = True,
+) -> EpisodeRecording:
+    """
+    Play a fixed set of team episodes and record them; no generator that training draws from moves.
+
+    Each game plays its share, as ``evaluate_team`` divides them.
+
+    :param policy: of this package
+    :param env: environment of teams
+    :param n_eval_episodes: team episodes to play
+    :param seed: of games and actions
+    :param deterministic: whether the policy takes its most likely actions
+    :param gamma: discount factor of the returns
+    :param zones: as in :class:`~sb3_saf.InspectionCallback`
+    :param normalizer: normalises the rewards that the critic learns from; None if nothing does
+    :param observations: whether to keep the agents' own observations
+    :param pictures: whether to draw the first game, if its render mode allows it
+    :raises ValueError: if the policy is none of this package's or ``env`` is not made of teams
+    """
+    ours, n_agents = require_our_policy(policy), require_n_agents(env)
+    check_count("n_eval_episodes", n_eval_episodes)
+    n_games = env.num_envs // n_agents
+    shares = (n_eval_episodes + np.arange(n_games)) // n_games
+    reader = reader_of(ours, env.num_envs, deterministic)
+    recorder = _Recorder(env, reader, shares, zone_function(env, zones), normalizer, observations)
+    was_training = ours.training
+    ours.set_training_mode(False)
+    try:
+        with own_randomness(seed, ours.device):
+            recorder.play(seed, pictures and draws_pictures(env))
+    finally:
+        ours.set_training_mode(was_training)
+    return recorder.recording(gamma)
+
+
+class _Recorder:
+    """
+    Plays episodes and collects what every step gives.
+
+    :param env: rows of teams
+    :param reader: of the policy
+    :param shares: (E,) episodes of each game
+    :param zones: gives the zone of each row's agent; None for no zones
+    :param normalizer: of the rewards that the critic learns from
+    :param observations: whether to keep observations
+    """
+
+    def __init__(
+        self,
+        env: VecEnv,
+        reader: PolicyReader | QReader,
+        shares: Ints,
+        zones: ZoneFunction | None,
+        normalizer: VecNormalize | None,
+        observations: bool,
+    ) -> None:
+        self.env, self.reader, self.shares, self.zones, self.normalizer = env, reader, shares, zones, normalizer
+        self.keeps_observations = observations
+        self.n_agents = env.num_envs // len(shares)
+        self.episodes = np.zeros(len(shares), dtype=np.int64)
+        self.returns_now, self.lengths_now = np.zeros(len(shares)), np.zeros(len(shares), dtype=np.int64)
+        self.returns: list[float] = []
+        self.lengths: list[int] = []
+        self.pictures: list[Picture] = []
+        self.readings: list[StepReading] = []
+        self.columns: dict[str, list[npt.NDArray[Any]]] = {}
+
+    def play(self, seed: int, draw: bool) -> None:
+        """Play until every game has had its share."""
+        self.env.seed(seed)
+        obs = self.env.reset()
+        starts = np.ones(self.env.num_envs, dtype=bool)
+        first = int(np.flatnonzero(self.shares)[0])
+        while (self.episodes < self.shares).any():
+            if draw and first == 0 and self.episodes[0] == 0:
+                frame = picture(self.env)
+                self.pictures += [] if frame is None else [frame]
+            obs, starts = self._step(obs, starts)
+
+    def _step(self, obs: Any, starts: Bools) -> tuple[Any, Bools]:
+        policy = self.reader.policy
+        counted = np.repeat(self.episodes < self.shares, self.n_agents) & _active(obs, self.n_agents)
+        zones = None if self.zones is None else zones_now(self.zones, self.env)
+        masks = get_action_masks(self.env) if takes_masks(policy) and is_masking_supported(self.env) else None
+        reading = self.reader.step(_tensors(policy, obs), starts, masks)
+        following, rewards, dones, infos = self.env.step(reading.actions)
+        dones = np.asarray(dones, dtype=bool)
+        raw = self.env.get_original_reward() if isinstance(self.env, VecNormalize) else np.array(rewards)
+        learned = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
+        self.readings.append(reading)
+        self._keep("counted", counted)
+        self._keep("rewards", self._team_sums(learned) if self.reader.of_team else learned)
+        # Nothing that comes after an agent's own end counts for it, as in TeamRolloutBuffer.
+        self._keep("ends", dones if self.reader.of_team else dones | ~_active(following, self.n_agents))
+        self._keep("last_values", _last_values(self.reader, dones, infos))
+        if zones is not None:
+            self._keep("zones", zones)
+        if self.keeps_observations:
+            self._keep("observations", np.array(obs[OBS_KEY]))
+        self._count(raw, dones, counted)
+        return following, dones
+
+    def _keep(self, name: str, column: npt.NDArray[Any]) -> None:
+        self.columns.setdefault(name, []).append(column)
+
+    def _team_sums(self, rewards: Floats) -> Floats:
+        """Return (B,) the team's reward in each of its rows."""
+        teams: Floats = rewards.reshape(-1, self.n_agents).sum(axis=1, keepdims=True)
+        return np.repeat(teams, self.n_agents, axis=1).reshape(-1)
+
+    def _count(self, rewards: Floats, dones: Bools, counted: Bools) -> None:
+        """Add up the returns and lengths of episodes."""
+        playing = counted.reshape(-1, self.n_agents).any(axis=1)
+        self.returns_now += rewards.reshape(-1, self.n_agents).sum(axis=1, dtype=np.float64)
+        self.lengths_now += 1
+        ended = team_dones(dones, self.n_agents)
+        self.returns += self.returns_now[ended & playing].tolist()
+        self.lengths += self.lengths_now[ended & playing].tolist()
+        self.returns_now[ended], self.lengths_now[ended] = 0, 0
+        self.episodes += ended
+
+    def recording(self, gamma: float) -> EpisodeRecording:
+        """Return everything so far."""
+        columns = {name: np.stack(column) for name, column in self.columns.items()}
+        pools = [reading.pool for reading in self.readings if reading.pool]
+        sources = [reading.source for reading in self.readings if reading.source]
+        probabilities = [r.probabilities for r in self.readings if r.probabilities is not None]
+        values = _stack([reading.values for reading in self.readings])
+        return EpisodeRecording(
+            n_agents=self.n_agents,
+            of_team=self.reader.of_team,
+            gamma=gamma,
+            observations=columns.get("observations"),
+            actions=np.stack([reading.actions for reading in self.readings]),
+            action_probabilities=_stack(probabilities) if probabilities else None,
+            counted=columns["counted"],
+            rewards=columns["rewards"],
+            ends=columns["ends"],
+            last_values=columns["last_values"],
+            values=values,
+            returns=lambda_returns(columns["rewards"], columns["ends"], columns["last_values"], values, gamma),
+            zones=columns.get("zones"),
+            pool_weights=_stack([pool.weights for pool in pools]) if pools else None,
+            pool_actions=_stack([pool.actions for pool in pools]) if pools else None,
+            write_attention=_stack([source.write for source in sources]) if sources else None,
+            read_attention=_stack([source.read for source in sources]) if sources else None,
+            message_strengths=_stack([source.strengths for source in sources]) if sources else None,
+            values_without={
+                name: _stack([source.values[name] for source in sources])
+                for name in (sources[0].values if sources else ())
+            },
+            episode_returns=self.returns,
+            episode_lengths=self.lengths,
+            pictures=self.pictures,
+        )
+
+
+def _stack(tensors: list[th.Tensor]) -> Floats:
+    stacked: Floats = th.stack(tensors).cpu().numpy()
+    return stacked
+
+
+def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:
+    tensors, _ = policy.obs_to_tensor(obs)
+    assert isinstance(tensors, dict)
+    return tensors
+
+
+def _active(obs: Any, n_agents: int) -> Bools:
+    """Return (B,) whether the row's agent takes part."""
+    if ACTIVE_KEY not in obs:
+        return np.ones(len(obs[OBS_KEY]), dtype=bool)
+    return np.asarray(obs[ACTIVE_KEY][::n_agents]).reshape(-1) != 0
+
+
+def _last_values(reader: PolicyReader | QReader, dones: Bools, infos: list[dict[str, Any]]) -> Floats:
+    """Compute (B,) values of last observations where a time limit is no true end, as SB3 bootstraps them."""
+    values = np.zeros(len(infos), dtype=np.float32)
+    rows = np.array([row for row in np.flatnonzero(dones) if infos[row].get(TRUNCATED)], dtype=np.int64)
+    if len(rows):
+        last = [infos[row][TERMINAL_OBSERVATION] for row in rows]
+        obs = {key: np.stack([observation[key] for observation in last]) for key in last[0]}
+        values[rows] = reader.last_values(_tensors(reader.policy, obs), rows).cpu().numpy()
+    return values
