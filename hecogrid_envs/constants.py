@@ -73,7 +73,19 @@ BLACK: Final[Colour] = (0, 0, 0)
 EMERALD: Final[Colour] = (38, 222, 129)
 GOLD: Final[Colour] = (255, 205, 60)
 
-#: Colour of an agent by its zone, repeating beyond the last.
+#: Colours that the colour-blind can tell apart (Okabe and Ito, 2008), for pictures that people look at.
+OKABE_ITO: Final[dict[str, Colour]] = {
+    "blue": (0, 114, 178),
+    "orange": (230, 159, 0),
+    "purple": (204, 121, 167),
+    "green": (0, 158, 115),
+    "sky": (86, 180, 233),
+    "vermillion": (213, 94, 0),
+    "yellow": (240, 228, 66),
+    "white": (240, 240, 240),
+}
+
+#: In observations: colour of an agent by its zone, repeating beyond the last.
 ZONE_COLOURS: Final[tuple[Colour, ...]] = (
     (255, 0, 0),
     (255, 165, 0),
@@ -103,6 +115,11 @@ BLUE_INDEX: Final = ZONE_COLOURS.index((0, 0, 255))
 ZONE_STRIDE: Final = 500
 #: ... as long as there are no more zones than this; beyond, the stride is 5040 // h.
 MAX_ZONES_AT_STRIDE: Final = 11
+
+
+def zone_colour(zone: int) -> Colour:
+    """Return the colour of a zone in pictures for people."""
+    return list(OKABE_ITO.values())[zone % len(OKABE_ITO)]
 
 
 def action_permutations() -> npt.NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.constants import N_ACTIONS, ZONE_COLOURS, Colour, RenderMode
+from hecogrid_envs.constants import N_ACTIONS, Colour, RenderMode, zone_colour
 from hecogrid_envs.page import COMMON_PAGE
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import STATE_PLANES, StateMapping, central_view, state_option
@@ -198,9 +198,9 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
 
     @property
     def zone_colours(self) -> tuple[Colour, ...]:
-        """Colour of an agent in each zone, from 0 to 255."""
+        """Colour of each zone in pictures, from 0 to 255."""
         n_zones = int(self.params.zone_of_column()[-1]) + 1
-        return tuple(ZONE_COLOURS[zone % len(ZONE_COLOURS)] for zone in range(n_zones))
+        return tuple(zone_colour(zone) for zone in range(n_zones))
 
     @property
     def best_return(self) -> int:

@@ -14,16 +14,17 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
-from typing import Any, Final, Literal, Protocol, TextIO, get_args, get_type_hints
+from typing import Any, Final, Literal, TextIO, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.constants import N_ACTIONS, Command, Direction
 from hecogrid_envs.fields_of_view import seen_cells
+from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.registry import parallel_env
 from hecogrid_envs.rendering import Picture, Scene, fit_tile_size, render_scene
-from hecogrid_envs.task import TaskName, check_task
 from hecogrid_envs.text import render_text
 from hecogrid_envs.tiles import INVISIBLE
 from hecogrid_envs.window import HumanWindow
@@ -60,34 +61,6 @@ _NOT_FOR_PEOPLE: Final = ("observation", "view_tile_size")
 _WINDOW_FPS: Final = 30
 
 
-class Playable(Protocol):
-    """The part of ``hecogrid_envs.parallel_env`` that a person needs; observations are tile codes."""
-
-    task: TaskName
-    params: HECOGridParams
-    possible_agents: list[str]
-
-    @property
-    def n_steps(self) -> int:
-        """Game steps so far."""
-
-    @property
-    def collected(self) -> int:
-        """Treasures collected so far."""
-
-    def reset(self, seed: int | None = None) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Start a game."""
-
-    def step(self, actions: dict[str, Any]) -> tuple[Mapping[str, Any], ...]:
-        """Play one step: observations, rewards, terminations, truncations, infos."""
-
-    def get_state(self) -> Mapping[str, Any]:
-        """Plain arrays."""
-
-    def close(self) -> None:
-        """Release what the game holds."""
-
-
 class Session:
     """
     One person's game: turns keys into joint actions and says what happened.
@@ -98,7 +71,7 @@ class Session:
     :param others: what the agents do that are not selected
     """
 
-    def __init__(self, env: Playable, seed: int | None = None, raw: bool = False, others: Others = "wait") -> None:
+    def __init__(self, env: HECOGridEnv, seed: int | None = None, raw: bool = False, others: Others = "wait") -> None:
         self.env = env
         self.raw = raw
         self.others = others
@@ -379,18 +352,10 @@ def make_session(arguments: Sequence[str] | None = None) -> tuple[Session, argpa
     names = {field.name for field in fields(HECOGridParams)}
     world = {name: value for name, value in vars(options).items() if name in names}
     try:
-        env = make_env(check_task(options.task), **world)
+        env = parallel_env(options.task, observation="tiles", **world)
         return Session(env, options.seed, options.raw, options.others), options
     except ValueError as error:
         parser.error(str(error))
-
-
-def make_env(task: TaskName, **world: Any) -> Playable:
-    """Make the real game, seen as tile codes."""
-    from hecogrid_envs import parallel_env
-
-    env: Playable = parallel_env(task, observation="tiles", **world)
-    return env
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,8 +1,9 @@
 """
 Pictures of a game for people: zones, walls, treasures, keys, agents with what they see, and a score bar.
 
-Everything here works on a plain state mapping, so that a level can be drawn without running it. What does not change
-within a game (floor, walls, zone names) is drawn once per level; a frame then costs a few milliseconds.
+Everything here works on a plain state mapping, so that a level can be drawn without running it. Colours can be told
+apart by the colour-blind (Okabe and Ito, 2008); agents also carry their numbers. What agents themselves see is drawn by
+:mod:`hecogrid_envs.tiles`.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import AGENT_PALETTE, KEY_CARRIER_INDEX, ZONE_COLOURS, Colour, TreasureState
+from hecogrid_envs.constants import OKABE_ITO, Colour, TreasureState, zone_colour
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.task import TaskName
+from hecogrid_envs.task import DECLARED, TaskName
 
 Picture = npt.NDArray[np.uint8]
 #: A state mapping; see :class:`hecogrid_envs.state.StateMapping`.
@@ -31,22 +32,26 @@ _LARGEST_SIDE: Final = 60 * _USUAL_TILE
 #: A picture larger than this is a mistake: 64 million pixels are 192 MB.
 MAX_PIXELS: Final = 2**26
 
+#: Colours of agents by index, repeating beyond the last; the gems' green is left out.
+AGENT_PALETTE: Final = tuple(
+    OKABE_ITO[name] for name in ("orange", "sky", "purple", "white", "vermillion", "blue", "yellow")
+)
+
 _INK: Final[Colour] = (15, 17, 24)
 _FLOOR: Final[Colour] = (44, 48, 61)
-_WALL: Final[Colour] = (92, 98, 117)
+_WALL: Final[Colour] = (104, 110, 128)
 _TEXT: Final[Colour] = (238, 240, 246)
 _DIM: Final[Colour] = (141, 148, 168)
-_GOLD: Final[Colour] = (255, 205, 60)
-_EMERALD: Final[Colour] = (38, 222, 129)
 _KEY: Final[Colour] = (255, 214, 64)
-_PINK: Final[Colour] = AGENT_PALETTE[KEY_CARRIER_INDEX]
 
-_ZONE_TINT: Final = 0.17
-_WALL_TINT: Final = 0.06
-_VIEW_FILL: Final = 0.10
-_VIEW_EDGE: Final = 0.45
+_ZONE_TINT: Final = 0.25
+#: Opacity, from 0 to 255, of the veil over seen cells and of the outline of each agent's field of view.
+_VEIL: Final = 14
+_OUTLINE: Final = 110
 #: Shapes are drawn this many times larger and averaged down.
 _SUPERSAMPLING: Final = 8
+#: Sprites smaller than this carry no number.
+_LEGIBLE: Final = 15
 
 
 class Scene(NamedTuple):
@@ -71,20 +76,13 @@ class Scene(NamedTuple):
     selected: int | None = None
 
 
-class _Sprite(NamedTuple):
-    """Pixels ready for blending: ``picture * keep + add``, both in units of 1/255."""
-
-    add: npt.NDArray[np.uint16]
-    keep: npt.NDArray[np.uint16]
-
-
 def render_scene(scene: Scene, tile_size: int | None = None, show_views: bool = True) -> Picture:
     """
     Draw a scene.
 
     :param scene: what to draw
     :param tile_size: pixels per cell, from 4 to 128; by default 24, and less for maps of more than 60 cells
-    :param show_views: lay a veil in the agent's colour over the cells that it sees (needs ``scene.visible``)
+    :param show_views: outline what each agent sees (needs ``scene.visible``)
     :return: (height, width, 3); the size depends on the task, the parameters and ``tile_size`` only
     :raises ValueError: if the tile size is out of range or the picture would be enormous
     :raises ImportError: if Pillow is missing
@@ -93,20 +91,19 @@ def render_scene(scene: Scene, tile_size: int | None = None, show_views: bool = 
         tile_size = min(_USUAL_TILE, fit_tile_size(scene.params.grid_size, _LARGEST_SIDE))
     _check_size(scene.params, tile_size)
     walls = np.ascontiguousarray(scene.state["walls"], dtype=np.bool_)
-    picture: Picture = _background(scene.task, scene.params, tile_size, walls.tobytes()).copy()
+    image = _background(scene.task, scene.params, tile_size, walls.tobytes()).copy()
+    _draw_header(image, scene, tile_size)
     top = header_height(scene.task, scene.params, tile_size)
-    _draw_header(picture[:top], scene, tile_size)
-    cells = _cells(picture[top:], tile_size)
     if show_views and scene.visible is not None:
-        _draw_views(cells, scene)
-    _draw_objects(cells, scene, tile_size)
-    _draw_agents(cells, scene, tile_size)
-    return picture
+        _draw_views(image, scene, tile_size, top)
+    _draw_objects(image, scene, tile_size, top)
+    _draw_agents(image, scene, tile_size, top)
+    return np.array(image)
 
 
 def header_height(task: TaskName, params: HECOGridParams, tile_size: int) -> int:
     """
-    Height of the bar above the map.
+    Return the height of the bar above the map.
 
     :return: pixels, an even number
     """
@@ -115,7 +112,7 @@ def header_height(task: TaskName, params: HECOGridParams, tile_size: int) -> int
 
 def fit_tile_size(grid_size: int, max_pixels: int = 960) -> int:
     """
-    Largest tile size, at most 32, whose map fits into a square window.
+    Return the largest tile size, at most 32, whose map fits into a square window.
 
     :param grid_size: cells per side
     :param max_pixels: side of the window
@@ -134,9 +131,6 @@ def _check_size(params: HECOGridParams, tile_size: int) -> None:
         )
 
 
-# --- colours, shapes and blending
-
-
 def _pillow() -> tuple[ModuleType, ModuleType, ModuleType]:
     try:
         from PIL import Image, ImageDraw, ImageFont
@@ -145,59 +139,180 @@ def _pillow() -> tuple[ModuleType, ModuleType, ModuleType]:
     return Image, ImageDraw, ImageFont
 
 
+def _brush(image: Any) -> Any:
+    """Return a drawing context that lays translucent colours over an image."""
+    return _pillow()[1].Draw(image, "RGBA")
+
+
+@lru_cache(maxsize=64)
+def _font(size: int) -> Any:
+    return _pillow()[2].load_default(size)
+
+
 def _mix(colour: Colour, other: Colour, share: float) -> Colour:
     """Move ``colour`` towards ``other`` by ``share``."""
     red, green, blue = (round(a + (b - a) * share) for a, b in zip(colour, other, strict=True))
     return red, green, blue
 
 
-def _zone_colour(zone: int) -> Colour:
-    return ZONE_COLOURS[zone % len(ZONE_COLOURS)]
+def _readable_on(colour: Colour) -> Colour:
+    """Return black or white, whichever stands out."""
+    red, green, blue = colour
+    return _INK if 0.30 * red + 0.59 * green + 0.11 * blue > 105 else (255, 255, 255)
 
 
-def _gem_colour(task: TaskName) -> Colour:
-    return _GOLD if task == "TeamTogether" else _EMERALD
+# --- the level: floor, walls, zones; drawn once
 
 
-def _cells(area: Picture, tile_size: int) -> Picture:
-    """View the map's pixels as (row y, pixel row, column x, pixel column, channel)."""
-    height, width, _ = area.shape
-    return area.reshape(height // tile_size, tile_size, width // tile_size, tile_size, 3)
+@lru_cache(maxsize=8)
+def _background(task: TaskName, params: HECOGridParams, tile: int, walls_bytes: bytes) -> Any:
+    """Draw what stays put in a game."""
+    side, top = params.grid_size, header_height(task, params, tile)
+    walls = np.frombuffer(walls_bytes, dtype=np.bool_).reshape(side, side)
+    image = _pillow()[0].new("RGB", (side * tile, top + side * tile), _INK)
+    draw, zones = _brush(image), params.zone_of_column()
+    for x, y in np.ndindex(side, side):
+        # A map with one zone stays neutral: there is nothing to tell apart.
+        tint = _mix(_FLOOR, zone_colour(int(zones[x])), _ZONE_TINT if zones[-1] > 0 else 0.0)
+        box = (x * tile, top + y * tile, (x + 1) * tile - 1, top + (y + 1) * tile - 1)
+        draw.rectangle(box, fill=_WALL if walls[x, y] else tint, outline=None if walls[x, y] else _mix(tint, _INK, 0.2))
+    if zones[-1] > 0:
+        _draw_zone_names(draw, zones, tile, top)
+    return image
 
 
-def _over(below: Picture, sprite: _Sprite) -> Picture:
-    """Blend with integers only: exact to rounding, and several times faster than floats."""
-    mixed = below.astype(np.uint16)
-    mixed *= sprite.keep
-    mixed += sprite.add
-    mixed += 128
-    mixed += mixed >> 8
-    mixed >>= 8
-    return mixed.astype(np.uint8)
+def _draw_zone_names(draw: Any, zones: npt.NDArray[np.int64], tile: int, top: int) -> None:
+    """Draw a band in the zones' full colours right above the map."""
+    band = _band_height(zones, tile)
+    font = _font(max(band - 4, 7))
+    for zone in np.unique(zones).tolist():
+        columns = np.flatnonzero(zones == zone) * tile
+        left, right = int(columns[0]), int(columns[-1]) + tile
+        draw.rectangle((left, top - band, right - 1, top - 1), fill=zone_colour(zone))
+        for name in (f"zone {zone}", f"{zone}"):
+            if font.getlength(name) + 6 <= right - left:
+                place = ((left + right) / 2, top - band / 2)
+                draw.text(place, name, font=font, fill=_readable_on(zone_colour(zone)), anchor="mm")
+                break
 
 
-def _veil(colours: npt.NDArray[Any], alpha: float) -> _Sprite:
-    """Translucent colour of any leading shape."""
-    opacity = round(alpha * 255)
-    return _Sprite((np.asarray(colours) * opacity).astype(np.uint16), np.array(255 - opacity, dtype=np.uint16))
+def _band_height(zones: npt.NDArray[np.int64], tile: int) -> int:
+    return 2 * max(round(tile * 0.29), 2) if zones[-1] > 0 else 0
 
 
-def _sprite(image: Any, size: int) -> _Sprite:
-    """Average a large RGBA drawing down to ``size`` pixels."""
-    pixels = np.asarray(image.reduce(image.width // size)).astype(np.uint16)
-    alpha = pixels[..., 3:]
-    return _Sprite(pixels[..., :3] * alpha, 255 - alpha)
+# --- the bar above the map
+
+
+class _Layout(NamedTuple):
+    """Font size of the bar's words, its height, and (x, y) of each word."""
+
+    font: int
+    height: int
+    places: tuple[tuple[int, int], ...]
+
+
+def _words(scene: Scene) -> list[tuple[str, str]]:
+    """Return labels and values of the bar."""
+    treasures, params = scene.state["treasures"], scene.params
+    found, total = (int(np.count_nonzero(treasures >= kind)) for kind in (TreasureState.COLLECTED, 1))
+    return [
+        ("", scene.task),
+        ("c", f"{params.coordination}"),
+        ("h", f"{params.heterogeneity}"),
+        ("step", f"{scene.step}/{params.max_cycles}"),
+        ("treasures", f"{found}/{total}"),
+        ("return", f"{scene.collected}"),
+    ]
+
+
+@lru_cache(maxsize=64)
+def _header_layout(task: TaskName, params: HECOGridParams, tile: int) -> _Layout:
+    """Place the words, the widest that a game can show so that numbers do not jump: as many to a line as fit."""
+    width, wanted = params.grid_size * tile, int(np.clip(round(tile * 0.62), 11, 22))
+    most = np.ones(params.n_treasures)
+    words = _words(Scene(task, params, {"treasures": 2 * most}, params.max_cycles, len(most)))
+    for font in range(wanted, 5, -1):
+        widths = [_word_width(word, font) for word in words]
+        if max(widths) <= width - font:
+            break
+    places: list[tuple[int, int]] = []
+    x, y = font // 2, font // 4
+    for word_width in widths:
+        if places and x + word_width > width - font // 2:
+            x, y = font // 2, y + font + font // 2
+        places.append((x, y))
+        x += word_width + font
+    height = y + font + font // 2 + font // 4 + _bar_height(tile) + _band_height(params.zone_of_column(), tile)
+    return _Layout(font, height + height % 2, tuple(places))
+
+
+def _word_width(word: tuple[str, str], font: int) -> int:
+    return int(np.ceil(_font(font).getlength(" ".join(word).strip())))
+
+
+def _bar_height(tile: int) -> int:
+    return 2 if tile < 16 else 3
+
+
+def _draw_header(image: Any, scene: Scene, tile: int) -> None:
+    layout, draw = _header_layout(scene.task, scene.params, tile), _brush(image)
+    font = _font(layout.font)
+    for (label, value), place in zip(_words(scene), layout.places, strict=True):
+        indent = font.getlength(f"{label} ") if label else 0
+        draw.text(place, label, font=font, fill=_DIM)
+        draw.text((place[0] + indent, place[1]), value, font=font, fill=_TEXT)
+    bottom = layout.height - _band_height(scene.params.zone_of_column(), tile) - 1
+    top, share = bottom - _bar_height(tile) + 1, min(scene.step / scene.params.max_cycles, 1)
+    draw.rectangle((0, top, image.width, bottom), fill=_mix(_INK, _DIM, 0.25))
+    if share > 0:
+        draw.rectangle((0, top, round(image.width * share) - 1, bottom), fill=_DIM)
+
+
+# --- what agents see
+
+
+def _draw_views(image: Any, scene: Scene, tile: int, top: int) -> None:
+    """Lighten seen floor a little, and outline each agent's field of view in its colour."""
+    floor = ~np.asarray(scene.state["walls"], dtype=np.bool_)
+    visible = np.asarray(scene.visible, dtype=np.bool_) & floor
+    draw = _brush(image)
+    for x, y in np.argwhere(visible.any(axis=0)).tolist():
+        draw.rectangle(_box(x, y, tile, top), fill=(255, 255, 255, _VEIL))
+    for agent, seen in enumerate(visible):
+        around = np.pad(seen | ~floor, 1)
+        ink = (*_agent_colour(agent), _OUTLINE)
+        for x, y in np.argwhere(seen).tolist():
+            left, upper, right, lower = _box(x, y, tile, top)
+            for dx, dy, edge in (
+                (-1, 0, (left, upper, left, lower)),
+                (1, 0, (right, upper, right, lower)),
+                (0, -1, (left, upper, right, upper)),
+                (0, 1, (left, lower, right, lower)),
+            ):
+                if not around[x + 1 + dx, y + 1 + dy]:
+                    draw.line(edge, fill=ink)
+
+
+def _box(x: int, y: int, tile: int, top: int) -> tuple[int, int, int, int]:
+    """Return the first and last pixels of a cell: left, upper, right, lower."""
+    return x * tile, top + y * tile, (x + 1) * tile - 1, top + (y + 1) * tile - 1
+
+
+def _agent_colour(agent: int) -> Colour:
+    return AGENT_PALETTE[agent % len(AGENT_PALETTE)]
+
+
+# --- sprites
 
 
 class _Canvas:
     """A large transparent drawing in unit coordinates, averaged down to a sprite at the end."""
 
     def __init__(self, size: int) -> None:
-        image, draw, _ = _pillow()
         self.size = size
         self.side = size * _SUPERSAMPLING
-        self.image = image.new("RGBA", (self.side, self.side), (0, 0, 0, 0))
-        self.draw = draw.Draw(self.image)
+        self.image = _pillow()[0].new("RGBA", (self.side, self.side), (0, 0, 0, 0))
+        self.draw = _pillow()[1].Draw(self.image)
 
     def points(self, unit: npt.ArrayLike) -> list[tuple[float, float]]:
         return [(float(x) * self.side, float(y) * self.side) for x, y in np.asarray(unit, dtype=float)]
@@ -207,335 +322,59 @@ class _Canvas:
 
     def outline(self, unit: npt.ArrayLike, colour: Colour, width: float) -> None:
         points = self.points(unit)
-        stroke = max(round(width * self.side), 1)
-        self.draw.line([*points, points[0], points[1]], fill=(*colour, 255), width=stroke, joint="curve")
+        self.draw.line(
+            [*points, *points[:2]], fill=(*colour, 255), width=max(round(width * self.side), 1), joint="curve"
+        )
 
     def disc(self, x: float, y: float, radius: float, colour: Colour) -> None:
         box = self.points([(x - radius, y - radius), (x + radius, y + radius)])
         self.draw.ellipse(box, fill=(*colour, 255))
 
-    def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
-        self.draw.rectangle(self.points([(left, top), (right, bottom)]), fill=(*colour, 255))
+    def box(self, box: npt.NDArray[np.float64], colour: Colour) -> None:
+        self.draw.rectangle(self.points(box.reshape(2, 2)), fill=(*colour, 255))
 
     def text(self, x: float, y: float, text: str, height: float, colour: Colour) -> None:
         font = _font(round(height * self.side))
-        self.draw.text((x * self.side, y * self.side), text, font=font, fill=(*colour, 255), anchor="mm")
+        stroke = self.side // 60
+        place = (x * self.side, y * self.side)
+        self.draw.text(place, text, font=font, fill=(*colour, 255), anchor="mm", stroke_width=stroke)
 
-    def sprite(self) -> _Sprite:
-        return _sprite(self.image, self.size)
-
-
-@lru_cache(maxsize=64)
-def _font(size: int) -> Any:
-    return _pillow()[2].load_default(size)
+    def sprite(self) -> Any:
+        return self.image.reduce(_SUPERSAMPLING)
 
 
-# --- the level: floor, walls, zones; drawn once
-
-
-@lru_cache(maxsize=8)
-def _background(task: TaskName, params: HECOGridParams, tile_size: int, walls_bytes: bytes) -> Picture:
-    """Everything that stays put in a game, header bar (without its words) and zone names included."""
-    side = params.grid_size
-    walls = np.frombuffer(walls_bytes, dtype=np.bool_).reshape(side, side)
-    top = header_height(task, params, tile_size)
-    picture = np.empty((top + side * tile_size, side * tile_size, 3), dtype=np.uint8)
-    picture[:top] = _INK
-    _draw_zone_names(picture[:top], params, tile_size)
-    cells = _cells(picture[top:], tile_size)
-    _draw_floor(cells, params)
-    _draw_walls(cells, walls.T, params)
-    picture.flags.writeable = False
-    return picture
-
-
-def _zone_tints(base: Colour, params: HECOGridParams, share: float) -> list[Colour]:
-    """
-    Colour of each column, its zone's shining through.
-
-    A map with one zone stays neutral: there is nothing to tell apart.
-    """
-    zones = params.zone_of_column()
-    share = share if zones[-1] > 0 else 0.0
-    return [_mix(base, _zone_colour(int(zone)), share) for zone in zones]
-
-
-def _draw_floor(cells: Picture, params: HECOGridParams) -> None:
-    for x, tint in enumerate(_zone_tints(_FLOOR, params, _ZONE_TINT)):
-        cells[:, :, x] = tint
-        line = _mix(tint, _INK, 0.35)
-        cells[:, -1, x] = line
-        cells[:, :, x, -1] = line
-
-
-def _draw_walls(cells: Picture, walls: npt.NDArray[np.bool_], params: HECOGridParams) -> None:
-    """Blocks lit from above: a bright upper rim, a dark front, and a shadow on the floor below."""
-    tile = cells.shape[1]
-    rim, front, shadow = max(tile // 12, 1), max(tile // 5, 1), max(tile // 6, 1)
-    blocks = _zone_tints(_WALL, params, _WALL_TINT)
-    for y, x in np.argwhere(walls):
-        block = blocks[x]
-        cells[y, :, x] = block
-        if y > 0 and not walls[y - 1, x]:
-            cells[y, :rim, x] = _mix(block, (255, 255, 255), 0.35)
-        if y + 1 < len(walls) and not walls[y + 1, x]:
-            cells[y, tile - front :, x] = _mix(block, _INK, 0.45)
-            cells[y + 1, :shadow, x] = _over(cells[y + 1, :shadow, x], _veil(np.array(_INK), 0.4))
-
-
-def _draw_zone_names(header: Picture, params: HECOGridParams, tile_size: int) -> None:
-    """A band in the zones' full colours right above the map, only where there is more than one zone."""
-    band = _band_height(params, tile_size)
-    if band == 0:
-        return
-    zones = params.zone_of_column()
-    for zone in np.unique(zones):
-        columns = np.flatnonzero(zones == zone) * tile_size
-        left, right = int(columns[0]), int(columns[-1]) + tile_size
-        colour = _mix(_zone_colour(int(zone)), _INK, 0.15)
-        strip = header[-band:, left:right]
-        strip[:] = colour
-        for text in (f"zone {zone}", f"{zone}"):
-            mask = _text_mask(text, max(band - 4, 7))
-            if mask.shape[0] <= band and mask.shape[1] + 6 <= right - left:
-                y, x = (band - mask.shape[0]) // 2, (right - left - mask.shape[1]) // 2
-                _stamp(strip, mask, x, y, _readable_on(colour))
-                break
-
-
-def _band_height(params: HECOGridParams, tile_size: int) -> int:
-    several = int(params.zone_of_column()[-1]) > 0
-    return 2 * max(round(tile_size * 0.29), 2) if several else 0
-
-
-def _readable_on(colour: Colour) -> Colour:
-    """Black or white, whichever stands out."""
-    red, green, blue = colour
-    return _INK if 0.30 * red + 0.59 * green + 0.11 * blue > 105 else (255, 255, 255)
-
-
-# --- the bar above the map
-
-
-class _Item(NamedTuple):
-    """A label and a value of the bar; ``widest`` is the value that needs most room, so that numbers do not jump."""
-
-    label: str
-    value: str
-    widest: str
-    gem: bool = False
-
-
-#: Where the second half of the bar begins: step, treasures, return.
-_FIRST_SCORE_ITEM: Final = 3
-
-
-class _Slot(NamedTuple):
-    x: int
-    y: int
-
-
-class _HeaderLayout(NamedTuple):
-    font: int
-    height: int
-    slots: tuple[_Slot, ...]
-
-
-def _header_items(task: TaskName, params: HECOGridParams, step: int, found: int, total: int, score: int) -> list[_Item]:
-    cycles = params.max_cycles
-    return [
-        _Item("", task, task),
-        _Item("c", f"{params.coordination}", f"{params.coordination}"),
-        _Item("h", f"{params.heterogeneity}", f"{params.heterogeneity}"),
-        _Item("step", f"{step}/{cycles}", f"{cycles}/{cycles}"),
-        _Item("", f"{found}/{total}", f"{total}/{total}", gem=True),
-        _Item("return", f"{score}", f"{total}"),
-    ]
-
-
-@lru_cache(maxsize=64)
-def _header_layout(task: TaskName, params: HECOGridParams, tile_size: int) -> _HeaderLayout:
-    """Place the words: on one line if they fit, else in two or more, smaller in tiny pictures."""
-    width = params.grid_size * tile_size
-    items = _header_items(task, params, 0, 0, params.n_treasures, 0)
-    wanted = int(np.clip(round(tile_size * 0.62), 11, 22))
-    font, rows = _choose_rows(items, wanted, width)
-    gap, margin, line = font, font // 2, font + font // 2
-    places: dict[int, _Slot] = {}
-    for number, row in enumerate(rows):
-        # On a single line the score stands on the right, above the map's corner.
-        spare = width - 2 * margin - _row_width(items, row, font) if len(rows) == 1 else 0
-        x = margin
-        for index in row:
-            x += spare if index == _FIRST_SCORE_ITEM else 0
-            places[index] = _Slot(x, margin // 2 + number * line)
-            x += _item_width(items[index], font) + gap
-    height = len(rows) * line + 2 * (margin // 2) + _bar_height(tile_size) + _band_height(params, tile_size)
-    return _HeaderLayout(font, height + height % 2, tuple(places[index] for index in range(len(items))))
-
-
-def _choose_rows(items: list[_Item], wanted: int, width: int) -> tuple[int, list[list[int]]]:
-    """Font size and the items of each line."""
-    everything = list(range(len(items)))
-    halves = [everything[:_FIRST_SCORE_ITEM], everything[_FIRST_SCORE_ITEM:]]
-    for font in range(wanted, round(wanted * 0.8), -1):
-        if _row_width(items, everything, font) <= width - font:
-            return font, [everything]
-    for font in range(wanted, 7, -1):
-        if max(_row_width(items, half, font) for half in halves) <= width - font:
-            return font, halves
-    for font in range(min(wanted, 9), 5, -1):
-        if max(_item_width(item, font) for item in items) <= width - font:
-            break
-    return font, _wrap([_item_width(item, font) for item in items], font, width - font)
-
-
-def _row_width(items: list[_Item], row: list[int], font: int) -> int:
-    return sum(_item_width(items[index], font) for index in row) + font * (len(row) - 1)
-
-
-def _wrap(widths: list[int], gap: int, room: int) -> list[list[int]]:
-    """Fill lines from the left."""
-    rows: list[list[int]] = [[]]
-    used = 0
-    for index, width in enumerate(widths):
-        if rows[-1] and used + gap + width > room:
-            rows.append([])
-            used = 0
-        used += width + (gap if rows[-1] else 0)
-        rows[-1].append(index)
-    return rows
-
-
-def _bar_height(tile_size: int) -> int:
-    return 2 if tile_size < 16 else 3
-
-
-def _item_width(item: _Item, font: int) -> int:
-    before = font if item.gem else _text_width(item.label, font)
-    return before + (font // 3 if before else 0) + _text_width(item.widest, font)
-
-
-def _draw_header(header: Picture, scene: Scene, tile_size: int) -> None:
-    treasures = scene.state["treasures"]
-    total = int(np.count_nonzero(treasures))
-    found = int(np.count_nonzero(treasures == TreasureState.COLLECTED))
-    items = _header_items(scene.task, scene.params, scene.step, found, total, scene.collected)
-    layout = _header_layout(scene.task, scene.params, tile_size)
-    for item, slot in zip(items, layout.slots, strict=True):
-        _draw_item(header, item, slot, layout.font, scene.task)
-    bottom = len(header) - _band_height(scene.params, tile_size)
-    bar = header[bottom - _bar_height(tile_size) : bottom]
-    bar[:] = _mix(_INK, _DIM, 0.25)
-    bar[:, : round(bar.shape[1] * min(scene.step / scene.params.max_cycles, 1))] = _DIM
-
-
-def _draw_item(header: Picture, item: _Item, slot: _Slot, font: int, task: TaskName) -> None:
-    x = slot.x
-    if item.gem:
-        area = header[slot.y + font // 8 : slot.y + font // 8 + font, x : x + font]
-        sprite = _treasure_sprite(font, _gem_colour(task), False)
-        area[:] = _over(area, _Sprite(*(part[: area.shape[0], : area.shape[1]] for part in sprite)))
-        x += font + font // 3
-    elif item.label:
-        _stamp(header, _text_mask(item.label, font), x, slot.y, _DIM)
-        x += _text_width(item.label, font) + font // 3
-    _stamp(header, _text_mask(item.value, font), x, slot.y, _TEXT)
-
-
-def _stamp(area: Picture, mask: npt.NDArray[np.uint8], x: int, y: int, colour: Colour) -> None:
-    """Print a text mask, cut off at the area's edges."""
-    part = area[y : y + mask.shape[0], x : x + mask.shape[1]]
-    alpha = mask[: part.shape[0], : part.shape[1], None].astype(np.uint16)
-    part[:] = _over(part, _Sprite(alpha * np.array(colour, dtype=np.uint16), 255 - alpha))
-
-
-@lru_cache(maxsize=1024)
-def _text_mask(text: str, size: int) -> npt.NDArray[np.uint8]:
-    """Coverage of each pixel by the text, its lines as high as the font's tallest letters."""
-    image, draw, _ = _pillow()
-    font = _font(size)
-    ascent, descent = font.getmetrics()
-    picture = image.new("L", (max(_text_width(text, size), 1), ascent + descent), 0)
-    draw.Draw(picture).text((0, 0), text, font=font, fill=255)
-    return np.asarray(picture)
-
-
-@lru_cache(maxsize=1024)
-def _text_width(text: str, size: int) -> int:
-    return int(np.ceil(_font(size).getlength(text))) if text else 0
-
-
-# --- what agents see
-
-
-def _draw_views(cells: Picture, scene: Scene) -> None:
-    """Veil the seen cells in their viewers' colours, walls less, and line each view's border on the floor."""
-    visible = np.asarray(scene.visible, dtype=np.bool_).transpose(0, 2, 1)
-    walls = np.asarray(scene.state["walls"], dtype=np.bool_).T
-    colours = _agent_colours(scene)
-    count = visible.sum(axis=0)
-    y, x = np.nonzero(count)
-    # The mean colour of the viewers; the more of them, the denser, but never opaque.
-    mean = np.einsum("nk,nc->kc", visible[:, y, x], colours) / count[y, x, None]
-    opacity = 1 - (1 - _VIEW_FILL) ** np.minimum(count[y, x], 3)
-    alpha = np.round(255 * opacity * np.where(walls[y, x], 0.25, 1.0))[:, None, None, None]
-    veil = _Sprite((mean[:, None, None] * alpha).astype(np.uint16), (255 - alpha).astype(np.uint16))
-    cells[y, :, x] = _over(cells[y, :, x], veil)
-    _draw_view_edges(cells, visible, walls, colours)
-
-
-def _draw_view_edges(
-    cells: Picture,
-    visible: npt.NDArray[np.bool_],
-    walls: npt.NDArray[np.bool_],
-    colours: npt.NDArray[np.uint16],
-) -> None:
-    around = np.pad(visible | walls, ((0, 0), (1, 1), (1, 1)))
-    whole = slice(None)
-    sides: list[tuple[Any, Any, npt.NDArray[np.bool_]]] = [
-        (0, whole, around[:, :-2, 1:-1]),
-        (-1, whole, around[:, 2:, 1:-1]),
-        (whole, 0, around[:, 1:-1, :-2]),
-        (whole, -1, around[:, 1:-1, 2:]),
-    ]
-    for row, column, neighbour in sides:
-        agent, y, x = np.nonzero(visible & ~walls & ~neighbour)
-        veil = _veil(colours[agent][:, None, :], _VIEW_EDGE)
-        cells[y, row, x, column] = _over(cells[y, row, x, column], veil)
-
-
-def _agent_colours(scene: Scene) -> npt.NDArray[np.uint16]:
-    """Colour of each agent by the zone it stands in now: (N, 3)."""
-    zones = scene.params.zone_of_column()[np.asarray(scene.state["agent_pos"])[:, 0]]
-    colours: npt.NDArray[np.uint16] = np.array(ZONE_COLOURS, dtype=np.uint16)[zones % len(ZONE_COLOURS)]
-    return colours
+def _paste(image: Any, sprite: Any, x: int, y: int, tile: int, top: int, centre: tuple[float, float]) -> None:
+    """Lay a sprite over a cell, around a point of the cell, inside it."""
+    left, upper = (int(np.clip(round(at * tile - sprite.width / 2), 0, tile - sprite.width)) for at in centre)
+    image.paste(sprite, (x * tile + left, top + y * tile + upper), sprite)
 
 
 # --- treasures and keys
 
-
-def _draw_objects(cells: Picture, scene: Scene, tile_size: int) -> None:
-    treasures, gem = scene.state["treasures"], _gem_colour(scene.task)
-    _paste(cells, treasures == TreasureState.COLLECTED, _treasure_sprite(tile_size, gem, True))
-    _paste(cells, treasures == TreasureState.AVAILABLE, _treasure_sprite(tile_size, gem, False))
-    _paste(cells, scene.state["keys"], _key_sprite(tile_size))
+_MIDDLE: Final = (0.5, 0.5)
 
 
-def _paste(cells: Picture, where: npt.NDArray[np.bool_], sprite: _Sprite) -> None:
-    x, y = np.nonzero(where)
-    cells[y, :, x] = _over(cells[y, :, x], sprite)
+def _draw_objects(image: Any, scene: Scene, tile: int, top: int) -> None:
+    treasures, gem = np.asarray(scene.state["treasures"]), DECLARED[scene.task].gem
+    for where, sprite in (
+        (treasures == TreasureState.COLLECTED, _treasure_sprite(tile, gem, True)),
+        (treasures == TreasureState.AVAILABLE, _treasure_sprite(tile, gem, False)),
+        (scene.state["keys"], _key_sprite(tile)),
+    ):
+        for x, y in np.argwhere(where).tolist():
+            _paste(image, sprite, x, y, tile, top, _MIDDLE)
 
 
 @lru_cache(maxsize=64)
-def _treasure_sprite(size: int, colour: Colour, collected: bool) -> _Sprite:
-    """A cut gem; where it was collected only its empty setting remains."""
+def _treasure_sprite(size: int, colour: Colour, collected: bool) -> Any:
+    """Draw a cut gem; where it was collected only its empty setting and a tick remain."""
     canvas = _Canvas(size)
     girdle, table, tip = 0.40, 0.20, 0.86
     outline = [(0.30, table), (0.70, table), (0.90, girdle), (0.50, tip), (0.10, girdle)]
     if collected:
-        canvas.polygon(outline, _INK, 90)
+        canvas.polygon(outline, _INK, 110)
         canvas.outline(outline, _mix(_DIM, _INK, 0.25), 0.06)
+        canvas.draw.line(canvas.points([(0.36, 0.46), (0.48, 0.60), (0.68, 0.34)]), (*_DIM, 255), canvas.side // 12)
         return canvas.sprite()
     white = (255, 255, 255)
     canvas.outline(outline, _INK, 0.14)
@@ -549,25 +388,19 @@ def _treasure_sprite(size: int, colour: Colour, collected: bool) -> _Sprite:
 
 
 @lru_cache(maxsize=32)
-def _key_sprite(size: int) -> _Sprite:
+def _key_sprite(size: int) -> Any:
     canvas = _Canvas(size)
     _draw_key(canvas, 0.5, 0.5, 1.0, 0.05)
     return canvas.sprite()
 
 
 def _draw_key(canvas: _Canvas, x: float, y: float, scale: float, rim: float) -> None:
-    """A golden key, upright, its middle at (x, y)."""
-
-    def box(left: float, top: float, right: float, bottom: float, grow: float, colour: Colour) -> None:
-        canvas.box(
-            x + left * scale - grow, y + top * scale - grow, x + right * scale + grow, y + bottom * scale + grow, colour
-        )
-
+    """Draw a golden key, upright, its middle at (x, y)."""
+    boxes = np.array([(-0.07, -0.10, 0.07, 0.40), (0.00, 0.10, 0.24, 0.20), (0.00, 0.28, 0.20, 0.38)])
     for grow, colour in ((rim, _INK), (0.0, _KEY)):
         canvas.disc(x, y - 0.21 * scale, 0.19 * scale + grow, colour)
-        box(-0.07, -0.10, 0.07, 0.40, grow, colour)
-        box(0.00, 0.10, 0.24, 0.20, grow, colour)
-        box(0.00, 0.28, 0.20, 0.38, grow, colour)
+        for box in boxes * scale + (x, y, x, y) + np.multiply((-1, -1, 1, 1), grow):
+            canvas.box(box, colour)
     canvas.disc(x, y - 0.21 * scale, 0.08 * scale, _INK)
 
 
@@ -578,16 +411,15 @@ class _Look(NamedTuple):
     """Everything that decides how one agent's sprite looks."""
 
     size: int
-    colour: Colour
+    agent: int
     direction: int
-    label: str
     has_key: bool
     selected: bool
 
 
 #: Where the members of a crowd stand in their cell (centres), and how large; more than nine share the last grid.
-_FANS: Final[dict[int, tuple[float, list[tuple[float, float]]]]] = {
-    1: (1.0, [(0.5, 0.5)]),
+_CROWDS: Final[dict[int, tuple[float, list[tuple[float, float]]]]] = {
+    1: (1.0, [_MIDDLE]),
     2: (0.66, [(0.33, 0.33), (0.67, 0.67)]),
     3: (0.60, [(0.30, 0.30), (0.70, 0.30), (0.50, 0.70)]),
     4: (0.54, [(0.27, 0.27), (0.73, 0.27), (0.27, 0.73), (0.73, 0.73)]),
@@ -595,75 +427,42 @@ _FANS: Final[dict[int, tuple[float, list[tuple[float, float]]]]] = {
 }
 _MOST_SHOWN: Final = 9
 #: An agent alone on a treasure is drawn smaller, so that the treasure shows.
-_ON_TREASURE: Final = (0.70, [(0.5, 0.56)])
-#: Sprites smaller than this carry no number and no picture of a key.
-_LEGIBLE: Final = 15
+_ON_TREASURE: Final = (0.75, [(0.5, 0.60)])
 
 
-def _draw_agents(cells: Picture, scene: Scene, tile_size: int) -> None:
-    positions = np.asarray(scene.state["agent_pos"])
+def _draw_agents(image: Any, scene: Scene, tile: int, top: int) -> None:
     crowds: dict[tuple[int, int], list[int]] = {}
-    for index, (x, y) in enumerate(positions.tolist()):
-        crowds.setdefault((x, y), []).append(index)
-    colours = _agent_colours(scene)
+    for agent, (x, y) in enumerate(np.asarray(scene.state["agent_pos"]).tolist()):
+        crowds.setdefault((x, y), []).append(agent)
     for (x, y), members in crowds.items():
-        _draw_crowd(cells[y, :, x], scene, members, colours, tile_size)
-
-
-def _draw_crowd(
-    cell: Picture, scene: Scene, members: list[int], colours: npt.NDArray[np.uint16], tile_size: int
-) -> None:
-    """Draw all agents of one cell side by side; when too many, the last place shows how many are left."""
-    scale, centres = next(fan for most, fan in _FANS.items() if most >= min(len(members), _MOST_SHOWN))
-    x, y = scene.state["agent_pos"][members[0]]
-    if len(members) == 1 and scene.state["treasures"][x, y] != TreasureState.NONE:
-        scale, centres = _ON_TREASURE
-    size = max(round(scale * tile_size), 1)
-    shown = members if len(members) <= _MOST_SHOWN else members[: _MOST_SHOWN - 1]
-    for index, centre in zip(shown, centres, strict=False):
-        red, green, blue = colours[index].tolist()
-        look = _Look(
-            size,
-            (red, green, blue),
-            int(scene.state["agent_dir"][index]),
-            f"{index}",
-            bool(scene.state["agent_has_key"][index]),
-            index == scene.selected,
-        )
-        _put(cell, _agent_sprite(look), centre)
-    if len(shown) < len(members):
-        _put(cell, _more_sprite(size, len(members) - len(shown)), centres[-1])
-
-
-def _put(cell: Picture, sprite: _Sprite, centre: tuple[float, float]) -> None:
-    size, tile = len(sprite.add), len(cell)
-    left, top = (int(np.clip(round(at * tile - size / 2), 0, tile - size)) for at in centre)
-    part = cell[top : top + size, left : left + size]
-    part[:] = _over(part, sprite)
+        scale, centres = next(crowd for most, crowd in _CROWDS.items() if most >= min(len(members), _MOST_SHOWN))
+        if len(members) == 1 and scene.state["treasures"][x, y] != TreasureState.NONE:
+            scale, centres = _ON_TREASURE
+        size = max(round(scale * tile), 1)
+        shown = members if len(members) <= _MOST_SHOWN else members[: _MOST_SHOWN - 1]
+        for agent, centre in zip(shown, centres, strict=False):
+            direction, has_key = (int(scene.state[name][agent]) for name in ("agent_dir", "agent_has_key"))
+            look = _Look(size, agent, direction, bool(has_key), agent == scene.selected)
+            _paste(image, _agent_sprite(look), x, y, tile, top, centre)
+        if len(shown) < len(members):
+            # The last place shows how many are left.
+            _paste(image, _more_sprite(size, len(members) - len(shown)), x, y, tile, top, centres[-1])
 
 
 @lru_cache(maxsize=4096)
-def _agent_sprite(look: _Look) -> _Sprite:
-    """A triangle that points where the agent faces, its index inside, pink rim and a key if it carries one."""
-    canvas = _Canvas(look.size)
-    shape = _turned([(0.12, 0.12), (0.92, 0.50), (0.12, 0.88)], look.direction)
+def _agent_sprite(look: _Look) -> Any:
+    """Draw a triangle that points where the agent faces, its number inside, and a key if it carries one."""
+    canvas, colour, label = _Canvas(look.size), _agent_colour(look.agent), f"{look.agent}"
+    shape = _turned([(0.10, 0.06), (0.97, 0.50), (0.10, 0.94)], look.direction)
     if look.selected:
         canvas.outline(shape, (255, 255, 255), 0.24)
     canvas.outline(shape, _INK, 0.13)
-    canvas.polygon(shape, look.colour)
+    canvas.polygon(shape, colour)
+    if look.size >= _LEGIBLE and len(label) <= 2:
+        x, y = _turned([(0.36, 0.5)], look.direction)[0]
+        canvas.text(x, y, label, 0.5 if len(label) == 1 else 0.40, _readable_on(colour))
     if look.has_key:
-        canvas.outline(shape, _PINK, 0.11)
-    else:
-        canvas.outline(shape, _mix(look.colour, (255, 255, 255), 0.65), 0.06)
-    if look.size >= _LEGIBLE and len(look.label) <= 2:
-        x, y = _turned([(0.37, 0.5)], look.direction)[0]
-        canvas.text(x, y, look.label, 0.42 if len(look.label) == 1 else 0.36, _readable_on(look.colour))
-    if look.has_key:
-        if look.size >= _LEGIBLE:
-            _draw_key(canvas, 0.84, 0.27, 0.56, 0.045)
-        else:
-            canvas.disc(0.80, 0.20, 0.20, _INK)
-            canvas.disc(0.80, 0.20, 0.15, _KEY)
+        _draw_key(canvas, 0.82, 0.27, 0.60, 0.05)
     return canvas.sprite()
 
 
@@ -675,7 +474,7 @@ def _turned(points: list[tuple[float, float]], direction: int) -> list[tuple[flo
 
 
 @lru_cache(maxsize=256)
-def _more_sprite(size: int, number: int) -> _Sprite:
+def _more_sprite(size: int, number: int) -> Any:
     canvas = _Canvas(size)
     canvas.disc(0.5, 0.5, 0.5, _INK)
     canvas.text(0.5, 0.5, f"+{number}", 0.6 if number < 10 else 0.45, _TEXT)

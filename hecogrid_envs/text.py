@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import AGENT_PALETTE, KEY_CARRIER_INDEX, ZONE_COLOURS, Colour, TreasureState
+from hecogrid_envs.constants import KEY_CARRIER_COLOUR, Colour, TreasureState, zone_colour
 from hecogrid_envs.state import StateMapping
 
 WALL: Final = "#"
@@ -156,22 +156,18 @@ def _painted(row: str, zones: list[int], ink: Callable[[str, int], _Ink]) -> str
     return "".join(parts)
 
 
-def _zone_colour(zone: int) -> Colour:
-    return ZONE_COLOURS[zone % len(ZONE_COLOURS)]
-
-
 def _zone_ink(character: str, zone: int) -> _Ink:
-    red, green, blue = _zone_colour(zone)
+    red, green, blue = zone_colour(zone)
     return _Ink((0, 0, 0) if red + 2 * green > 250 else (255, 255, 255), (red, green, blue))
 
 
 def _cell_ink(character: str, zone: int) -> _Ink:
     """The ground is the zone's colour, darkened; agents are the zone's colour, lightened."""
-    red, green, blue = _zone_colour(zone)
+    red, green, blue = zone_colour(zone)
     if character in AGENT:
         front: Colour = (64 + 3 * red // 4, 64 + 3 * green // 4, 64 + 3 * blue // 4)
     elif character in CARRIER:
-        front = AGENT_PALETTE[KEY_CARRIER_INDEX]
+        front = KEY_CARRIER_COLOUR
     else:
         front = _INKS.get(character, (255, 255, 255))
     return _Ink(front, (28 + red // 9, 28 + green // 9, 28 + blue // 9))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from textwrap import dedent
 from typing import Any
 
@@ -86,25 +85,8 @@ def test_crowds_are_counted(number: int, character: str) -> None:
     assert render_text(state).splitlines()[2] == f"#...${character}#"
 
 
-def test_many_agents_fill_several_lines() -> None:
-    state = make_state()
-    state["agent_pos"] = np.array([(5, 2)] * 50)
-    state["agent_dir"] = np.zeros(50, dtype=int)
-    state["agent_has_key"] = np.zeros(50, dtype=bool)
-    lines = [line for line in render_text(state).splitlines() if line.startswith("agents")]
-    assert len(lines) == 4
-    assert max(map(len, lines)) <= 100
-    assert len(parse_level(render_text(state))["agent_dir"]) == 50
-
-
 def test_zones_beyond_nine_are_letters() -> None:
     assert render_text(make_state(), zones=[9, 10, 35, 36, 0, 0, 0]).splitlines()[0] == "9az0000"
-
-
-def test_colours_add_nothing_but_escapes() -> None:
-    zones = [0, 0, 0, 0, 1, 1, 1]
-    painted = render_text(make_state(), zones=zones, step=3, collected=1, colour=True)
-    assert re.sub(r"\x1b\[[0-9;]*m", "", painted) == PAGE
 
 
 def test_zones_and_things_have_colours_of_their_own() -> None:
@@ -119,12 +101,6 @@ def test_zones_and_things_have_colours_of_their_own() -> None:
 
 
 # --- reading
-
-
-def test_page_is_read_back() -> None:
-    expected = make_state()
-    expected["agent_pos"] = expected["agent_pos"].astype(np.int64)
-    assert_equal_states(parse_level(PAGE), expected)
 
 
 @st.composite
