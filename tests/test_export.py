@@ -11,10 +11,10 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
+import msgspec
 import numpy as np
 import pytest
 import torch as th
@@ -39,7 +39,7 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.export import files as export_files
-from sb3_saf.export.manifest import DATA_FILES, MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, DataFile, Manifest
+from sb3_saf.export.manifest import DATA_FILES, MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, DataFile, Manifest, checksum
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.lone_agent import TRAINING, Absent
 from tests.test_policies import ACTIONS, equal_weights, make_model, make_policy
@@ -232,9 +232,9 @@ def test_onnx_gives_torchs_numbers(folders: dict[str, tuple[TeamActorCriticPolic
     policy, folder = folders[name]
     obs = samples(policy.team_spaces.own, 33)
     torch_actor, onnx_actor = Actor.load(folder, agent=2), Actor.load(folder, agent=2, runtime="onnx")
-    for found, expected in zip(onnx_actor._outputs(obs)[0], torch_actor._outputs(obs)[0], strict=True):
-        if expected is not None and found is not None:
-            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    actions = samples(policy.action_space, 33)
+    found, expected = onnx_actor.log_prob(obs, actions), torch_actor.log_prob(obs, actions)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(onnx_actor.act(obs), predicted(policy, obs, 2), atol=1e-5)
     one = onnx_actor.act(obs[0], deterministic=False, rng=3)
     np.testing.assert_array_equal(one, onnx_actor.act(obs[0], deterministic=False, rng=3))
@@ -287,6 +287,70 @@ def test_an_export_without_onnx_says_so(tmp_path: Path) -> None:
     folder = exported(make_policy(MAPPOPolicy), tmp_path / "actor")
     with pytest.raises(ExportError, match=r'without actor.onnx; load it with runtime="torch"'):
         Actor.load(folder, runtime="onnx")
+
+
+# --- files of earlier versions ----------------------------------------------------------------------------------------
+
+EARLIER = ROOT / "tests" / "golden" / "format_2"
+
+
+@pytest.mark.parametrize(
+    ("name", "runtime"), [("pool", "torch"), ("pool", "onnx"), ("gumbel", "torch"), ("per_agent_memory", "torch")]
+)
+def test_exports_of_format_version_2_act_as_they_did(name: str, runtime: Literal["torch", "onnx"]) -> None:
+    expected = json.loads((EARLIER / "answers.json").read_text())[name]
+    actor = Actor.load(EARLIER / name, agent=1, runtime=runtime)
+    memories = [actor.new_memory() if actor.has_memory else None for _ in range(2)]
+    obs = np.array(expected["observation"], actor.manifest.observation.dtype)
+    found = actor.act(obs, memory=memories[0])
+    np.testing.assert_allclose(found, expected["actions"], atol=1e-5)
+    np.testing.assert_allclose(actor.log_prob(obs, found, memory=memories[1]), expected["log_prob"], atol=1e-4)
+
+
+def test_weights_saved_by_an_earlier_version_are_read() -> None:
+    model = make_model(seed=1)
+    load_weights(model, EARLIER / "model.zip")
+    expected = json.loads((EARLIER / "answers.json").read_text())["model"]["actions"]
+    assert model.predict(samples(VECTOR, 6), deterministic=True)[0].tolist() == expected
+
+
+# --- who acts, and pixels for an actor of tile codes ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy_class", [MAPPOPolicy, SAFPolicy])
+def test_an_actor_that_reads_who_acts_is_told(policy_class: type[TeamActorCriticPolicy], tmp_path: Path) -> None:
+    policy = make_policy(policy_class, noise=0.6, actor_identity=True)
+    folder, obs = export_actors(policy, tmp_path / "actor"), samples(VECTOR, 20)
+    with pytest.raises(ValueError, match="say which one acts"):
+        Actor.load(folder)
+    probabilities = []
+    for agent in range(3):
+        actors = Actor.load(folder, agent=agent), Actor.load(folder, agent=agent, runtime="onnx")
+        rows = {"obs": th.as_tensor(obs), "agent": th.full((20,), agent)}
+        with th.no_grad():
+            expected = cast(Any, policy.get_distribution(rows)).distribution.probs
+        for actor in actors:
+            np.testing.assert_allclose(actor.probabilities(obs), expected, atol=1e-5)
+            np.testing.assert_array_equal(actor.act(obs), predicted(policy, obs, agent))
+        probabilities.append(expected.numpy())
+    assert np.abs(probabilities[0] - probabilities[2]).max() > 0.01
+
+
+@pytest.mark.parametrize("encoder", [None, LightEncoder, MLPEncoder])
+def test_an_actor_of_tile_codes_takes_pixels(encoder: type[BaseFeaturesExtractor] | None, tmp_path: Path) -> None:
+    space = CodeSpace()
+    kwargs: dict[str, Any] = {} if encoder is None else {"features_extractor_class": encoder}
+    folder = export_actors(make_policy(SAFPolicy, space, noise=0.6, **kwargs), tmp_path / "actor", onnx=encoder is None)
+    codes = samples(space, 10)
+    pictures = space.atlas[codes].swapaxes(2, 3).reshape(10, 12, 12, 3)
+    for runtime in ("torch", "onnx") if encoder is None else ("torch",):
+        actor = Actor.load(folder, runtime=cast(Any, runtime))
+        np.testing.assert_array_equal(actor.act(pictures), actor.act(codes))
+        np.testing.assert_array_equal(actor.act(np.moveaxis(pictures, -1, 1)), actor.act(codes))
+        assert actor.act(pictures[3]) == actor.act(codes[3])
+    pictures[2, 5, 9, 0] ^= 1
+    with pytest.raises(ValueError, match="the tile in row 1, column 2 is none of the 20 tiles that this agent was"):
+        actor.act(pictures)
 
 
 # --- processes that see nothing but their own observation -------------------------------------------------------------
@@ -486,7 +550,7 @@ def rewrite(folder: Path, change: Callable[[dict[str, Any]], object], weights: b
     manifest = Manifest.from_json((folder / MANIFEST_FILE).read_bytes())
     if weights is not None:
         (folder / WEIGHTS_FILE).write_bytes(weights)
-        manifest = replace(manifest, files={WEIGHTS_FILE: DataFile.of(weights)})
+        manifest = msgspec.structs.replace(manifest, files={WEIGHTS_FILE: DataFile.of(weights)})
     entries = json.loads(manifest.to_json())
     del entries["checksum"]
     change(entries)
@@ -494,9 +558,7 @@ def rewrite(folder: Path, change: Callable[[dict[str, Any]], object], weights: b
 
 
 def with_checksum(entries: dict[str, Any]) -> str:
-    from sb3_saf.export.manifest import _checksum
-
-    return json.dumps({**entries, "checksum": _checksum(entries)})
+    return json.dumps({**entries, "checksum": checksum(entries)})
 
 
 def test_nothing_is_unpickled(export: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -509,26 +571,28 @@ def test_nothing_is_unpickled(export: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
-    "format version 3": lambda m: m.update(format_version=3),
+    "format version 4": lambda m: m.update(format_version=4),
     "is not of an exported actor": lambda m: m.update(format="pickle"),
-    "encoder.name must be one of": lambda m: m["encoder"].update(name="os.system"),
-    "actor.name must be one of": lambda m: m["actor"].update(name="builtins.eval"),
-    "activation must be one of": lambda m: m["actor"].update(activation="Module"),
-    "unknown entry": lambda m: m.update(extra=1),
-    "lacks 'n_agents'": lambda m: m.pop("n_agents"),
-    "unknown entry '../../etc/passwd'": lambda m: m["files"].update({"../../etc/passwd": m["files"][WEIGHTS_FILE]}),
-    "1..1048576, got 1048577": lambda m: m["encoder"].update(hidden=(1 << 20) + 1),
+    "Invalid enum value 'os.system' - at `$.encoder.name`": lambda m: m["encoder"].update(name="os.system"),
+    "`$.actor.name`": lambda m: m["actor"].update(name="builtins.eval"),
+    "`$.actor.activation`": lambda m: m["actor"].update(activation="Module"),
+    "unknown field `extra`": lambda m: m.update(extra=1),
+    "missing required field `n_agents`": lambda m: m.pop("n_agents"),
+    "'../../etc/passwd' - at `key` in `$.files`": lambda m: m["files"].update(
+        {"../../etc/passwd": m["files"][WEIGHTS_FILE]}
+    ),
+    "<= 1048576 - at `$.encoder.hidden`": lambda m: m["encoder"].update(hidden=(1 << 20) + 1),
     "of shape (1048576, 144)": lambda m: m["encoder"].update(hidden=1 << 20),
     "describes at least 4": lambda m: m["actor"].update(n_policies=1 << 20),
     "describes at least 32": lambda m: m["actor"].update(hidden=[1] * 4096),
     "has 1099511627776 entries": lambda m: m["observation"].update(shape=[1 << 20, 1 << 20]),
     "whole tiles": lambda m: m["encoder"].update(tile_size=5),
     "without an entry in its atlas": lambda m: m["observation"].update(high=20),
-    "must be true or false": lambda m: m.update(reads_agent=1),
-    "dtype must be one of": lambda m: m["observation"].update(dtype="O"),
+    "Expected `bool`, got `int` - at `$.reads_agent`": lambda m: m.update(reads_agent=1),
+    "`$.observation.dtype`": lambda m: m["observation"].update(dtype="O"),
     "or have the shape (3, 3)": lambda m: m["observation"].update(low=[[[]]] * 9),
     "one number of uint8 or nested lists": lambda m: m["observation"].update(low={}),
-    "must be an object": lambda m: m.update(observation=[]),
+    "got `array` - at `$.observation`": lambda m: m.update(observation=[]),
     "names neither": lambda m: m.update(files={}, encoder=None, actor=None),
 }
 

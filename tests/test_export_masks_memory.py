@@ -196,7 +196,7 @@ def test_other_lstms_are_refused(tmp_path: Path) -> None:
         ("more than 1048576 numbers", {"n_layers": 4000, "hidden_size": 300}),
         ("of shape (28, 12)", {"hidden_size": 7}),
         ("lacks the tensor 'memory.bias_hh_l1'", {"n_layers": 2}),
-        ("memory.bias must be true or false", {"bias": 0}),
+        ("Expected `bool`, got `int` - at `$.memory.bias`", {"bias": 0}),
     ],
 )
 def test_malformed_memories_are_refused(message: str, changes: dict[str, Any], tmp_path: Path) -> None:

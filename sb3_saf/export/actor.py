@@ -7,41 +7,20 @@ these are not installed.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
 
-from sb3_saf.export.act import (
-    Draws,
-    Memory,
-    NumpyDraws,
-    Outputs,
-    States,
-    as_batch,
-    as_masks,
-    decide,
-    masked,
-)
+from sb3_saf.export.act import Memory, as_batch, as_masks
 from sb3_saf.export.files import read_limited
-from sb3_saf.export.likelihood import log_prob
-from sb3_saf.export.manifest import MANIFEST_FILE, MAX_MANIFEST_BYTES, Manifest, SpaceRecord, bound_array
+from sb3_saf.export.manifest import MANIFEST_FILE, MAX_MANIFEST_BYTES, Manifest
+from sb3_saf.export.runtime import Array, Inputs, Rng, Runtime, States
+from sb3_saf.networks.spaces import SpaceSpec, pixels_to_codes
 
-Array = npt.NDArray[Any]
-RuntimeName = Literal["torch", "onnx"]
-
-
-class Runtime(Protocol):
-    """What computes the network."""
-
-    def __call__(self, observations: Array, states: States = ()) -> tuple[Outputs, States]:
-        """(K, *shape) own observations and what is remembered, to the network's outputs and what is remembered then."""
-
-    def draws(self, seed: int | None) -> Draws:
-        """Random numbers from a seed, or those that go on from the last call."""
+RuntimeName: TypeAlias = Literal["torch", "onnx"]
 
 
 class Actor:
@@ -68,8 +47,7 @@ class Actor:
         self.agent = agent
         self._runtime = runtime
         self._observation = _plain(manifest.observation)
-        self._action = _plain(manifest.action)
-        self._masks = {"action": self._action, "action_mask": manifest.action_mask}
+        self._masks = {"action": _plain(manifest.action), "action_mask": manifest.action_mask}
 
     @classmethod
     def load(cls, folder: str | PathLike[str], agent: int | None = None, runtime: RuntimeName = "torch") -> Actor:
@@ -77,7 +55,7 @@ class Actor:
         Read an export. Files may come from strangers: whatever is wrong with them is an :class:`ExportError`.
 
         :param folder: written by ``sb3_saf.export_actors``
-        :param agent: index of the agent in its team; needed if every agent has a policy of its own
+        :param agent: index of the agent in its team; needed where what is done depends on who acts
         :param runtime: ``"torch"``, or ``"onnx"`` which needs onnxruntime and no torch
         :raises ExportError: if the files are damaged, malformed or of an unknown format
         """
@@ -121,7 +99,7 @@ class Actor:
         draws unless told otherwise.
 
         :param observation: one own observation as the environment gives it (pictures with channels first or last), or
-            a batch of them with one more axis
+            a batch of them with one more axis. An actor of tile codes also takes the game's pixels
         :param deterministic: whether to take the most likely action instead of drawing one
         :param rng: where draws come from: a seed, or a NumPy generator. None goes on where the last call ended; with
             torch that is torch's global generator, and the draws are those of the trained model's ``predict`` (for a
@@ -134,32 +112,34 @@ class Actor:
         :raises ValueError: for observations that are not of the observation space's shape and kind, or not finite, and
             for masks or memories that do not fit
         """
-        outputs, states, is_batch = self._outputs(observation, action_mask, memory)
-        draws = None if deterministic else self._draws(rng)
-        actions = decide(self._action, self.manifest.selection, outputs, draws)
+        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        actions, states = self._runtime.act(inputs, deterministic, _checked_rng(rng))
         if memory is not None:
             memory.hidden, memory.cell = states
+        if self.manifest.action.kind == "box":
+            actions = np.clip(actions, *self.manifest.action.bounds())
         return actions if is_batch else actions.squeeze(axis=0)
 
     def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Probability of every action, for discrete actions.
+        Compute the probability of every action, for discrete actions.
 
         :param observation: see :meth:`act`
         :param action_mask: see :meth:`act`
         :param memory: see :meth:`act`; it stays as it is
         :return: (A,), or (K, A) for a batch
         """
-        outputs, _, is_batch = self._outputs(observation, action_mask, memory)
+        inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()
-        if outputs.log_probs is None:
+        if not self.manifest.gives_log_probs:
             raise ValueError(f"{self.manifest.action.kind} actions have no list of probabilities; use log_prob")
-        probabilities = np.exp(outputs.log_probs)
+        probabilities: Array = np.exp(self._runtime.log_probs(inputs))
         return probabilities if is_batch else probabilities[0]
 
     def log_prob(self, observation: Any, action: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Log-likelihood of actions: that of drawing a policy of the pool by its weight, and the action from it.
+        Compute the log-likelihood of actions: that of drawing a policy of the pool by its weight, and the action from
+        it.
 
         :param observation: see :meth:`act`
         :param action: one action, or as many as there are observations
@@ -167,24 +147,24 @@ class Actor:
         :param memory: see :meth:`act`; it stays as it is
         :return: (), or (K,) for a batch
         """
-        outputs, _, is_batch = self._outputs(observation, action_mask, memory)
+        inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()
-        actions = np.asarray(action).reshape(len(outputs.log_weights), -1)
-        result = log_prob(self._action, outputs, actions)
+        actions = np.asarray(action).reshape(len(inputs.observation), -1)
+        choices = np.asarray(self.manifest.action.choices)
+        if choices.size and ((actions < 0) | (actions >= choices)).any():
+            raise ValueError(f"expected actions of at least 0 and below {choices.tolist()}, got {actions.tolist()}")
+        result = self._runtime.log_prob(inputs, actions)
         return result if is_batch else result[0]
 
     def _refuse_greedy(self) -> None:
         if self.manifest.selection == "greedy":
             raise ValueError(f"{self.manifest.policy} has values of actions and takes the best: no action is drawn")
 
-    def _outputs(
-        self, observation: Any, action_mask: Any = None, memory: Memory | None = None
-    ) -> tuple[Outputs, States, bool]:
-        """What the network says, with forbidden actions taken out; what is remembered then; whether a batch came."""
+    def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[Inputs, bool]:
+        """What the runtime reads, checked, and whether a batch came."""
         batch, is_batch = self._batch(observation)
         mask = as_masks(action_mask, self._masks, len(batch))
-        outputs, states = self._runtime(batch, self._states(memory, len(batch)))
-        return (outputs if mask is None else masked(self._action, outputs, mask)), states, is_batch
+        return Inputs(batch, mask, self._states(memory, len(batch))), is_batch
 
     def _states(self, memory: Memory | None, n_rows: int) -> States:
         net = self.manifest.memory
@@ -197,11 +177,13 @@ class Actor:
                 "this actor remembers what it has seen: memory = actor.new_memory() at the start of each episode, then "
                 f"actor.act(observation, memory=memory); got memory={memory!r}"
             )
-        return memory.arrays(asdict(net), n_rows)
+        return memory.arrays(msgspec.structs.asdict(net), n_rows)
 
     def _batch(self, observation: Any) -> tuple[Array, bool]:
         space = self.manifest.observation
         array = np.asarray(observation)
+        if self._runtime.atlas is not None and _is_picture(array, space):
+            array = pixels_to_codes(array, self._runtime.atlas)
         if not _can_become(array, np.dtype(space.dtype)):
             raise ValueError(f"expected observations of {space.dtype}, got {array.dtype} that does not fit into it")
         batch, is_batch = as_batch(array, self._observation)
@@ -210,20 +192,27 @@ class Actor:
         _check_codes(batch, space)
         return batch, is_batch
 
-    def _draws(self, rng: int | np.random.Generator | None) -> Draws:
-        if isinstance(rng, np.random.Generator):
-            return NumpyDraws(rng)
-        if rng is not None and (isinstance(rng, bool) or not isinstance(rng, (int, np.integer))):
-            raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
-        return self._runtime.draws(None if rng is None else int(rng))
+
+def _is_picture(array: Array, codes: SpaceSpec) -> bool:
+    """Whether an array is pixels, one picture or a batch, where tile codes are expected."""
+    channels, height, width = codes.picture_shape
+    return array.ndim in (3, 4) and array.shape[-3:] in ((height, width, channels), (channels, height, width))
+
+
+def _checked_rng(rng: object) -> Rng:
+    if rng is None or isinstance(rng, np.random.Generator):
+        return rng
+    if isinstance(rng, bool) or not isinstance(rng, (int, np.integer)):
+        raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
+    return int(rng)
 
 
 def _make_runtime(name: RuntimeName, folder: Path, manifest: Manifest, agent: int | None) -> Runtime:
     # Imported here: each needs a library that the other does without.
     if name == "onnx":
-        from sb3_saf.export.onnx_runtime import OnnxRuntime
+        from sb3_saf.export.onnx_runtime import make_onnx_runtime
 
-        return OnnxRuntime(folder, manifest, agent)
+        return make_onnx_runtime(folder, manifest, agent)
     from sb3_saf.export.torch_runtime import TorchRuntime
 
     return TorchRuntime(folder, manifest, agent)
@@ -233,7 +222,7 @@ def _checked_agent(manifest: Manifest, agent: int | None) -> int | None:
     if agent is None:
         if manifest.reads_agent:
             raise ValueError(
-                "every agent of this team has a policy of its own: say which one acts, "
+                "what agents of this team do depends on who they are: say which one acts, "
                 f"Actor.load(folder, agent=0) to {manifest.n_agents - 1}"
             )
         return None
@@ -242,12 +231,9 @@ def _checked_agent(manifest: Manifest, agent: int | None) -> int | None:
     return int(agent)
 
 
-def _plain(space: SpaceRecord) -> dict[str, Any]:
-    """A space as ``act.py`` finds it in the file, with its bounds read once."""
-    bounds = {
-        side: bound_array(bound, space) for side in ("low", "high") if (bound := getattr(space, side)) is not None
-    }
-    return {**asdict(space), **bounds}
+def _plain(space: SpaceSpec) -> dict[str, Any]:
+    """A space as ``act.py`` finds it in the file."""
+    return {"shape": space.shape, "dtype": space.dtype, "choices": space.choices, "picture": space.picture}
 
 
 def _can_become(array: Array, dtype: np.dtype[Any]) -> bool:
@@ -260,7 +246,7 @@ def _can_become(array: Array, dtype: np.dtype[Any]) -> bool:
         return bool((array.astype(dtype) == array).all())
 
 
-def _check_codes(batch: Array, space: SpaceRecord) -> None:
+def _check_codes(batch: Array, space: SpaceSpec) -> None:
     """Refuse codes and choices that do not exist."""
     if space.atlas is not None:
         limit = np.asarray(space.atlas[0])

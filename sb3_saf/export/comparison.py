@@ -10,13 +10,12 @@ import torch as th
 
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.manifest import MemoryNet
-from sb3_saf.export.network import ActorNetwork
-from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.export.network import AgentNetwork, States
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
 
-#: Policies whose actors read one agent's own observation, mask and memory, and nothing else.
+#: Policies whose actors read one agent's own observation, index, mask and memory, and nothing else.
 ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy
 
 #: Largest difference between the model's and the exported network's outputs, beside the outputs' own size.
@@ -25,7 +24,7 @@ _N_CHECKED: Final = 16
 
 
 def some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str, th.Tensor]:
-    """Random inputs of the network, by name; the space's own generator and torch's are left alone."""
+    """Make random inputs of the network, by name; the space's own generator and torch's are left alone."""
     space = copy.deepcopy(policy.team_spaces.own)
     space.seed(0)
     inputs = {"observation": th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))}
@@ -38,34 +37,30 @@ def some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str,
     return inputs
 
 
-def compare(policy: ExportablePolicy, network: ActorNetwork, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
-    """The exported network's outputs, once they are known to be the model's."""
+def check_network(policy: ExportablePolicy, network: AgentNetwork, inputs: dict[str, th.Tensor]) -> None:
+    """
+    Compare the exported network with the model.
+
+    :raises ExportError: if they differ by more than rounding does
+    """
     was_training = policy.training
     policy.set_training_mode(False)
     with th.no_grad():
-        expected, states = _of_model(policy, {name: value.to(policy.device) for name, value in inputs.items()})
-        outputs = network(**inputs)
+        expected = _of_model(policy, {name: value.to(policy.device) for name, value in inputs.items()})
+        states = (inputs["hidden"], inputs["cell"]) if "hidden" in inputs else ()
+        output, states = network(inputs["observation"], inputs.get("agent"), states)
     policy.set_training_mode(was_training)
-    n_outputs = len(outputs) - len(states)
-    found = outputs[n_outputs - 1].flatten(1)
-    if not isinstance(policy.actor, PolicyPool):
-        found = outputs[1].flatten(1)
-    elif found.shape != expected.shape:
-        found = th.cat([outputs[0], outputs[1].flatten(1)], dim=1)
-    otherwise = f"{type(policy).__name__} does more than its encoder and actor show"
-    check_close(found, expected.cpu(), otherwise)
-    for state, wanted in zip(outputs[n_outputs:], states, strict=True):
-        check_close(state, wanted.cpu(), otherwise)
-    return tuple(outputs)
+    for found, wanted in zip((*output, *states), expected, strict=True):
+        check_close(found, wanted.cpu(), f"{type(policy).__name__} does more than its encoder and actor show")
 
 
-def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
+def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> States:
     """What the model's own actor gives, and what it remembers then."""
     latent = policy.extract_features(inputs["observation"])
-    states: tuple[th.Tensor, ...] = ()
+    states: States = ()
     if isinstance(policy, TeamRecurrentPolicy):
         latent, states = policy.remember(latent, (inputs["hidden"], inputs["cell"]))
-    return policy.actor(latent, inputs.get("agent")), states
+    return *policy.actor.evaluate(latent, inputs.get("agent")), *states
 
 
 def check_close(found: th.Tensor, expected: th.Tensor, otherwise: str) -> None:

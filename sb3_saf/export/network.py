@@ -1,376 +1,258 @@
 """
-The networks of an actor in torch alone: encoder and policies, from raw own observations to action parameters.
+The network of one agent: the encoder, memory and actor of ``sb3_saf.networks``, from raw own observations to decisions.
 
-The layers are those of ``sb3_saf.networks``, under the same names, without what training needs around them. Letters: K
-rows, d features, N agents, U policies, P parameters of one policy's distribution, A actions.
+Letters: K rows, d features, N agents, U policies, P parameters of one policy's distribution, D action dimensions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from math import prod
-from typing import Final
+from typing import Any, Final, get_args
 
+import numpy as np
+import numpy.typing as npt
 import torch as th
+from safetensors import SafetensorError
+from safetensors.torch import load
 from torch import nn
 
+from sb3_saf.export.errors import ExportError
 from sb3_saf.export.manifest import (
-    ACTIVATION_NAMES,
+    MANIFEST_FILE,
+    WEIGHTS_FILE,
+    Activation,
     ActorNet,
     EncoderNet,
     Manifest,
     MemoryNet,
-    SpaceRecord,
-    picture_shape,
 )
-from sb3_saf.networks.layers import mlp
+from sb3_saf.networks import encoders
+from sb3_saf.networks.actor import ActorNetwork, PoolOutput, SinglePolicy
+from sb3_saf.networks.distributions import (
+    likeliest_action,
+    mixture_log_probs,
+    mixture_mode,
+    mixture_sample,
+    policy_parameters,
+    sample_action,
+)
+from sb3_saf.networks.encoders import preprocess
+from sb3_saf.networks.policy_pool import PolicyPool, draw_policy
+from sb3_saf.networks.spaces import ObservationSpec, SpaceSpec
+
+Array = npt.NDArray[Any]
+States = tuple[th.Tensor, ...]
 
 #: Activations that a file may name.
-ACTIVATIONS: Final[dict[str, type[nn.Module]]] = {name: getattr(nn, name) for name in ACTIVATION_NAMES}
+ACTIVATIONS: Final[dict[str, type[nn.Module]]] = {name: getattr(nn, name) for name in get_args(Activation)}
+#: Where files have the pixels of tile codes.
+ATLAS: Final = "encoder.pixels.atlas"
 
 
-class Pictures(nn.Module):
+class RawEncoder(nn.Module):
     """
-    Raw pictures or tile codes as float pictures (K, C, H, W).
+    An encoder that reads raw observations.
 
+    :param encoder: reads preprocessed observations
     :param space: of one own observation
     :param divide_by_255: whether pictures of bytes are scaled to [0, 1]
     """
 
-    atlas: th.Tensor
-
-    def __init__(self, space: SpaceRecord, divide_by_255: bool):
+    def __init__(self, encoder: nn.Module, space: SpaceSpec, divide_by_255: bool):
         super().__init__()
-        self.divide_by_255 = divide_by_255
-        self.shape = picture_shape(space)
-        self.is_codes = space.atlas is not None
-        self.channels_last = not self.is_codes and space.shape != self.shape
-        if space.atlas is not None:
-            self.register_buffer("atlas", th.zeros(space.atlas, dtype=th.uint8))
+        self.encoder, self.space, self.divide_by_255 = encoder, space, divide_by_255
 
-    def colours(self) -> th.Tensor:
-        """(n_codes, t, t, C) pixels of every code in [0, 1]."""
-        return self.atlas.float() / 255.0
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) raw observations to (K, C, H, W)."""
-        if self.is_codes:
-            tiles = self.colours()[observations.long()]
-            channels, height, width = self.shape
-            return tiles.transpose(2, 3).reshape(-1, height, width, channels).permute(0, 3, 1, 2)
-        pictures = observations.float()
-        if self.divide_by_255:
-            pictures = pictures / 255.0
-        if self.channels_last:
-            pictures = pictures.permute(0, 3, 1, 2)
-        return pictures.contiguous(memory_format=th.channels_last)
-
-
-class PaperCNN(nn.Module):
-    """See ``sb3_saf.PaperCNN``."""
-
-    def __init__(self, space: SpaceRecord, net: EncoderNet):
-        super().__init__()
-        self.pixels = Pictures(space, net.divide_by_255)
-        channels, height, width = self.pixels.shape
-        out = [((size - 4) // 2 + 1 - 3) // 2 + 1 for size in (height, width)]
-        self.net = nn.Sequential(
-            nn.Conv2d(channels, 32, kernel_size=4, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(32, 64, kernel_size=3, stride=2),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(64 * prod(out), 512),
-            nn.ReLU(),
-            nn.Linear(512, net.features_dim),
-        )
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) raw observations to (K, d)."""
-        features: th.Tensor = self.net(self.pixels(observations))
+    def forward(self, observation: th.Tensor) -> th.Tensor:
+        """(K, *shape) to (K, d)."""
+        features: th.Tensor = self.encoder(preprocess(observation, self.space, self.divide_by_255))
         return features
 
 
-class NatureEncoder(nn.Module):
-    """See ``sb3_saf.NatureEncoder``."""
-
-    def __init__(self, space: SpaceRecord, net: EncoderNet):
-        super().__init__()
-        self.pixels = Pictures(space, net.divide_by_255)
-        self.nature = _NatureCNN(self.pixels.shape, net.features_dim)
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) raw observations to (K, d)."""
-        features: th.Tensor = self.nature(self.pixels(observations))
-        return features
-
-
-class _NatureCNN(nn.Module):
-    """Stable-Baselines3's, without Stable-Baselines3."""
-
-    def __init__(self, shape: tuple[int, int, int], features_dim: int):
-        super().__init__()
-        channels, height, width = shape
-        out = [(((size - 8) // 4 + 1 - 4) // 2 + 1 - 3) + 1 for size in (height, width)]
-        self.cnn = nn.Sequential(
-            nn.Conv2d(channels, 32, kernel_size=8, stride=4),
-            nn.ReLU(),
-            nn.Conv2d(32, 64, kernel_size=4, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(64, 64, kernel_size=3, stride=1),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
-        self.linear = nn.Sequential(nn.Linear(64 * prod(out), features_dim), nn.ReLU())
-
-    def forward(self, pictures: th.Tensor) -> th.Tensor:
-        """(K, C, H, W) to (K, d)."""
-        features: th.Tensor = self.linear(self.cnn(pictures))
-        return features
-
-
-class LightEncoder(nn.Module):
-    """See ``sb3_saf.LightEncoder``."""
-
-    def __init__(self, space: SpaceRecord, net: EncoderNet):
-        super().__init__()
-        self.pixels = Pictures(space, net.divide_by_255)
-        self.tile = net.tile_size
-        channels, height, width = self.pixels.shape
-        self.n_tiles = (height // self.tile) * (width // self.tile)
-        self.embed = nn.Linear(self.tile**2 * channels, net.embedding_dim)
-        self.net = mlp([self.n_tiles * net.embedding_dim, net.hidden, net.features_dim], nn.ReLU)
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) raw observations to (K, d)."""
-        if self.pixels.is_codes:
-            by_code = self.embed(self.pixels.colours().flatten(1))
-            tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
-        else:
-            tiles = self.embed(self._cut(self.pixels(observations)))
-        features: th.Tensor = self.net(tiles.flatten(1))
-        return features
-
-    def _cut(self, pictures: th.Tensor) -> th.Tensor:
-        """(K, tiles, t * t * C): (K, C, H, W)."""
-        channels, height, width = self.pixels.shape
-        t = self.tile
-        tiles = pictures.reshape(-1, channels, height // t, t, width // t, t).permute(0, 2, 4, 3, 5, 1)
-        return tiles.reshape(-1, self.n_tiles, t * t * channels)
-
-
-class MLPEncoder(nn.Module):
-    """See ``sb3_saf.MLPEncoder``."""
-
-    def __init__(self, space: SpaceRecord, net: EncoderNet):
-        super().__init__()
-        self.choices = space.choices if space.is_one_hot else ()
-        self.divide_by_255 = net.divide_by_255
-        n_inputs = sum(self.choices) or prod(space.shape)
-        self.net = mlp([n_inputs, net.hidden, net.features_dim], nn.Tanh)
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) raw observations to (K, d)."""
-        features: th.Tensor = self.net(self._one_hot(observations) if self.choices else self._floats(observations))
-        return features
-
-    def _floats(self, observations: th.Tensor) -> th.Tensor:
-        numbers = observations.float()
-        return (numbers / 255.0 if self.divide_by_255 else numbers).flatten(1)
-
-    def _one_hot(self, observations: th.Tensor) -> th.Tensor:
-        columns = observations.reshape(-1, len(self.choices)).long()
-        hot = [columns[:, i : i + 1] == th.arange(n) for i, n in enumerate(self.choices)]
-        return th.cat(hot, dim=1).float()
-
-
-#: Encoders that a file may name.
-ENCODERS: Final[dict[str, Callable[[SpaceRecord, EncoderNet], nn.Module]]] = {
-    "LightEncoder": LightEncoder,
-    "MLPEncoder": MLPEncoder,
-    "NatureEncoder": NatureEncoder,
-    "PaperCNN": PaperCNN,
-}
-
-
-class Head(nn.Module):
-    """
-    One policy: an MLP, and for Box actions a standard deviation that does not depend on the observation.
-
-    :param sizes: d, hidden layers, outputs
-    :param activation_fn: activation of the hidden layers
-    :param has_std: whether actions are a Box
-    """
-
-    log_std: nn.Parameter | None
-
-    def __init__(self, sizes: Sequence[int], activation_fn: type[nn.Module], has_std: bool):
-        super().__init__()
-        self.register_parameter("log_std", nn.Parameter(th.zeros(sizes[-1])) if has_std else None)
-        self.net = mlp(sizes, activation_fn)
-
-    def forward(self, features: th.Tensor) -> th.Tensor:
-        """(K, d) to (K, P)."""
-        outputs: th.Tensor = self.net(features)
-        return outputs if self.log_std is None else th.cat([outputs, self.log_std.expand_as(outputs)], dim=1)
-
-
-class SinglePolicy(nn.Module):
-    """
-    One policy for all agents.
-
-    :param head: the policy
-    """
-
-    def __init__(self, head: nn.Module):
-        super().__init__()
-        self.head = head
-
-    def forward(self, features: th.Tensor, agent: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
-        """(K, d) to (K, 1) log weights and (K, 1, P) parameters."""
-        return _certain(features), self.head(features).unsqueeze(1)
-
-
-class AgentPolicies(nn.Module):
-    """
-    One policy for each agent; rows may belong to different agents.
-
-    :param heads: N policies
-    """
-
-    def __init__(self, heads: Sequence[Head]):
-        super().__init__()
-        self.heads = nn.ModuleList(heads)
-
-    def forward(self, features: th.Tensor, agent: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
-        """(K, d) and (K,) agents to (K, 1) log weights and (K, 1, P) parameters."""
-        assert agent is not None
-        every = th.stack([head(features) for head in self.heads], dim=1)
-        return _certain(features), every.gather(1, agent.reshape(-1, 1, 1).expand(-1, 1, every.shape[2]))
-
-    def of_agent(self, agent: int) -> SinglePolicy:
-        """The policy of one agent."""
-        return SinglePolicy(self.heads[agent])
-
-
-class PolicyPool(nn.Module):
-    """
-    U policies and the choice among them: see ``sb3_saf.networks.policy_pool.PolicyPool``.
-
-    :param query_net: (K, d) features to (K, latent) queries
-    :param latent_dim: size of queries and signature keys
-    :param policies: U policies
-    """
-
-    def __init__(self, query_net: nn.Module, latent_dim: int, policies: Sequence[Head]):
-        super().__init__()
-        self.query_net = query_net
-        self.signature_keys = nn.Parameter(th.zeros(len(policies), latent_dim))
-        self.policies = nn.ModuleList(policies)
-
-    def forward(self, features: th.Tensor, agent: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
-        """(K, d) to (K, U) log weights and (K, U, P) parameters."""
-        logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
-        return logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1)
-
-
-def _certain(features: th.Tensor) -> th.Tensor:
-    """(K, 1) log weights of the only policy."""
-    return th.zeros_like(features[:, :1])
+def make_encoder(net: EncoderNet, observation: ObservationSpec) -> nn.Module:
+    """Make the encoder that a manifest describes, with weights yet to be loaded."""
+    if net.name == "PaperCNN":
+        return encoders.PaperCNN(observation, net.features_dim)
+    if net.name == "NatureEncoder":
+        return encoders.NatureEncoder(observation, net.features_dim)
+    if net.name == "MLPEncoder":
+        return encoders.MLPEncoder(observation, net.features_dim, net.hidden)
+    return encoders.LightEncoder(
+        observation, net.features_dim, net.tile_size, net.embedding_dim, net.hidden, net.one_hot_codes
+    )
 
 
 def make_actor(
-    net: ActorNet, features_dim: int, action: SpaceRecord, n_agents: int, activation_fn: type[nn.Module]
-) -> SinglePolicy | AgentPolicies | PolicyPool:
-    """
-    The policies, with weights yet to be loaded.
-
-    :param net: which, and their sizes
-    :param features_dim: d
-    :param action: the action space
-    :param n_agents: N
-    :param activation_fn: activation of hidden layers
-    """
-    sizes = [features_dim, *net.hidden, action.n_outputs]
-
-    def heads(count: int) -> list[Head]:
-        return [Head(sizes, activation_fn, has_std=action.kind == "box") for _ in range(count)]
-
-    if net.name == "SinglePolicy":
-        return SinglePolicy(heads(1)[0])
-    if net.name == "AgentPolicies":
-        return AgentPolicies(heads(n_agents))
-    query_net = mlp([features_dim, *net.projection_hidden, net.latent_dim], activation_fn)
-    return PolicyPool(query_net, net.latent_dim, heads(net.n_policies))
+    net: ActorNet, features_dim: int, action: SpaceSpec, n_agents: int, activation_fn: type[nn.Module]
+) -> ActorNetwork:
+    """Make the actor that a manifest describes, with weights yet to be loaded."""
+    n_identities = n_agents if net.agent_identity else 0
+    if net.name == "PolicyPool":
+        return PolicyPool(
+            features_dim,
+            action,
+            net.hidden,
+            activation_fn,
+            n_policies=net.n_policies,
+            selection="mixture",
+            latent_dim=net.latent_dim,
+            projection_hidden=net.projection_hidden,
+            n_identities=n_identities,
+        )
+    n_heads = n_agents if net.name == "AgentPolicies" else None
+    return SinglePolicy(features_dim, action, net.hidden, activation_fn, n_agents=n_heads, n_identities=n_identities)
 
 
 def make_memory(net: MemoryNet | None, features_dim: int) -> nn.LSTM | None:
-    """
-    The LSTM, with weights yet to be loaded.
-
-    :param net: its sizes; None without memory
-    :param features_dim: d
-    """
+    """Make the LSTM that a manifest describes, with weights yet to be loaded; None without memory."""
     return None if net is None else nn.LSTM(features_dim, net.hidden_size, net.n_layers, bias=net.bias)
 
 
-class ActorNetwork(nn.Module):
+class AgentNetwork(nn.Module):
     """
     All that an agent needs to act.
 
     :param encoder: (K, *shape) raw own observations to (K, d)
     :param memory: LSTM over the features of one step after the other, (K, d) to (K, H); None without memory
-    :param actor: (K, d), or (K, H), and agents to log weights and parameters
-    :param gives_log_probs: whether actions are discrete, so that each has a probability
+    :param actor: (K, d), or (K, H), and agents to weights and parameters of policies
     """
 
-    def __init__(
-        self,
-        encoder: nn.Module,
-        memory: nn.LSTM | None,
-        actor: SinglePolicy | AgentPolicies | PolicyPool,
-        gives_log_probs: bool,
-    ) -> None:
+    def __init__(self, encoder: nn.Module, memory: nn.LSTM | None, actor: ActorNetwork):
         super().__init__()
-        self.encoder, self.memory, self.actor, self.gives_log_probs = encoder, memory, actor, gives_log_probs
+        self.encoder, self.memory, self.actor = encoder, memory, actor
 
     @classmethod
-    def of(cls, manifest: Manifest) -> ActorNetwork:
-        """The networks that a manifest describes, with weights yet to be loaded."""
+    def of(cls, manifest: Manifest, atlas: Array | None) -> AgentNetwork:
+        """
+        Make the network that a manifest describes, with weights yet to be loaded.
+
+        :param manifest: of an export that describes encoder and actor
+        :param atlas: pixels of tile codes, if observations are such
+        """
         encoder, actor, memory = manifest.encoder, manifest.actor, manifest.memory
         assert encoder is not None and actor is not None
         latent_dim = encoder.features_dim if memory is None else memory.hidden_size
+        inner = make_encoder(encoder, ObservationSpec(manifest.observation, atlas))
         return cls(
-            ENCODERS[encoder.name](manifest.observation, encoder),
+            RawEncoder(inner, manifest.observation, encoder.divide_by_255),
             make_memory(memory, encoder.features_dim),
             make_actor(actor, latent_dim, manifest.action, manifest.n_agents, ACTIVATIONS[actor.activation]),
-            manifest.gives_log_probs,
         )
 
     def forward(
-        self,
-        observation: th.Tensor,
-        agent: th.Tensor | None = None,
-        hidden: th.Tensor | None = None,
-        cell: th.Tensor | None = None,
-    ) -> tuple[th.Tensor, ...]:
+        self, observation: th.Tensor, agent: th.Tensor | None = None, states: States = ()
+    ) -> tuple[PoolOutput, States]:
         """
-        Everything that the action depends on.
+        Compute everything that the action depends on.
 
         :param observation: (K, *shape) raw own observations
-        :param agent: (K,) indices of agents, where each has a policy of its own
-        :param hidden: (layers, K, H) what is remembered, where there is a memory
-        :param cell: the same of the LSTM's cells
-        :return: log weights (K, U), parameters (K, U, P), for discrete actions log-probabilities (K, A), and with a
-            memory the next hidden and cell states
+        :param agent: (K,) indices of agents, where it matters who acts
+        :param states: hidden and cell state of the memory, (layers, K, H) each, where there is one
+        :return: log weights (K, U) and parameters (K, U, P), and the next states
         """
-        latent, states = self.encoder(observation), ()
+        latent = self.encoder(observation)
         if self.memory is not None:
-            assert hidden is not None and cell is not None
+            hidden, cell = states
             outputs, states = self.memory(latent.unsqueeze(0), (hidden, cell))
             latent = outputs.squeeze(0)
-        log_weights, parameters = self.actor(latent, agent)
-        if not self.gives_log_probs:
-            return log_weights, parameters, *states
-        log_probs = (log_weights.unsqueeze(2) + parameters.log_softmax(dim=2)).logsumexp(dim=1)
-        return log_weights, parameters, log_probs, *states
+        return self.actor.evaluate(latent, agent), states
+
+    def tensors(self) -> dict[str, th.Tensor]:
+        """The weights under the names that files have."""
+        return {_name_in_file(name): tensor for name, tensor in self.state_dict().items()}
+
+
+def _name_in_file(name: str) -> str:
+    """Names of format version 2, which are shorter than those of the modules."""
+    return name.replace("encoder.encoder.", "encoder.").replace("actor.head.heads.", "actor.heads.")
+
+
+def decide(space: SpaceSpec, selection: str, output: PoolOutput, deterministic: bool) -> th.Tensor:
+    """
+    Choose actions as the trained model's ``predict`` does, with the same random numbers.
+
+    :param space: the action space
+    :param selection: ``"mixture"``, ``"gumbel"``, or ``"greedy"`` if parameters are values of actions
+    :param output: of the network, with forbidden actions taken out
+    :param deterministic: whether to take the most likely action
+    :return: (K, D)
+    """
+    log_weights, parameters = output
+    is_pool = log_weights.shape[1] > 1
+    favourite = policy_parameters(parameters, log_weights.argmax(dim=1)) if is_pool else parameters[:, 0]
+    if selection == "greedy":
+        # Values, not logits: there is nothing to draw.
+        return favourite.argmax(dim=1, keepdim=True)
+    if deterministic:
+        mixed = is_pool and selection == "mixture"
+        return mixture_mode(space, log_weights, parameters) if mixed else likeliest_action(space, favourite)
+    if not is_pool:
+        return sample_action(space, favourite)
+    if selection == "gumbel":
+        return sample_action(space, draw_policy(log_weights, parameters))
+    if space.kind == "discrete":
+        return sample_action(space, mixture_log_probs(log_weights, parameters))
+    return mixture_sample(space, log_weights, parameters)
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def load_network(manifest: Manifest, weights: bytes) -> tuple[AgentNetwork, Array | None]:
+    """
+    Make the network that a manifest describes.
+
+    Sizes are compared with the file's before anything of these sizes is made.
+
+    :param manifest: of the export
+    :param weights: content of the safetensors file
+    :return: the network, and the pixels of tile codes if observations are such
+    :raises ExportError: if they do not fit each other
+    """
+    try:
+        tensors = load(weights)
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:
+        raise ExportError(f"{WEIGHTS_FILE} is not a valid safetensors file: {error}") from error
+    _check_layers(manifest, len(tensors))
+    atlas = _taken_atlas(manifest, tensors)
+    with th.device("meta"):
+        network = AgentNetwork.of(manifest, atlas)
+    _check_tensors(network.tensors(), tensors)
+    network.load_state_dict({name: tensors[_name_in_file(name)] for name in network.state_dict()}, assign=True)
+    return network.requires_grad_(False).eval(), atlas
+
+
+def _taken_atlas(manifest: Manifest, tensors: dict[str, th.Tensor]) -> Array | None:
+    shape = manifest.observation.atlas
+    reads_pixels = manifest.encoder is not None and manifest.encoder.name != "MLPEncoder"
+    if shape is None or (ATLAS not in tensors and not reads_pixels):
+        return None
+    _check_tensors({ATLAS: th.empty(shape, dtype=th.uint8, device="meta")}, tensors, all_of_them=False)
+    atlas: Array = np.array(tensors.pop(ATLAS).numpy())
+    return atlas
+
+
+def _check_layers(manifest: Manifest, n_tensors: int) -> None:
+    """Refuse before millions of modules are made."""
+    actor = manifest.actor
+    assert actor is not None
+    n_heads = manifest.n_agents if actor.name == "AgentPolicies" else actor.n_policies
+    needed = 2 * (n_heads * (len(actor.hidden) + 1) + len(actor.projection_hidden))
+    if manifest.memory is not None:
+        needed += 2 * manifest.memory.n_layers
+    if needed > n_tensors:
+        raise ExportError(f"{MANIFEST_FILE} describes at least {needed} tensors, {WEIGHTS_FILE} has {n_tensors}")
+
+
+def _check_tensors(expected: dict[str, th.Tensor], found: dict[str, th.Tensor], all_of_them: bool = True) -> None:
+    if missing := sorted(expected.keys() - found.keys()):
+        raise ExportError(f"{WEIGHTS_FILE} lacks the tensor {missing[0]!r}")
+    if all_of_them and (unknown := sorted(found.keys() - expected.keys())):
+        raise ExportError(f"{WEIGHTS_FILE} has a tensor that the actor does not have: {unknown[0][:80]!r}")
+    for name, wanted in expected.items():
+        tensor = found[name]
+        if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
+            raise ExportError(
+                f"{WEIGHTS_FILE}: expected {name!r} of shape {tuple(wanted.shape)} and {wanted.dtype}, got "
+                f"{tuple(tensor.shape)} and {tensor.dtype}"
+            )
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise ExportError(f"{WEIGHTS_FILE}: {name!r} has NaN or infinity")

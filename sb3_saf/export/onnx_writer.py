@@ -1,33 +1,131 @@
-"""The network of an actor as an ONNX graph."""
+"""The network of an agent as an ONNX graph that decides, too."""
 
 from __future__ import annotations
 
+import base64
 import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch as th
+from torch import nn
 
 from sb3_saf.export.comparison import check_close
 from sb3_saf.export.errors import ExportError
-from sb3_saf.export.network import ActorNetwork
+from sb3_saf.export.network import AgentNetwork, Array, decide
+from sb3_saf.networks.actor import PoolOutput
+from sb3_saf.networks.distributions import (
+    masked_parameters,
+    mixture_log_prob,
+    mixture_log_probs,
+    n_action_parameters,
+    policy_parameters,
+)
+from sb3_saf.networks.spaces import SpaceSpec
 
 _OPSET = 18
+#: NumPy's name of the noise that draws an action of each kind of space, when it is added to parameters.
+_NOISE = {"box": "normal", "multi_binary": "logistic", "discrete": "gumbel", "multi_discrete": "gumbel"}
 
 
-def onnx_bytes(network: ActorNetwork, inputs: dict[str, th.Tensor], expected: tuple[th.Tensor, ...]) -> bytes:
+class DecidingNetwork(nn.Module):
+    """
+    An agent's network with its decisions; random numbers are inputs.
+
+    :param network: the agent's
+    :param space: the action space
+    :param selection: see ``sb3_saf.export.network.decide``
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, network: AgentNetwork, space: SpaceSpec, selection: str):
+        super().__init__()
+        self.network, self.space, self.selection = network, space, selection
+        if space.kind == "box":
+            for side, bound in zip(("low", "high"), space.bounds(), strict=True):
+                self.register_buffer(side, th.tensor(bound, dtype=th.float32).expand(space.shape).clone())
+
+    def forward(self, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
+        """
+        Decide.
+
+        :param inputs: see :func:`onnx_bytes`
+        :return: outputs, see :func:`output_names`
+        """
+        states = (inputs["hidden"], inputs["cell"]) if "hidden" in inputs else ()
+        output, states = self.network(inputs["observation"], inputs.get("agent"), states)
+        if "action_mask" in inputs:
+            output = output._replace(actions=masked_parameters(self.space, output.actions, inputs["action_mask"]))
+        likeliest = self._in_space(decide(self.space, self.selection, output, deterministic=True))
+        if self.selection == "greedy":
+            return likeliest, *states
+        drawn = self._in_space(self._drawn(output, inputs))
+        log_prob = mixture_log_prob(self.space, output.log_weights, output.actions, inputs["action"])
+        log_probs = (mixture_log_probs(*output),) if self.space.kind == "discrete" else ()
+        return likeliest, drawn, log_prob, *log_probs, *states
+
+    def _drawn(self, output: PoolOutput, inputs: dict[str, th.Tensor]) -> th.Tensor:
+        """(K, D): noise makes draws of the largest: the policy, and then its choices."""
+        policy = (output.log_weights + inputs["gumbel_policy"]).argmax(dim=1)
+        parameters = policy_parameters(output.actions, policy)
+        noise = inputs[f"{_NOISE[self.space.kind]}_action"]
+        if self.space.kind == "box":
+            mean, log_std = parameters.chunk(2, dim=1)
+            return mean + noise * log_std.exp()
+        if self.space.kind == "multi_binary":
+            return (parameters + noise > 0).to(parameters.dtype)
+        parts = th.split(parameters + noise, list(self.space.choices), dim=1)
+        return th.stack([part.argmax(dim=1) for part in parts], dim=1)
+
+    def _in_space(self, chosen: th.Tensor) -> th.Tensor:
+        """(K, *shape): (K, D)."""
+        chosen = chosen.reshape(-1, *self.space.shape)
+        return chosen if self.space.kind != "box" else th.minimum(th.maximum(chosen, self.low), self.high)
+
+
+def output_names(space: SpaceSpec, selection: str, has_memory: bool) -> list[str]:
+    """
+    Name the outputs of a graph.
+
+    :param space: the action space
+    :param selection: see ``sb3_saf.export.network.decide``
+    :param has_memory: whether there is an LSTM
+    """
+    names = ["most_likely"]
+    if selection != "greedy":
+        names += ["drawn", "log_prob"] + (["log_probs"] if space.kind == "discrete" else [])
+    return names + (["next_hidden", "next_cell"] if has_memory else [])
+
+
+def onnx_bytes(
+    network: AgentNetwork,
+    space: SpaceSpec,
+    selection: str,
+    inputs: dict[str, th.Tensor],
+    has_masks: bool,
+    atlas: Array | None,
+) -> bytes:
     """
     Write the graph, run it, and compare.
 
-    Inputs: ``observation`` (rows, *shape) of the observation space's own dtype, ``agent`` (rows,) int64 where each
-    agent has a policy of its own, and where there is a memory ``hidden`` and ``cell`` (layers, rows, H). Outputs:
-    ``log_weights`` (rows, U), ``parameters`` (rows, U, P), for discrete actions ``log_probs`` (rows, A), and with a
-    memory ``next_hidden`` and ``next_cell``.
+    Inputs: ``observation`` (rows, *shape) of the observation space's own dtype, ``agent`` (rows,) int64 where it
+    matters who acts, ``action_mask`` (rows, M) bool where masks may be given, ``hidden`` and ``cell`` (layers, rows, H)
+    where there is a memory; and unless the best action is always taken, ``action`` (rows, D), whose ``log_prob`` is
+    given, and the noise with which ``drawn`` is drawn: ``gumbel_policy`` (rows, U) and ``normal_action``,
+    ``logistic_action`` or ``gumbel_action``, called as the distribution that it has to come from.
+
+    Outputs: ``most_likely`` and ``drawn`` (rows, *shape), ``log_prob`` (rows,), for discrete actions ``log_probs``
+    (rows, A), and with a memory ``next_hidden`` and ``next_cell``.
 
     :param network: what to write
-    :param inputs: by name, to trace and to compare with
-    :param expected: the network's outputs
+    :param space: the action space
+    :param selection: see ``sb3_saf.export.network.decide``
+    :param inputs: of the agent's network by name, to trace and to compare with
+    :param has_masks: whether actions may be masked
+    :param atlas: pixels of tile codes, if observations are such
     :raises ImportError: if onnx, onnxscript or onnxruntime are missing
     :raises ExportError: if the network cannot be written as a graph, or the graph gives other numbers
     """
@@ -38,44 +136,73 @@ def onnx_bytes(network: ActorNetwork, inputs: dict[str, th.Tensor], expected: tu
         raise ImportError(
             'writing ONNX needs onnx, onnxscript and onnxruntime: pip install "sb3-saf[export]", or pass onnx=False'
         ) from error
-    data = _written(network, inputs)
+    deciding = DecidingNetwork(network, space, selection).requires_grad_(False).eval()
+    inputs = inputs | _more_inputs(network, space, selection, inputs, has_masks)
+    names = output_names(space, selection, network.memory is not None)
+    metadata = {} if atlas is None else {"atlas": base64.b64encode(atlas.tobytes()).decode()}
+    data = _written(deciding, inputs, names, metadata)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    found = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
+    found = session.run(names, {name: tensor.numpy() for name, tensor in inputs.items()})
+    with th.no_grad():
+        expected = deciding(inputs)
     for output, wanted in zip(found, expected, strict=True):
-        check_close(th.as_tensor(output), wanted, "its ONNX graph differs")
+        check_close(th.as_tensor(output).float(), wanted.float(), "its ONNX graph differs")
     return data
 
 
-def _written(network: ActorNetwork, inputs: dict[str, th.Tensor]) -> bytes:
+def _more_inputs(
+    network: AgentNetwork, space: SpaceSpec, selection: str, inputs: dict[str, th.Tensor], has_masks: bool
+) -> dict[str, th.Tensor]:
+    """Examples of the inputs that only decisions read."""
+    n_rows = len(inputs["observation"])
+    more = {"action_mask": th.ones(n_rows, sum(space.choices), dtype=th.bool)} if has_masks else {}
+    if selection == "greedy":
+        return more
+    with th.no_grad():
+        states = (inputs["hidden"], inputs["cell"]) if "hidden" in inputs else ()
+        output, _ = network(inputs["observation"], inputs.get("agent"), states)
+        n_dimensions = len(space.choices) if space.kind != "box" else space.n_outputs
+        n_noise = n_dimensions if space.kind == "box" else n_action_parameters(space)
+        return more | {
+            "action": th.zeros(n_rows, n_dimensions, dtype=th.int64 if space.is_one_hot else th.float32),
+            "gumbel_policy": th.zeros(n_rows, output.log_weights.shape[1]),
+            f"{_NOISE[space.kind]}_action": th.zeros(n_rows, n_noise),
+        }
+
+
+def _written(
+    network: DecidingNetwork, inputs: dict[str, th.Tensor], names: list[str], metadata: dict[str, str]
+) -> bytes:
     rows = th.export.Dim("rows")
-    names = ["log_weights", "parameters", "log_probs"][: 3 if network.gives_log_probs else 2]
-    names += [] if network.memory is None else ["next_hidden", "next_cell"]
     axes = {name: {1 if name in ("hidden", "cell") else 0: rows} for name in inputs}
     try:
         with _quiet():
             program = th.onnx.export(
                 network,
-                kwargs=inputs,
+                kwargs={"inputs": inputs},
                 input_names=list(inputs),
                 output_names=names,
                 opset_version=_OPSET,
                 dynamo=True,
-                dynamic_shapes=axes,
+                dynamic_shapes={"inputs": axes},
                 external_data=False,
                 verbose=False,
             )
     except Exception as error:  # a user's own encoder may do anything
         raise ExportError(f"the network cannot be written as ONNX: {error}") from error
     assert program is not None
-    data: bytes = program.model_proto.SerializeToString(deterministic=True)
+    proto = program.model_proto
+    for key, value in metadata.items():
+        proto.metadata_props.add(key=key, value=value)
+    data: bytes = proto.SerializeToString(deterministic=True)
     return data
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's talk about its own inside."""
+    """Without the exporter's messages about its own stages."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -6,18 +6,17 @@ import copy
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from safetensors.torch import save
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
-from sb3_saf.export.comparison import ExportablePolicy, compare, some_inputs
+from sb3_saf.export.comparison import ExportablePolicy, check_network, some_inputs
 from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import write_folder
 from sb3_saf.export.manifest import (
@@ -25,18 +24,19 @@ from sb3_saf.export.manifest import (
     ONNX_FILE,
     SCRIPT_FILE,
     WEIGHTS_FILE,
+    Activation,
     ActorNet,
-    Bound,
     DataFile,
+    EncoderName,
     EncoderNet,
     Manifest,
     MemoryNet,
-    SpaceRecord,
 )
-from sb3_saf.export.network import ACTIVATIONS, ENCODERS, ActorNetwork, make_actor, make_memory
+from sb3_saf.export.network import ACTIVATIONS, ATLAS, AgentNetwork, RawEncoder, make_actor, make_encoder, make_memory
 from sb3_saf.networks.actor import ActionHead, SinglePolicy
 from sb3_saf.networks.layers import AgentHeads
-from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.networks.policy_pool import PolicyPool, Selection
+from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec, spec_of
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.policies.maskable import TeamMaskablePolicy
@@ -80,10 +80,11 @@ def export_actors(
     described = _Described.of(policy)
     network = described.network(policy)
     inputs = some_inputs(policy, described.memory)
-    expected = compare(policy, network, inputs)
+    check_network(policy, network, inputs)
+    atlas = described.observation.atlas
     data: dict[str, bytes] = {}
-    if described.encoder is not None and described.actor_name_is_known:
-        data[WEIGHTS_FILE] = save({name: tensor.contiguous() for name, tensor in network.state_dict().items()})
+    if described.encoder is not None and described.activation_is_known:
+        data[WEIGHTS_FILE] = save(_tensors(network, described.observation))
     elif not onnx:
         raise ExportError(
             f"{type(policy.features_extractor).__name__} with {policy.activation_fn.__name__} can be exported as ONNX "
@@ -92,7 +93,8 @@ def export_actors(
     if onnx:
         from sb3_saf.export.onnx_writer import onnx_bytes
 
-        data[ONNX_FILE] = onnx_bytes(network, inputs, expected)
+        has_masks = _action_mask(policy) != "none"
+        data[ONNX_FILE] = onnx_bytes(network, described.action, described.selection, inputs, has_masks, atlas)
     manifest = described.manifest(policy, {name: DataFile.of(content) for name, content in data.items()})
     data[MANIFEST_FILE] = manifest.to_json().encode("utf-8")
     if onnx:
@@ -101,6 +103,12 @@ def export_actors(
     path = Path(folder)
     write_folder(path, data, overwrite)
     return path
+
+
+def _tensors(network: AgentNetwork, observation: ObservationSpec) -> dict[str, th.Tensor]:
+    """What the file of weights has: the weights, and the pixels of tile codes, which an actor finds nowhere else."""
+    tensors = {name: tensor.contiguous() for name, tensor in network.tensors().items()}
+    return tensors if observation.atlas is None else tensors | {ATLAS: th.tensor(observation.atlas)}
 
 
 def _checked_policy(model: object) -> ExportablePolicy:
@@ -130,53 +138,43 @@ class _Described(NamedTuple):
     encoder: EncoderNet | None
     memory: MemoryNet | None
     actor: ActorNet
+    activation_is_known: bool
     features_dim: int
-    selection: str
-    observation: SpaceRecord
-    action: SpaceRecord
-
-    @property
-    def reads_agent(self) -> bool:
-        return self.actor.name == "AgentPolicies"
-
-    @property
-    def actor_name_is_known(self) -> bool:
-        return self.actor.activation in ACTIVATIONS
+    selection: Selection | Literal["greedy"]
+    observation: ObservationSpec
+    action: SpaceSpec
 
     @classmethod
     def of(cls, policy: ExportablePolicy) -> _Described:
-        own = policy.team_spaces.own
+        _check_counts_from_zero(policy.team_spaces.own, "observation")
+        _check_counts_from_zero(policy.action_space, "action")
         return cls(
             encoder=_describe_encoder(policy),
             memory=_describe_memory(policy),
             actor=_describe_actor(policy),
+            activation_is_known=ACTIVATIONS.get(policy.activation_fn.__name__) is policy.activation_fn,
             features_dim=policy.features_dim,
             selection=_selection(policy),
-            observation=describe_space(own, "observation"),
-            action=describe_space(policy.action_space, "action"),
+            observation=observation_spec(policy.team_spaces.own),
+            action=spec_of(policy.action_space),
         )
 
-    def network(self, policy: ExportablePolicy) -> ActorNetwork:
+    def network(self, policy: ExportablePolicy) -> AgentNetwork:
         """The network with the policy's weights, on the CPU."""
-        encoder: nn.Module
-        if self.encoder is None:
-            encoder = _OwnExtractor(policy)
-        else:
-            encoder = ENCODERS[self.encoder.name](self.observation, self.encoder)
-            encoder.load_state_dict(_encoder_tensors(policy), strict=True)
-        n_agents = policy.team_spaces.n_agents
+        encoder: nn.Module = _OwnExtractor(policy)
+        if self.encoder is not None:
+            inner = make_encoder(self.encoder, self.observation)
+            inner.load_state_dict(_inner_encoder(policy).state_dict(), strict=True)
+            encoder = RawEncoder(inner, self.observation.space, self.encoder.divide_by_255)
         memory = make_memory(self.memory, self.features_dim)
         if memory is not None:
             assert isinstance(policy, TeamRecurrentPolicy)
             memory.load_state_dict(policy.lstm_actor.state_dict(), strict=True)
         latent_dim = self.features_dim if self.memory is None else self.memory.hidden_size
+        n_agents = policy.team_spaces.n_agents
         actor = make_actor(self.actor, latent_dim, self.action, n_agents, policy.activation_fn)
-        prefix = "head." if self.reads_agent else ""
-        actor.load_state_dict(
-            {name.removeprefix(prefix): tensor for name, tensor in policy.actor.state_dict().items()}, strict=True
-        )
-        gives_log_probs = self.action.kind == "discrete" and self.selection != "greedy"
-        return ActorNetwork(encoder, memory, actor, gives_log_probs).requires_grad_(False).eval()
+        actor.load_state_dict(policy.actor.state_dict(), strict=True)
+        return AgentNetwork(encoder, memory, actor).requires_grad_(False).eval()
 
     def manifest(self, policy: ExportablePolicy, data: dict[str, DataFile]) -> Manifest:
         """The manifest beside some files."""
@@ -187,15 +185,15 @@ class _Described(NamedTuple):
             sb3_saf_version=__version__,
             policy=type(policy).__name__,
             n_agents=policy.team_spaces.n_agents,
-            reads_agent=self.reads_agent,
+            reads_agent=self.actor.reads_agent,
             action_mask=_action_mask(policy),
             selection=self.selection,
-            observation=self.observation,
+            observation=self.observation.space,
             action=self.action,
             encoder=self.encoder if complete else None,
             actor=self.actor if complete else None,
             memory=self.memory,
-            files=data,
+            files=cast("dict[Literal['actor.safetensors', 'actor.onnx'], DataFile]", data),
         )
 
 
@@ -204,7 +202,7 @@ class _OwnExtractor(nn.Module):
 
     def __init__(self, policy: ExportablePolicy):
         super().__init__()
-        self.space = policy.team_spaces.own
+        self.space: spaces.Space[Any] = policy.team_spaces.own
         self.normalize_images = policy.normalize_images
         self.extractor = copy.deepcopy(policy.features_extractor).cpu()
 
@@ -217,13 +215,13 @@ class _OwnExtractor(nn.Module):
 # --- describing -------------------------------------------------------------------------------------------------------
 
 
-def _selection(policy: ExportablePolicy) -> str:
+def _selection(policy: ExportablePolicy) -> Selection | Literal["greedy"]:
     if isinstance(policy, QPLEXPolicy):
         return "greedy"
     return policy.actor.selection if isinstance(policy.actor, PolicyPool) else "mixture"
 
 
-def _action_mask(policy: ExportablePolicy) -> str:
+def _action_mask(policy: ExportablePolicy) -> Literal["none", "optional", "required"]:
     """Whether the policy asks for masks: with each observation, or only if somebody has one."""
     if policy.team_spaces.action_mask is not None:
         return "required"
@@ -248,45 +246,40 @@ def _inner_encoder(policy: ExportablePolicy) -> nn.Module:
 
 def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
     """None for an encoder that is not exactly one of ours: a subclass may do anything."""
-    own, encoder = policy.team_spaces.own, _inner_encoder(policy)
-    divide = bool(policy.normalize_images and isinstance(own, spaces.Box) and is_image_space(own))
-    features_dim = policy.features_dim
-    if type(encoder) in (PaperCNN, NatureEncoder):
-        return EncoderNet(type(encoder).__name__, features_dim, divide)
-    if type(encoder) is MLPEncoder:
-        return EncoderNet("MLPEncoder", features_dim, divide, hidden=_hidden(encoder.net)[0])
-    if type(encoder) is LightEncoder:
+    encoder, features_dim = _inner_encoder(policy), policy.features_dim
+    divide = bool(policy.normalize_images and spec_of(policy.team_spaces.own).picture)
+    if type(encoder) not in (PaperCNN, NatureEncoder, MLPEncoder, LightEncoder):
+        return None
+    net = EncoderNet(cast(EncoderName, type(encoder).__name__), features_dim, divide)
+    if isinstance(encoder, MLPEncoder):
+        return EncoderNet(net.name, features_dim, divide, hidden=_hidden(encoder.net)[0])
+    if isinstance(encoder, LightEncoder):
         return EncoderNet(
-            "LightEncoder",
+            net.name,
             features_dim,
             divide,
             tile_size=int(encoder.tile_size),
             embedding_dim=encoder.embed.out_features,
             hidden=_hidden(encoder.net)[0],
+            one_hot_codes=encoder.one_hot_codes,
         )
-    return None
-
-
-def _encoder_tensors(policy: ExportablePolicy) -> dict[str, th.Tensor]:
-    tensors = dict(_inner_encoder(policy).state_dict())
-    own: Any = policy.team_spaces.own
-    if hasattr(own, "atlas") and type(_inner_encoder(policy)) is not MLPEncoder:
-        # What codes look like belongs to the space, not to the weights, and an actor has no space but this.
-        tensors["pixels.atlas"] = th.tensor(np.asarray(own.atlas))
-    return tensors
+    return net
 
 
 def _describe_actor(policy: ExportablePolicy) -> ActorNet:
-    actor, activation = policy.actor, policy.activation_fn.__name__
-    if ACTIVATIONS.get(activation) is not policy.activation_fn:
-        activation = "one that no file can name"
+    actor = policy.actor
     head = next(module for module in actor.modules() if isinstance(module, ActionHead))
-    hidden = _hidden(head.net)
+    name: Literal["AgentPolicies", "PolicyPool", "SinglePolicy"] = "SinglePolicy"
+    n_policies, latent_dim = 1, 1
+    projection: tuple[int, ...] = ()
     if isinstance(actor, PolicyPool):
-        latent_dim, projection = actor.signature_keys.shape[1], _hidden(actor.query_net)
-        return ActorNet("PolicyPool", hidden, activation, actor.n_policies, latent_dim, projection)
-    assert isinstance(actor, SinglePolicy)
-    return ActorNet("AgentPolicies" if isinstance(actor.head, AgentHeads) else "SinglePolicy", hidden, activation)
+        name, n_policies, latent_dim = "PolicyPool", actor.n_policies, actor.signature_keys.shape[1]
+        projection = _hidden(actor.query_net)
+    elif isinstance(actor, SinglePolicy) and isinstance(actor.head, AgentHeads):
+        name = "AgentPolicies"
+    activation = cast(Activation, policy.activation_fn.__name__)
+    identity = actor.n_identities > 0
+    return ActorNet(name, _hidden(head.net), activation, n_policies, latent_dim, projection, identity)
 
 
 def _hidden(net: nn.Sequential) -> tuple[int, ...]:
@@ -294,49 +287,9 @@ def _hidden(net: nn.Sequential) -> tuple[int, ...]:
     return tuple(layer.out_features for layer in net if isinstance(layer, nn.Linear))[:-1]
 
 
-def describe_space(space: spaces.Space[Any], what: str) -> SpaceRecord:
-    """
-    A space in plain words and numbers.
-
-    :param space: Box, Discrete, MultiDiscrete or MultiBinary; choices must count from 0
-    :param what: its name, for messages
-    :raises ExportError: for any other space
-    """
-    shape, dtype = tuple(int(size) for size in space.shape or ()), str(space.dtype)
-    if isinstance(space, spaces.Box):
-        atlas = np.shape(space.atlas) if hasattr(space, "atlas") else None
-        return SpaceRecord(
-            "box",
-            shape,
-            dtype,
-            low=_bound(space.low),
-            high=_bound(space.high),
-            picture=atlas is None and is_image_space(space),
-            atlas=None if atlas is None else (atlas[0], atlas[1], atlas[2], atlas[3]),
+def _check_counts_from_zero(space: AnySpace, what: str) -> None:
+    if np.any(getattr(space, "start", 0)):
+        raise ExportError(
+            f"expected the {what} space Box, Discrete, MultiDiscrete (of one axis) or MultiBinary, counting from 0, "
+            f"got {space}"
         )
-    if isinstance(space, spaces.Discrete) and space.start == 0:
-        return SpaceRecord("discrete", shape, dtype, (int(space.n),))
-    if isinstance(space, spaces.MultiDiscrete) and len(shape) == 1 and not np.any(space.start):
-        return SpaceRecord("multi_discrete", shape, dtype, tuple(int(n) for n in space.nvec))
-    if isinstance(space, spaces.MultiBinary):
-        return SpaceRecord("multi_binary", shape, dtype, (2,) * int(np.prod(shape)))
-    raise ExportError(
-        f"expected the {what} space Box, Discrete, MultiDiscrete (of one axis) or MultiBinary, counting from 0, got "
-        f"{space}"
-    )
-
-
-def _bound(values: npt.NDArray[Any]) -> Bound:
-    """One number if all are equal, else nested lists."""
-    if values.size and (values == values.flat[0]).all():
-        values = values.flat[0]
-    words = np.where(np.isinf(values), np.where(values > 0, "inf", "-inf"), "")
-    numbers = np.where(words == "", values, 0).astype(values.dtype)
-    return _merged(numbers.tolist(), words.tolist())
-
-
-def _merged(number: Any, word: Any) -> Bound:
-    if isinstance(number, list):
-        return [_merged(*pair) for pair in zip(number, word, strict=True)]
-    result: Bound = word or number
-    return result

@@ -56,9 +56,9 @@ def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.T
     space = spec_of(action_space)
     if space.kind == "box":
         raise ValueError(f"continuous actions cannot be masked, got {action_space}")
-    if masks.shape != (len(parameters), sum(space.choices)):
+    if masks.shape != (parameters.shape[0], sum(space.choices)):
         raise ValueError(
-            f"expected action masks of shape {(len(parameters), sum(space.choices))}, one flag for each choice of "
+            f"expected action masks of shape {(parameters.shape[0], sum(space.choices))}, one flag for each choice of "
             f"{action_space}, got {tuple(masks.shape)}; let the environment's action_masks give that"
         )
     if space.kind == "multi_binary":
@@ -117,13 +117,15 @@ def policy_log_probs(action_space: AnySpace, parameters: th.Tensor, actions: th.
     :return: (B, U)
     """
     space = spec_of(action_space)
-    factors = _factors(space, parameters)
-    actions = actions.reshape(len(parameters), 1, -1)
+    actions = actions.reshape(parameters.shape[0], 1, -1)
     if not space.is_one_hot:
-        (joint,) = factors
+        (joint,) = _factors(space, parameters)
         return joint.log_prob(actions).sum(dim=2)
-    chosen = zip(factors, actions.unbind(dim=2), strict=True)
-    return th.stack([factor.log_prob(action) for factor, action in chosen], dim=2).sum(dim=2)
+    log_probs = [
+        (logits - logits.logsumexp(dim=2, keepdim=True)).gather(2, action.expand(-1, parameters.shape[1], 1))
+        for logits, action in zip(_split(space, parameters), actions.long().split(1, dim=2), strict=True)
+    ]
+    return th.cat(log_probs, dim=2).sum(dim=2)
 
 
 def _factors(space: SpaceSpec, parameters: th.Tensor) -> list[Distribution]:
@@ -152,7 +154,8 @@ def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
     :param policy: (B,) index of a policy
     :return: (B, P)
     """
-    return parameters[th.arange(len(policy), device=policy.device), policy]
+    # shape[0], not len(), here and elsewhere: a graph that is exported keeps it open.
+    return parameters[th.arange(policy.shape[0], device=policy.device), policy]
 
 
 def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:

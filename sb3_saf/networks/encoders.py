@@ -243,6 +243,7 @@ class LightEncoder(Encoder):
     ):
         super().__init__()
         self.pixels = PixelInput(observation)
+        self.one_hot_codes = one_hot_codes
         self.tile_size = self.pixels.atlas.shape[1] if self.pixels.layout == "codes" else tile_size
         channels, height, width = self.pixels.shape
         if height % self.tile_size or width % self.tile_size:
@@ -288,7 +289,7 @@ class LightEncoder(Encoder):
         channels, height, width = self.pixels.shape
         t = self.tile_size
         tiles = pictures.reshape(-1, channels, height // t, t, width // t, t).permute(0, 2, 4, 3, 5, 1)
-        return tiles.reshape(len(pictures), -1, t * t * channels)
+        return tiles.reshape(-1, self.n_tiles, t * t * channels)
 
 
 class MLPEncoder(Encoder):

@@ -110,6 +110,9 @@ class AgentHeads(nn.Module):
         :param agent: (K,) int64 in 0..N-1
         :return: (K, P)
         """
+        if th.compiler.is_compiling():  # a graph has no parts whose sizes depend on numbers
+            every = th.stack([head(x) for head in self.heads], dim=1)
+            return every.gather(1, agent.reshape(-1, 1, 1).expand(-1, 1, every.shape[2])).squeeze(1)
         order = agent.argsort(stable=True)
         counts = th.bincount(agent, minlength=len(self.heads)).tolist()
         parts = th.split(gather(x, order), counts)
