@@ -163,7 +163,7 @@ def watch(model: Any, wait: bool = True) -> Stopwatch:
     watch.watch(policy, "evaluate_actions", "update: likelihood, entropy, gathering")
     for module, name in ((policy.features_extractor, "encoder"), (policy.actor, "actor"), (policy.value_net, "critic")):
         watch.watch(module, "forward", f"{name}, forward")
-    watch.watch(policy.views, "find", "which views are equal")
+    watch.watch(policy.row_encoder, "find", "which observations are equal")
     watch.watch(th.Tensor, "backward", "backward")
     watch.watch(th.nn.utils, "clip_grad_norm_", "clipping of gradients")
     watch.watch(policy.optimizer, "step", "Adam")

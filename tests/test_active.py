@@ -511,6 +511,20 @@ def test_idle_rows_do_not_touch_the_loss() -> None:
         th.testing.assert_close(clean, spoiled, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("policy", ["SAFPolicy", "MAPPOPolicy", "IPPOPolicy"])
+def test_minibatches_without_idle_rows_are_judged_as_rows_of_their_teams(policy: str) -> None:
+    model = make_model(policy, n_epochs=1).learn(60)
+    model.policy.set_training_mode(False)
+    for sample in model.rollout_buffer.get(12):
+        obs = cast(Any, sample.observations)
+        assert obs.teams.rows is not None and len(obs["obs"]) < obs.teams.active.numel()
+        plain = dict(obs.items())
+        order = th.randperm(len(plain["obs"]))
+        shuffled = {key: value[order] for key, value in plain.items()}
+        expected = model.policy.predict_values(shuffled)
+        th.testing.assert_close(model.policy.predict_values(obs)[order], expected, rtol=1e-5, atol=1e-6)
+
+
 def test_sb3s_buffer_warns_once_that_idle_rows_enter_the_loss() -> None:
     model = make_model(rollout_buffer_class=DictRolloutBuffer)
     with warnings.catch_warnings(record=True) as caught:

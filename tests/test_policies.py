@@ -6,7 +6,7 @@ import copy
 import io
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,11 +25,14 @@ from sb3_saf.networks.layers import Linear
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
-from sb3_saf.registration import register
+from sb3_saf.registration import DECLARATIONS, register
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, take, team_rows, to_numpy
 
-POLICIES: list[type[TeamActorCriticPolicy]] = [IPPOPolicy, MAPPOPolicy, SAFPolicy]
-NAMES = ["IPPOPolicy", "MAPPOPolicy", "SAFPolicy"]
+#: Every policy that is declared for PPO, sorted by name.
+POLICIES: list[type[TeamActorCriticPolicy]] = sorted(
+    (cast(Any, policy) for one in DECLARATIONS for policy in one.policies.get(PPO, ())), key=lambda one: one.__name__
+)
+NAMES = [policy.__name__ for policy in POLICIES]
 ACTIONS: dict[str, spaces.Space[Any]] = {
     "discrete": spaces.Discrete(3),
     "multi-discrete": spaces.MultiDiscrete([3, 2]),
@@ -51,7 +54,10 @@ VARIANTS: list[tuple[type[TeamActorCriticPolicy], dict[str, Any]]] = [
     (SAFPolicy, {"n_policies": 1}),
     (SAFPolicy, {"n_policies": 1, "heads": "per_agent"}),
     (SAFPolicy, {"knowledge_source": False}),
+    (IPPOPolicy, {"actor_identity": True}),
+    (SAFPolicy, {"actor_identity": True}),
 ]
+VARIANTS += [(policy, {}) for policy in POLICIES if policy not in dict(VARIANTS)]
 SMALL = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
 SMALL_SAF = {"latent_dim": 8, "projection_arch": (10,)}
 
@@ -204,6 +210,31 @@ def test_naive_encoding_gives_the_same_loss_and_gradients(
         for name, gradient in gradients.items():
             scale = expected[name].abs().max().clamp_min(1.0)
             assert (gradient - expected[name]).abs().max() <= 1e-5 * scale, name
+
+
+@pytest.mark.parametrize(("policy_class", "kwargs"), [(MAPPOPolicy, {}), (SAFPolicy, {"heads": "per_agent"})])
+@pytest.mark.parametrize("encode_once", [True, False])
+def test_whole_teams_are_judged_without_search_and_as_rows_in_any_order(
+    policy_class: type[TeamActorCriticPolicy],
+    kwargs: dict[str, Any],
+    encode_once: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policy, obs = make_policy(policy_class, encode_once=encode_once, **kwargs), team_rows(VECTOR, n_views=50)
+    shuffled = th.tensor([2, 0, 1, 3, 5, 4, 6, 7, 8, 9, 10, 11])
+    expected = policy.predict_values(take(obs, shuffled))
+    searched: list[int] = []
+    joint_rows = policy.row_encoder.joint_rows
+    monkeypatch.setattr(policy.row_encoder, "joint_rows", lambda *args: searched.append(1) or joint_rows(*args))
+    values = policy.predict_values(obs)
+    assert not searched
+    th.testing.assert_close(values[shuffled], expected, rtol=0, atol=1e-6)
+    # Agents in order, and what row 0's team sees is what rows 0 to 2 see; but row 1 is of another team.
+    obs["team"][1, 0] = obs["obs"][9]
+    other = policy.predict_values(obs)
+    assert searched
+    th.testing.assert_close(other[1:2], policy.predict_values(take(obs, [1])), rtol=0, atol=1e-6)
+    assert abs(other[1] - values[1]) > 1e-5
 
 
 def test_each_distinct_view_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
