@@ -555,6 +555,23 @@ def test_predict_takes_pictures_of_either_layout() -> None:
     assert policy.predict(channels_last[3], deterministic=True)[0] == actions[3]
 
 
+def test_a_model_of_tile_codes_takes_the_pixels_of_the_same_game() -> None:
+    policy, codes = make_policy(SAFPolicy, CodeSpace(), noise=1.0), to_numpy(team_rows(CodeSpace(), n_views=12))["obs"]
+    pixels = CodeSpace().atlas[codes].swapaxes(2, 3).reshape(12, 12, 12, 3)
+    expected, _ = policy.predict(codes, deterministic=True)
+    assert len(set(expected.tolist())) > 1
+    np.testing.assert_array_equal(policy.predict(pixels, deterministic=True)[0], expected)
+    assert policy.predict(pixels[5], deterministic=True)[0] == expected[5]
+    assert policy.predict({"a": pixels[5], "b": pixels[6]}, deterministic=True)[0] == {
+        "a": expected[5],
+        "b": expected[6],
+    }
+    with pytest.raises(
+        ValueError, match=r"or pixels made of its 20 tiles, got pixels of other tiles; make the game wi"
+    ):
+        policy.predict(pixels ^ 1)
+
+
 def test_predict_needs_the_agent_with_heads_per_agent() -> None:
     policy, obs = make_policy(MAPPOPolicy, heads="per_agent"), to_numpy(team_rows(VECTOR))
     with pytest.raises(ValueError, match=r"expected the observation to have 'agent', which .* reads, got 'obs'"):

@@ -84,7 +84,8 @@ class TeamRowsPolicy(BasePolicy):
         Act, as SB3's ``predict``; also on the observations of a PettingZoo environment.
 
         :param observation: rows, some of their entries, own observations alone, or ``{agent: observation}`` as a
-            ParallelEnv gives them. Where an actor reads who acts, these must be all agents in index order
+            ParallelEnv gives them. Where an actor reads who acts, these must be all agents in index order. A model
+            that was trained on tile codes also takes the pixels of the same game
         :param args: state, episode_start, deterministic as in SB3
         :param kwargs: the same, and ``action_masks`` of MaskablePPO
         :return: actions and the next state; ``{agent: action}`` for ``{agent: observation}``
@@ -132,6 +133,8 @@ class TeamRowsPolicy(BasePolicy):
         if unknown:
             raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
         arrays = {key: np.asarray(value) for key, value in entries.items()}
+        if OBS_KEY in arrays:
+            arrays[OBS_KEY] = codes_of_pixels(arrays[OBS_KEY], self.team_spaces.own)
         if AGENT_KEY in arrays:
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
         tensors, is_batch = super().obs_to_tensor(arrays)
@@ -262,6 +265,33 @@ def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:
             f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A) where actions are Discrete(A), got {mask} for "
             f"{action_space}"
         )
+
+
+def codes_of_pixels(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
+    """
+    Return tile codes of pixels, for models that were trained on codes.
+
+    :param observation: (..., width t, height t, C) pixels of tiles of t x t; anything else is returned as it is
+    :param space: of codes, (width, height), with the tiles' pixels as ``atlas``, (n_codes, t, t, C)
+    :raises ValueError: for pixels of which no code is made
+    """
+    atlas = getattr(space, "atlas", None)
+    if atlas is None or space.shape is None or len(space.shape) != 2:
+        return observation
+    (width, height), (_, tile, _, channels) = space.shape, atlas.shape
+    if observation.dtype != np.uint8 or observation.shape[-3:] != (width * tile, height * tile, channels):
+        return observation
+    batch = observation.shape[:-3]
+    tiles = observation.reshape(-1, width, tile, height, tile, channels).swapaxes(2, 3)
+    codes = {pixels.tobytes(): code for code, pixels in reversed(list(enumerate(np.ascontiguousarray(atlas))))}
+    try:
+        found = [codes[pixels.tobytes()] for pixels in tiles.reshape(-1, tile, tile, channels)]
+    except KeyError:
+        raise ValueError(
+            f"expected codes {space}, or pixels made of its {len(atlas)} tiles, got pixels of other tiles; make the "
+            "game with the parameters that the model was trained with"
+        ) from None
+    return np.array(found, dtype=space.dtype).reshape(*batch, width, height)
 
 
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
