@@ -25,8 +25,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 import sb3_saf
 from hecogrid_envs.constants import Command
 from hecogrid_envs.task import TaskName, check_task
-from sb3_saf.experiments.cells import Cell
 from sb3_saf.experiments.definitions import Level
+from sb3_saf.experiments.grid import Cell
 from sb3_saf.experiments.results import Results
 from sb3_saf.inspection.games import zones_by_attribute
 
@@ -40,21 +40,23 @@ def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
         found = _SETTING.fullmatch(folder)
         if found is None:
             raise ValueError(f"expected a folder such as TeamSupport-c2-h1, got {folder}")
-        level, n_agents = Level(int(found["c"]), int(found["h"])), int(found["n"]) if found["n"] else None
-        yield Cell(method, check_task(found["task"]), level, int(seed.removeprefix("seed-")), (), n_agents)
+        level = Level.of(coordination=int(found["c"]), heterogeneity=int(found["h"]))
+        if found["n"]:
+            level = Level.of(**level.env_kwargs, n_agents=int(found["n"]))
+        yield Cell(method, f"{check_task(found['task'])}-v0", level, int(seed.removeprefix("seed-")))
 
 
 def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
     """Numbers by name."""
-    protocol = results.protocol()
-    if protocol is None:
+    config = results.config()
+    if config is None:
         raise ValueError(f"{results.folder} does not say how its cells were trained: settings.json is missing")
-    settings = protocol.settings(cell)
+    settings = config.settings(cell)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=16)
     model = settings.make_model(env, cell.seed, device="cpu")
     sb3_saf.load_weights(model, results.cell_folder(cell) / "model.zip")
     scalars: dict[str, Any] = dict(sb3_saf.inspect_team(model, env, n_episodes).scalars)
-    scalars |= useless_commands(cell.task, *commands_and_zones(model, env))
+    scalars |= useless_commands(check_task(cell.task), *commands_and_zones(model, env))
     greedy = sb3_saf.evaluate_team(model, env, n_eval_episodes=n_episodes, deterministic=True)
     return {name: float(value) for name, value in scalars.items() if value is not None} | {"greedy": greedy.mean}
 

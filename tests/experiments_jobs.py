@@ -1,63 +1,65 @@
-"""What the tests of the experiments run: small jobs for worker processes, an engine without any, readers of tables."""
+"""What the tests of the experiments share: engines without the package's own workers, readers of tables."""
 
 from __future__ import annotations
 
 import csv
-import os
-import signal
+import sys
 import time
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from sb3_saf.experiments.engine import Ending, Job, JobFunction, ending, guarded
+from sb3_saf.experiments.cell import Job, run_job
+from sb3_saf.experiments.engines import Engine
+from sb3_saf.experiments.tables import TIME_COLUMNS
+
+#: A worker without the package's imports, which does what ``order.txt`` in its folder says.
+WORKER = (sys.executable, str(Path(__file__).parent / "experiments_worker.py"))
 
 
-class InlineEngine:
-    """Jobs in this process, where everything is imported already; keeps what it was asked."""
+class InlineEngine(Engine):
+    """
+    Jobs in this process, where everything is imported already; keeps what it was asked.
 
-    def __init__(self) -> None:
-        self.payloads: list[Any] = []
+    :param work: in the place of training and testing
+    """
 
-    def run(self, function: JobFunction, jobs: Sequence[Job], retries: int = 0) -> Iterator[Ending]:
-        for job in jobs:
-            self.payloads.append(job.payload())
-            yield ending(job, 1, 0, *guarded(function, self.payloads[-1]))
+    def __init__(self, work: Callable[[Path], None] = run_job) -> None:
+        self.jobs: list[Job] = []
+        self.with_model: list[bool] = []
+        self._work = work
+
+    @property
+    def slots(self) -> int:
+        return 1
+
+    def submit(self, folder: Path) -> Future[None]:
+        self.jobs.append(Job.read(folder))
+        self.with_model.append((folder / "model.zip").exists())
+        done: Future[None] = Future()
+        try:
+            self._work(folder)
+            done.set_result(None)
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+    def close(self) -> None:
+        pass
 
 
-def job(name: str) -> Job:
-    """A job whose payload is its name."""
-    return Job(name, partial(str, name))
-
-
-def obey(name: str) -> bytes:
-    """Do what the name says; ``*_once`` only the first time, which a file remembers."""
-    verb, _, path = name.partition(" ")
-    if verb.endswith("_once"):
-        if Path(path).exists():
-            return b"second time"
-        Path(path).touch()
-    if verb.startswith("fail"):
-        raise RuntimeError(f"{name} has failed")
-    if verb.startswith("die"):
-        os.kill(os.getpid(), signal.SIGKILL)
-    if verb.startswith("exit"):
-        os._exit(3)
-    if verb == "sleep":
-        Path(path).write_text(str(os.getpid()))
-        time.sleep(600)
-    if verb == "variable":
-        return os.environ[path].encode()
-    return name.encode()
+def order(folder: Path, name: str, words: str) -> Path:
+    """Make the folder of a job for :data:`WORKER`."""
+    (folder / name).mkdir(parents=True)
+    (folder / name / "order.txt").write_text(words)
+    return folder / name
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """A table's rows without the columns that tell times."""
-    from sb3_saf.experiments.table import WALL_COLUMNS  # worker processes import this module, and need no tables
-
+    """Return a table's rows without the columns that tell times."""
     with path.open(encoding="utf-8", newline="") as file:
-        return [{key: row[key] for key in row if key not in WALL_COLUMNS} for row in csv.DictReader(file)]
+        return [{key: row[key] for key in row if key not in TIME_COLUMNS} for row in csv.DictReader(file)]
 
 
 def is_running(pid: int) -> bool:
@@ -69,7 +71,7 @@ def is_running(pid: int) -> bool:
     return stat.rpartition(")")[2].split()[0] != "Z"
 
 
-def wait_until(condition: Any, seconds: float = 120) -> None:
+def wait_until(condition: Callable[[], Any], seconds: float = 120) -> None:
     """Wait for something that other processes do."""
     end = time.monotonic() + seconds
     while not condition():

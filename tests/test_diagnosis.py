@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import diagnosis
 from hecogrid_envs.constants import Command
-from sb3_saf.experiments.cells import Protocol
+from sb3_saf.experiments.grid import RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.settings import load_settings
 
@@ -34,7 +34,7 @@ def test_it_looks_into_every_trained_team(
     for method, seed in (("saf", 0), ("saf", 1), ("ippo", 0)):
         save_team(tmp_path, method, seed)
     results = Results(tmp_path)
-    results.agree(Protocol("small", OVERRIDES))
+    results.save_config(RunConfig("small", OVERRIDES))
     assert [str(cell) for cell in diagnosis.cells(results)] == [
         "ippo TeamSupport c=2, h=3 seed 0",
         "saf TeamSupport c=2, h=3 seed 0",
@@ -76,7 +76,7 @@ def test_a_folder_without_trained_teams_is_an_error(
     assert "expected the folder of an experiment" in capsys.readouterr().err
 
 
-def test_a_folder_without_protocol_is_an_error(tmp_path: Path) -> None:
+def test_a_folder_without_settings_is_an_error(tmp_path: Path) -> None:
     save_team(tmp_path, "ippo", 0)
     results = Results(tmp_path)
     with pytest.raises(ValueError, match=r"settings\.json is missing"):

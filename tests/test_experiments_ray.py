@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.cells import Choice, Protocol, Shard
+from sb3_saf.experiments.cell import Job, run_job
 from sb3_saf.experiments.definitions import find_experiment
-from sb3_saf.experiments.engine import Ending, Job, JobFunction
-from sb3_saf.experiments.on_ray import RayEngine, require_ray
+from sb3_saf.experiments.engines import RayEngine, _run_on_ray, require_ray
+from sb3_saf.experiments.files import unpack
+from sb3_saf.experiments.grid import Cell, RunConfig, Selection
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.run import Machine, Summary, run
-from tests.experiments_jobs import InlineEngine, job, obey, read_table
+from sb3_saf.experiments.run import Summary, run
+from tests.experiments_jobs import InlineEngine, read_table
 
-CHOICE = Choice((0,), ("ippo", "mappo"))
+CHOICE = Selection((0,), ("ippo", "mappo"))
+SMOKE = RunConfig("smoke")
 #: Ray's own default is to wait some 15 s before it takes a silent node for dead.
 IMPATIENT = {
     "health_check_initial_delay_ms": 0,
@@ -55,63 +58,78 @@ def cluster() -> Iterator[Any]:
     nodes.shutdown()
 
 
-class NodeKiller:
+class NodeKiller(RayEngine):
     """
-    An engine that kills a node a second after the first ending, when both nodes are busy again.
+    An engine that kills a node a second after the first cell's end, when both nodes are busy again.
 
     :param cluster: whose node
     """
 
     def __init__(self, cluster: Any) -> None:
+        super().__init__(cluster.address)
         self.cluster = cluster
-        self.lost: list[Ending] = []
+        self.lost: list[BaseException] = []
+        self._killer = threading.Timer(1.0, self._kill)
 
-    def run(self, function: JobFunction, jobs: Sequence[Job], retries: int = 0) -> Iterator[Ending]:
-        for number, ended in enumerate(RayEngine(self.cluster.address).run(function, jobs, retries)):
-            if number == 0:
-                # Not at once: the node that has ended the first cell gets its next only when this one has been taken.
-                threading.Timer(1.0, self._kill).start()
-            if ended.error is not None:
-                self.lost.append(ended)
-            yield ended
+    def submit(self, folder: Path) -> Future[None]:
+        future = super().submit(folder)
+        future.add_done_callback(self._note)
+        return future
+
+    def _note(self, future: Future[None]) -> None:
+        if (error := future.exception()) is not None:
+            self.lost.append(error)
+        elif not self._killer.is_alive() and not self._killer.finished.is_set():
+            self._killer.start()
 
     def _kill(self) -> None:
         self.cluster.remove_node(self.cluster.list_all_nodes()[-1], allow_graceful=False)
 
 
-# Tests of this module run in this order, for the last one leaves a node less.
-
-
-def test_failures_and_deaths_on_ray(cluster: Any, tmp_path: Path) -> None:
-    names = ["a", "fail", "die", f"die_once {tmp_path / 'd'}"]
-    found: dict[str, list[Ending]] = {name: [] for name in names}
-    for ended in RayEngine(cluster.address, cpus=0.5).run(obey, [job(name) for name in names], retries=1):
-        found[ended.job.name].append(ended)
-    assert [ended.result for ended in found["a"]] == [b"a"]
-    assert "RuntimeError: fail has failed" in (found["fail"][-1].error or "")
-    assert "lost by Ray (WorkerCrashedError)" in (found["die"][-1].error or "")
-    assert [len(found[name]) for name in ("fail", "die")] == [2, 2]
-    assert [ended.result for ended in found[names[3]]] == [None, b"second time"]
-
-
 def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any, tmp_path: Path) -> None:
-    engine, joint = NodeKiller(cluster), find_experiment("joint")
-    machine = Machine(shared_disk=False)
-    summary = run(joint, CHOICE, Protocol("smoke"), Results(tmp_path / "ray"), engine, machine, Shard())
-    assert summary == Summary(9, [])
+    joint, engine = find_experiment("joint"), NodeKiller(cluster)
+    assert run(joint, CHOICE, SMOKE, Results(tmp_path / "ray"), engine) == Summary(9, [], [])
     assert engine.lost
-    assert all("NodeDied" in (ended.error or "") and not ended.final for ended in engine.lost)
-    run(joint, CHOICE, Protocol("smoke"), Results(tmp_path / "here"), InlineEngine(), Machine(), Shard())
+    assert all("NodeDied" in str(error) for error in engine.lost)
+    run(joint, CHOICE, SMOKE, Results(tmp_path / "here"), InlineEngine())
     ray, here = (read_table(tmp_path / name / "joint" / "table.csv") for name in ("ray", "here"))
     assert len(ray) == 9
     assert ray == here
     assert (tmp_path / "ray/cells/TeamSupport-c2-h2/mappo/seed-0/model.zip").exists()
 
 
+def test_a_job_fails_on_ray(cluster: Any, tmp_path: Path) -> None:
+    (tmp_path / "job.json").write_text("[]")
+    with RayEngine(cluster.address) as engine:
+        error = engine.submit(tmp_path).exception(timeout=200)
+    assert "job.json holds no JSON object" in str(error).splitlines()[-1]
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, tmp_path: Path) -> None:
+    """There, what is killed goes on; elsewhere the result travels."""
+    experiment = find_experiment("joint")
+    (level, *_) = experiment.tests()
+    job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}))
+    for name in ("here", "there"):
+        (tmp_path / name).mkdir()
+        job.write(tmp_path / name)
+    run_job(tmp_path / "here")
+    folder = tmp_path / "there"
+    archive = _run_on_ray(
+        str(folder if is_shared else tmp_path / "x"), {"job.json": (folder / "job.json").read_bytes()}
+    )
+    assert (archive is None) == is_shared
+    if archive is not None:
+        unpack(archive, folder / "result")
+    ours, theirs = ((tmp_path / name / "result" / "tests/c2-h2.json").read_text() for name in ("here", "there"))
+    assert ours.partition('"wall')[0] == theirs.partition('"wall')[0]
+
+
 def test_cells_that_fit_on_no_node_of_a_fresh_ray() -> None:
     pytest.importorskip("ray")
     with pytest.raises(ValueError, match=r"a cell wants 1 CPUs and 3 GPUs of one node, .* lower --cpus-per-cell or"):
-        list(RayEngine(gpus=3, workers=1).run(obey, [job("a")]))
+        RayEngine(gpus=3, workers=1)
 
 
 def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

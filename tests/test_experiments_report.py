@@ -1,60 +1,66 @@
-"""``run`` and ``report`` of the coordination experiment as a user types them, and what reports say."""
+"""What reports say, complete or not, of the paper's experiments and of one's own."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from scipy import stats
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.cells import Protocol
-from sb3_saf.experiments.comparisons import compare
-from sb3_saf.experiments.definitions import EXPERIMENTS
-from sb3_saf.experiments.frames import read_results
-from sb3_saf.experiments.options import protocol_of
-from sb3_saf.experiments.page import _protocol_words
-from sb3_saf.experiments.page_tables import losses
-from sb3_saf.experiments.selection import complete
-from sb3_saf.training.statistics import Estimate, mean_over_seeds
+from sb3_saf.experiments.definitions import EXPERIMENTS, find_experiment
+from sb3_saf.experiments.grid import RunConfig, Selection
+from sb3_saf.experiments.page import losses
+from sb3_saf.experiments.report import read_scale
+from sb3_saf.experiments.results import Results
+from sb3_saf.experiments.run import run
+from sb3_saf.experiments.tables import compare, complete, read_results
+from sb3_saf.training.figures import draw_curves
+from sb3_saf.training.statistics import Estimate, learning_curve, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
 
 pytest.importorskip("rliable")
-#: Seconds, of a busy machine too: the first test waits for 72 cells.
-pytestmark = pytest.mark.timeout(900)
-LEVELS = [f"{task}-c{c}-h1" for task in ("TeamTogether", "TeamSupport", "KeyForTreasure") for c in (1, 2, 3)]
+TASKS = ("TeamTogether", "TeamSupport")
+LEVELS = [f"{task}-c{c}-h1" for task in TASKS for c in (1, 2, 3)]
+N_CELLS = (2 + 1) * len(LEVELS) * 2
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``run coordination --size smoke`` in two processes, as the README has it."""
+    """A finished run of two tasks and two methods."""
     path = tmp_path_factory.mktemp("coordination")
-    assert cli.main(["run", "coordination", "--size", "smoke", "--workers", "2", "-f", str(path)]) == 0
+    selection = Selection((0, 1), ("saf", "ippo"), tuple(f"{task}-v0" for task in TASKS))
+    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80})
+    assert run(find_experiment("coordination"), selection, config, Results(path), InlineEngine()).finished == N_CELLS
     return path
 
 
-def report(folder: Path, *words: str) -> str:
-    assert cli.main(["report", "coordination", "-f", str(folder), *words]) == 0
-    return (folder / "coordination" / "report.md").read_text(encoding="utf-8")
+def report(folder: Path, *words: str, name: str = "coordination") -> str:
+    assert cli.main(["report", name, "-f", str(folder), *words]) == 0
+    return (folder / name / "report.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
 def page(folder: Path) -> str:
-    """``report coordination``."""
     return report(folder)
 
 
-def test_coordination_from_the_command_line(folder: Path, page: str) -> None:
-    assert len(read_table(folder / "coordination" / "table.csv")) == 4 * 9 * 2
+def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> None:
+    assert len(read_table(folder / "coordination" / "table.csv")) == N_CELLS
     assert "missing" not in page
     names = {"levels-coordination.png", "aggregates.png", *(f"curve-{level}.png" for level in LEVELS)}
     assert {path.name for path in (folder / "coordination").glob("*.png")} == names
     assert all(f"({name})" in page for name in names)
-    assert "Size `smoke`: 4 agents, 6 treasures, 400 game steps of training. saf, mappo, ippo and a random team" in page
+    assert "Size `smoke`: 4 agents, 6 treasures, 80 game steps of training. saf, ippo and a random team" in page
+    again = (
+        "run coordination --size smoke --game-steps 80 --hyperparams n_epochs:1 --seeds 0 1 --methods saf ippo --tasks"
+    )
+    assert f"python -m sb3_saf.experiments {again} TeamTogether TeamSupport -f {folder}" in page
+    assert page.count("python -m sb3_saf.train --algo ") == 2 * len(LEVELS) * 2
 
 
 def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> None:
@@ -62,9 +68,10 @@ def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> 
     runs = table[(table.method == "saf") & (table.task == "TeamSupport") & (table.coordination == 1)]
     low, high = stats.t.interval(0.95, 1, loc=runs.return_mean.mean(), scale=runs.return_mean.sem())
     assert f"| saf | {runs.return_mean.mean():.2f} [{low:.2f}, {high:.2f}] |" in page
-    every = np.sort(table[table.method == "mappo"].score)
-    # Of 18 scores, the middle half: four and a half from each end are left out, rounded as scipy does.
+    every = np.sort(table[table.method == "ippo"].score)
     assert f"{stats.trim_mean(every, 0.25):.3f} [" in page.split("## Aggregates")[1].split("## ")[0]
+    rows = [line for line in page.splitlines() if line.count("|") == 9 and "against" not in line and "---" not in line]
+    assert [line.split(" | ")[-1] for line in rows] == ["no winner: fewer than 3 seeds |"] * (2 * len(LEVELS))
 
 
 def test_losses_are_shares_of_the_first_level(page: str) -> None:
@@ -76,8 +83,8 @@ def test_losses_are_shares_of_the_first_level(page: str) -> None:
     ]
     table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "return_mean"])
     table["return_mean"] += table["seed"] * (table["coordination"] == 1) * (table["method"] == "saf")
-    table = table.assign(task="TeamSupport", heterogeneity=1, train_heterogeneity=1)
-    table["train_coordination"] = table["coordination"]
+    levels = [f"c{c}-h1" for c in table["coordination"]]
+    table = table.assign(task="TeamSupport", level=levels, train_level=levels)
     text = losses(table, EXPERIMENTS["coordination"].views[0])
     # Seed 0 has 3, 2, 1 treasures, seed 1 has 4, 2, 1.
     second, third = (mean_over_seeds([100 * (1 - each / 3), 100 * (1 - each / 4)]) for each in (2, 1))
@@ -87,59 +94,23 @@ def test_losses_are_shares_of_the_first_level(page: str) -> None:
     assert losses(table, EXPERIMENTS["ood-coordination"].views[0]) == ""
 
 
-def test_options_of_the_page_are_read_as_they_were() -> None:
-    overrides = {
-        "env_kwargs": {"observation": "rgb"},
-        "clip_range_vf": None,
-        "policy_kwargs": {"n_slots": 3},
-        "n_epochs": 1,
-    }
-    options = cli._parser().parse_args(["run", "joint", *_protocol_words(Protocol("smoke", overrides, 8, True))])
-    assert protocol_of(options) == Protocol("smoke", overrides, 8, True)
-
-
-def test_two_seeds_name_no_winner(page: str) -> None:
-    rows = [
-        line for line in page.splitlines() if line.count("|") == 9 and "saf against" not in line and "---" not in line
-    ]
-    verdicts = [line.split(" | ")[-1] for line in rows]
-    assert verdicts == ["no winner: fewer than 3 seeds |"] * (9 * 3)
-
-
-def test_the_page_repeats_itself(folder: Path, page: str, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert report(folder) == page
-    printed = capsys.readouterr()
-    assert f"page: {folder / 'coordination' / 'report.md'}" in printed.out
-    assert printed.err == ""
-
-
-def test_commands_of_the_page(folder: Path, page: str) -> None:
-    assert f"python -m sb3_saf.experiments run coordination --size smoke --seeds 0 1 -f {folder}" in page
-    assert page.count("python -m sb3_saf.train --algo ") == 54
-
-
-def test_part_of_an_experiment(folder: Path, tmp_path: Path) -> None:
+def test_parts_of_an_experiment(folder: Path, tmp_path: Path) -> None:
     part = shutil.copytree(folder, tmp_path / "part")
-    page = report(part, "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "1")
+    page = report(part, "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "1", "--levels", "1", "3")
+    page = page.split("## Run it again")[0]
     assert "ippo and a random team, seeds 1." in page
-    assert "TeamTogether" not in page.split("## Run it again")[0]
-
-
-def test_some_levels_of_an_experiment(folder: Path, tmp_path: Path) -> None:
-    part = shutil.copytree(folder, tmp_path / "part")
-    page = report(part, "--levels", "1", "3", "--tasks", "TeamSupport").split("## Run it again")[0]
     assert "| TeamSupport | c=1, h=1 | c=3, h=1 | seeds |" in page
     assert "curve-TeamSupport-c3-h1.png" in page and "curve-TeamSupport-c2-h1.png" not in page
+    assert "TeamTogether" not in page
 
 
 def test_results_as_tables(folder: Path) -> None:
     tests, curves = read_results(folder, "coordination")
-    stored = pd.read_csv(folder / "coordination" / "table.csv")
-    pd.testing.assert_frame_equal(tests, stored[list(tests.columns)])
-    assert len(curves.groupby(["method", "task", "level", "seed"])) == 3 * 9 * 2
-    last = curves.groupby(["method", "task", "level", "seed"])["game_steps"].max()
-    assert set(last) == {400}
+    stored = pd.read_csv(folder / "coordination" / "table.csv", float_precision="round_trip")
+    pd.testing.assert_frame_equal(tests, stored[list(tests.columns)], check_exact=True)
+    last = curves.groupby(["method", "task", "level", "coordination", "seed"])["game_steps"].max()
+    assert len(last) == 2 * len(LEVELS) * 2 and set(last) == {80}
+    assert (curves["processor_seconds"] > 0).all()
 
 
 def test_results_that_are_not_there(tmp_path: Path) -> None:
@@ -150,18 +121,68 @@ def test_results_that_are_not_there(tmp_path: Path) -> None:
 
 
 def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    partial = tmp_path / "partial"
-    shutil.copytree(folder, partial)
-    shutil.rmtree(partial / "cells" / "TeamTogether-c1-h1" / "saf")
-    failed = partial / "cells" / "TeamSupport-c1-h1" / "mappo" / "seed-0"
-    (failed / "status.json").write_text(json.dumps({"state": "failed"}))
-    page = report(partial)
-    assert "**3 of 72 cells are missing**" in page
+    part = shutil.copytree(folder, tmp_path / "part")
+    shutil.rmtree(part / "cells" / "TeamTogether-c1-h1" / "saf")
+    damaged, failed = (part / folder / "TeamSupport-c1-h1" / "ippo" / "seed-0" for folder in ("cells", "unfinished"))
+    (damaged / "status.json").write_text("")
+    (damaged.parent / "seed-1" / "curve.csv").write_text("x,y\n1,2\n")
+    failed.mkdir(parents=True)
+    (failed / "error.txt").write_text("out of luck")
+    page = report(part)
+    assert f"**3 of {N_CELLS} cells are missing**" in page
     assert "- saf TeamTogether c=1, h=1 seed 1: not run yet" in page
-    assert f"- mappo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page
+    assert f"- ippo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page
+    assert f"- damaged: {damaged / 'status.json'} cannot be read: " in page
+    assert "seed-1/curve.csv is no learning curve: " in page
     assert "| saf | – |" in page
     assert "the seeds 1, which all methods have" in page
-    assert "3 of 72 cells are missing; the page names them" in capsys.readouterr().err
+    assert f"3 of {N_CELLS} cells are missing; the page names them" in capsys.readouterr().err
+
+
+def test_a_killed_report_leaves_the_old_one(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    part = shutil.copytree(folder, tmp_path / "part")
+    report(part, "--seeds", "0")
+    before = {path.name: path.read_bytes() for path in (part / "coordination").iterdir() if path.is_file()}
+    count, save = [0], Figure.savefig
+
+    def killed_at_the_third(self: Figure, path: Path) -> None:
+        count[0] += 1
+        if count[0] == 3:
+            raise KeyboardInterrupt
+        save(self, path)
+
+    monkeypatch.setattr(Figure, "savefig", killed_at_the_third)
+    assert cli.main(["report", "coordination", "-f", str(part)]) == 130
+    assert {path.name: path.read_bytes() for path in (part / "coordination").iterdir() if path.is_file()} == before
+
+
+def test_reference_teams_are_drawn_where_they_belong(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scale = tmp_path / "scale.csv"
+    rows = ["TeamSupport,1,4,scripted,5.5", "TeamSupport,1,9,other size,5", "TeamSupport,1,4,random,1"]
+    scale.write_text("\n".join(["task,coordination,n_agents,name,mean", *rows]) + "\n")
+    found: dict[str, set[str]] = {}
+
+    def labels(self: Figure, path: Path) -> None:
+        found[path.name] = {text.get_text() for legend in self.legends for text in legend.get_texts()}
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(Figure, "savefig", labels)
+    report(shutil.copytree(folder, tmp_path / "part"), "--scale", str(scale))
+    curves = {"saf (2 seeds)", "ippo (2 seeds)", "random (2 seeds)"}
+    assert found["curve-TeamSupport-c1-h1.png"] == {*curves, "scripted"}
+    assert found["curve-TeamSupport-c2-h1.png"] == found["curve-TeamTogether-c1-h1.png"] == curves
+    assert found["levels-coordination.png"] == {"saf", "ippo", "random", "scripted"}
+    scale.write_text("a,b\n")
+    with pytest.raises(ValueError, match=r"is no file of reference teams: .* name, mean is missing"):
+        read_scale(scale)
+
+
+def test_seeds_that_were_never_measured_at_the_same_time_have_no_curve() -> None:
+    apart = pd.DataFrame({"method": "saf", "seed": [0, 0, 1, 1], "game_steps": [1.0, 2.0, 3.0, 4.0], "score": 1.0})
+    assert learning_curve(apart).empty
+    draw_curves(apart)
 
 
 def table_of(values: list[float]) -> pd.DataFrame:
@@ -181,13 +202,10 @@ def test_a_winner_needs_intervals_apart() -> None:
     assert near is not None
     assert near.difference.high < 0
     assert near.verdict == "no winner: intervals overlap"
-
-
-def test_two_seeds_that_agree_are_no_proof() -> None:
-    found = compare(table_of([1.0, 1.0]), table_of([2.0, 2.0]))
-    assert found is not None
-    assert found.first == Estimate(1.0, 1.0, 1.0)
-    assert found.verdict == "no winner: fewer than 3 seeds"
+    # Two seeds that agree are no proof.
+    two = compare(table_of([1.0, 1.0]), table_of([2.0, 2.0]))
+    assert two is not None
+    assert (two.first, two.verdict) == (Estimate(1.0, 1.0, 1.0), "no winner: fewer than 3 seeds")
 
 
 def test_only_common_seeds_are_compared() -> None:
@@ -206,10 +224,10 @@ def test_aggregates_compare_like_with_like() -> None:
     assert complete(apart).empty
 
 
-@pytest.mark.parametrize("name", ["joint", "ablation", "ood-ablation"])
+@pytest.mark.parametrize("name", ["joint", "ood-ablation"])
 def test_other_experiments_run_and_report(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One method, one seed: nothing is known of spreads, and the page says so by leaving intervals out."""
-    monkeypatch.setattr(cli, "engine_of", lambda options: InlineEngine())
+    monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
     monkeypatch.chdir(tmp_path)
     words = ["--size", "smoke", "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "0"]
     assert cli.main(["run", name, *words, "--hyperparams", "n_epochs:1", "--game-steps", "80"]) == 0
@@ -219,7 +237,6 @@ def test_other_experiments_run_and_report(name: str, tmp_path: Path, monkeypatch
     charts = {path.name for path in results.glob("levels-*.png")}
     assert charts == {f"levels-{view.axis.replace(' = ', '-')}.png" for view in EXPERIMENTS[name].views}
     for view in EXPERIMENTS[name].views:
-        trained = "" if view.train is None else f", trained at {view.train}"
-        assert f"## Team return by {view.axis}{trained}" in page
+        assert f"## Team return by {view.axis}{view.suffix}" in page
     assert "nan" not in page and "inf" not in page
     assert "--hyperparams n_epochs:1" in page and "--game-steps 80" in page

@@ -21,9 +21,9 @@ import pytest
 
 import hecogrid_envs
 from hecogrid_envs.text import parse_level, render_text
-from sb3_saf.experiments.cells import check_methods
 from sb3_saf.experiments.definitions import find_experiment
 from sb3_saf.experiments.files import pack, unpack
+from sb3_saf.experiments.grid import check_methods
 from sb3_saf.training.settings import ENV_IDS, load_settings
 from sb3_saf.training.yaml_files import SIZES, load_yaml
 

@@ -1,7 +1,7 @@
 """
-The paper's experiments by name: ``python -m sb3_saf.experiments list | plan NAME | run NAME | report NAME``.
+Grids of trainings by name: ``python -m sb3_saf.experiments list | plan | run | report | check``.
 
-An experiment (``definitions``) is a grid of cells (``cells``), each of which is trained and tested in a process of its
-own (``work``) by an engine, on this machine (``local``) or on a Ray cluster (``on_ray``). Results lie in one folder per
-cell (``results``), from which the table (``table``) and the report (``report``) are made.
+An experiment (``definitions``) is a grid of cells (``grid``). ``run`` gives each cell that is not finished to a process
+of this machine or of a Ray cluster (``engines``), which trains and tests it (``cell``). Results lie in one folder per
+cell (``results``), from which tables (``tables``) and the report (``report``, ``page``) are made.
 """

@@ -1,46 +1,49 @@
-"""The command line: ``list``, ``plan``, ``run``, ``report``."""
+"""The command line: ``list``, ``plan``, ``run``, ``report``, ``check``."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final, NoReturn
+from pathlib import Path
+from typing import Any, Final, NoReturn, TypeVar
 
-from sb3_saf.experiments.cells import Shard
-from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, find_experiment
-from sb3_saf.experiments.options import (
-    PROGRAM,
-    add_choice,
-    add_engine,
-    add_machine,
-    add_protocol,
-    add_rate,
-    choice_of,
-    engine_of,
-    existing_results_of,
-    machine_of,
-    positive,
-    protocol_of,
-    results_of,
-    wanted_of,
-    workers_of,
-)
-from sb3_saf.training.commands import USAGE_ERROR, OneLineParser
+from hecogrid_envs.task import check_task
+from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, Experiment, own_experiment
+from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
+from sb3_saf.experiments.grid import RunConfig, Selection, Shard
+from sb3_saf.experiments.page import PROGRAM
+from sb3_saf.experiments.results import Results
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.commands import USAGE_ERROR, KeyValues, OneLineParser
+from sb3_saf.training.devices import check_device
+from sb3_saf.training.names import unknown_name
+from sb3_saf.training.seeds import check_seed
+from sb3_saf.training.yaml_files import SIZES, Size
 
+DEFAULT_SIZE: Final[Size] = "small"
+#: Returns of reference teams, which reports draw if the file is there.
+DEFAULT_SCALE: Final = Path("results", "scale.csv")
 #: What a shell reports for a process that Ctrl-C has ended.
 _INTERRUPTED: Final = 130
+_LEVEL_PARAMETERS: Final = ("coordination", "heterogeneity")
+
+Number = TypeVar("Number", int, float, None)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    :return: 0 if all went well, 1 if cells failed, 2 if the command was wrong, 130 if it was interrupted
+    :return: 0 if all went well, 1 if cells failed or differ, 2 if the command was wrong, 130 if it was interrupted
     """
     options = _parser().parse_args(arguments)
+    if options.command == "cell":  # whose errors are for error.txt, with their traceback
+        return _cell(options)
     try:
         code: int = options.function(options)
     except (ValueError, OSError) as error:
@@ -52,50 +55,254 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
+# Options
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = OneLineParser(prog=PROGRAM, description="The paper's experiments by name.")
-    commands = parser.add_subparsers(dest="command", required=True, parser_class=OneLineParser)
-    commands.add_parser("list", help="the experiments").set_defaults(function=_list)
+    parser = OneLineParser(prog=PROGRAM, description="Grids of trainings: the paper's by name, and your own.")
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=OneLineParser, metavar="COMMAND")
+    commands.add_parser("list", help="the paper's experiments").set_defaults(function=_list)
     for name, function, groups, text in (
-        ("plan", _plan, (add_protocol, add_machine, add_rate), "cells, game steps, time and memory, before it runs"),
-        ("run", _run, (add_protocol, add_machine, add_engine), "run what is missing"),
-        ("report", _report, (), "figures and a page of tables, of whatever is there"),
+        ("plan", _plan, (_add_config,), "cells, game steps and, once cells are finished, the time that is left"),
+        ("run", _run, (_add_config, _add_machine), "run what is missing"),
+        ("report", _report, (_add_report,), "figures and a page of tables, of whatever is there"),
     ):
         command = commands.add_parser(name, help=text, description=text)
-        command.add_argument("name", metavar="NAME", help=f"one of {', '.join(EXPERIMENTS)}")
         command.set_defaults(function=function)
-        for add_group in (add_choice, *groups):
+        for add_group in (_add_selection, *groups):
             add_group(command)
+    check = commands.add_parser("check", help="run a finished cell again and compare the numbers")
+    check.set_defaults(function=_check)
+    check.add_argument(
+        "cell", type=Path, metavar="FOLDER/CELL", help="such as runs/x/cells/TeamSupport-c1-h1/saf/seed-0"
+    )
+    check.add_argument("--device", default="auto", help="as Stable-Baselines3 takes it")
+    cell = commands.add_parser("cell", help="what `run` starts for each cell: do the job of a folder")
+    cell.add_argument("cell", type=Path, metavar="FOLDER", help="with a job.json")
+    cell.add_argument("--until-stdin-closes", action="store_true", help="end when whoever started this ends")
     return parser
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", metavar="NAME", help=f"one of {', '.join(EXPERIMENTS)}, or your own")
+    group = parser.add_argument_group("what")
+    group.add_argument(
+        "--env", nargs="+", default=[], help="a grid of your own on these environments, as sb3_saf.train takes them"
+    )
+    group.add_argument(
+        "--vary",
+        nargs="+",
+        action=KeyValues,
+        default={},
+        metavar="KEY:[VALUES]",
+        help="a parameter of these environments and its values, such as N:[2,3]",
+    )
+    group.add_argument("--size", choices=SIZES, help=f"default: that of the folder, or {DEFAULT_SIZE}")
+    group.add_argument("-f", "--folder", type=Path, help="of the results; default: runs/experiments/SIZE, or /NAME")
+    group.add_argument("--seeds", type=int, nargs="+", default=[], help=f"default: {' '.join(map(str, DEFAULT_SEEDS))}")
+    group.add_argument("--methods", nargs="+", default=[], metavar="ALGO", help="default: the experiment's")
+    group.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="default: the experiment's")
+    group.add_argument("--levels", nargs="+", default=[], help="on its axes, such as 1 3 5; default: all")
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how cells are trained and tested (the same for all cells of a folder)")
+    group.add_argument(
+        "-n", "--game-steps", type=int, help="game steps (of all games together) to train for; default: the size's"
+    )
+    pairs: dict[str, Any] = {"nargs": "+", "action": KeyValues, "default": {}, "metavar": "KEY:VALUE"}
+    group.add_argument("--env-kwargs", **pairs, help="parameters of the environment, beside the levels")
+    group.add_argument("-params", "--hyperparams", **pairs, help="in the place of zoo_configs', for all methods")
+    group.add_argument("--episodes", type=int, default=32, help="team episodes of each test")
+    group.add_argument("--deterministic", action="store_true", help="test with the most likely actions")
+
+
+def _add_machine(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("where and how cells run")
+    group.add_argument("--workers", type=int, help="cells at the same time; default: as many as cores allow")
+    group.add_argument("--threads", type=int, default=1, help="threads of each worker")
+    group.add_argument("--device", default="auto", help="as Stable-Baselines3 takes it")
+    group.add_argument("--retries", type=int, default=1, help="further attempts for a cell that fails or is killed")
+    group.add_argument(
+        "--resume",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="cells that were killed go on, exactly, from their last checkpoint (the default), or start over",
+    )
+    group.add_argument("--shard", default="1/1", metavar="I/N", help="run only the I-th of N parts")
+    group.add_argument("--tensorboard", action="store_true", help="keep TensorBoard logs in the cells' folders")
+    group.add_argument("--ray", action="store_true", help="on Ray instead of processes of this machine")
+    group.add_argument("--address", help="of a running Ray cluster, or 'auto' to find it; implies --ray")
+    group.add_argument("--cpus-per-cell", type=float, default=1, help="on Ray")
+    group.add_argument("--gpus-per-cell", type=float, default=0, help="on Ray; with 0.25 four cells share one")
+
+
+def _add_report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--scale",
+        type=Path,
+        help=f"returns of reference teams to draw; default: {DEFAULT_SCALE}, if it is there",
+    )
+
+
+# What the options mean
+
+
+def _positive(name: str, value: Number) -> Number:
+    """
+    Return a number above 0, or None.
+
+    :raises ValueError: for any other
+    """
+    if value is not None and not value > 0:
+        raise ValueError(f"{name} must be above 0, got {value:g}")
+    return value
+
+
+def _size(options: argparse.Namespace) -> Size:
+    """Return the size that was named, that of the folder, or the default."""
+    if options.size is not None:
+        size: Size = options.size
+        return size
+    stored = None if options.folder is None else Results(options.folder).config()
+    return DEFAULT_SIZE if stored is None else stored.size
+
+
+def _results(options: argparse.Namespace) -> Results:
+    """Return the folder of results, which may not be there yet."""
+    name = _name(options)
+    return Results(options.folder or Path("runs", "experiments", _size(options) if name in EXPERIMENTS else name))
+
+
+def _name(options: argparse.Namespace) -> str:
+    """
+    Return the name of the experiment.
+
+    :raises ValueError: if there is none
+    """
+    name: str | None = options.name
+    if name is None and len(options.env) != 1:
+        example = f"{PROGRAM} {options.command} coordination, or --env mpe2.simple_spread_v3"
+        what = "several environments need a name before --env" if options.env else "name an experiment"
+        raise ValueError(f"{what}: {example}")
+    return options.env[0].removesuffix("-v0").replace(":", "-") if name is None else name
+
+
+def _experiment(options: argparse.Namespace) -> Experiment:
+    if options.env:
+        return own_experiment(_name(options), tuple(dict.fromkeys(options.env)), options.vary)
+    if options.vary:
+        raise ValueError("--vary is for a grid of your own: give its environments with --env")
+    return _results(options).experiment(_name(options))
+
+
+def _selection(options: argparse.Namespace, experiment: Experiment) -> Selection:
+    """
+    Return the part that was named; empty for what was not.
+
+    :raises ValueError: for names that do not exist
+    """
+    for method in options.methods:
+        if method not in ALGOS:
+            raise unknown_name("method", method, ALGOS)
+    return Selection(
+        tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
+        tuple(dict.fromkeys(options.methods)),
+        tuple(dict.fromkeys(_env(task, experiment) for task in options.tasks)),
+        tuple(dict.fromkeys(options.levels)),
+    )
+
+
+def _env(task: str, experiment: Experiment) -> str:
+    """Return the environment of a task; any of HECOGrid's will do for the paper's experiments."""
+    if task in experiment.envs:
+        return task
+    if experiment.name not in EXPERIMENTS:
+        raise unknown_name("environment of this experiment", task, experiment.envs)
+    return f"{check_task(task.removesuffix('-v0'))}-v0"
+
+
+def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
+    """Return how cells are trained and tested."""
+    overrides = dict(options.hyperparams)
+    if options.game_steps is not None:
+        overrides["game_steps"] = _positive("--game-steps", options.game_steps)
+    varied = {name for view in experiment.views for level in view.levels for name in level.env_kwargs}
+    for name in options.env_kwargs:
+        if name in varied:
+            raise ValueError(f"{name} is what the experiment varies; leave it out of --env-kwargs")
+    if options.env_kwargs:
+        overrides["env_kwargs"] = options.env_kwargs
+    return RunConfig(_size(options), overrides, _positive("--episodes", options.episodes), options.deterministic)
+
+
+def _engine(options: argparse.Namespace) -> Engine:
+    """
+    Return what runs cells.
+
+    :raises ValueError: if Ray is asked for and not installed, or not there
+    """
+    if not (options.ray or options.address is not None):
+        return LocalEngine(_workers(options), options.threads)
+    cpus = _positive("--cpus-per-cell", options.cpus_per_cell)
+    return RayEngine(options.address, cpus, options.gpus_per_cell, options.workers)
+
+
+def _workers(options: argparse.Namespace) -> int:
+    """Return how many cells run at the same time: a batch system may have limited the cores of this process."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers: int = options.workers or max(1, cores // options.threads)
+    return workers
+
+
+# Commands
 
 
 def _list(options: argparse.Namespace) -> int:
     for experiment in EXPERIMENTS.values():
         print(f"{experiment.name:<19}{experiment.question}")
-        for line in _details(experiment):
-            print(f"{'':<19}  {line}")
+        if experiment.is_grid:
+            tasks = ", ".join(env.removesuffix("-v0") for env in experiment.envs)
+            for line in (f"{', '.join(experiment.methods)} on {tasks}", *map(str, experiment.views)):
+                print(f"{'':<19}  {line}")
     return 0
 
 
-def _details(experiment: Experiment) -> list[str]:
+def _plan(options: argparse.Namespace) -> int:
+    from sb3_saf.experiments.plan import make_plan
+
+    experiment = _experiment(options)
     if not experiment.is_grid:
-        return []
-    agents = "" if experiment.n_agents is None else f", {experiment.n_agents} agents"
-    return [f"{', '.join(experiment.methods)} on {', '.join(experiment.tasks)}{agents}", *map(str, experiment.views)]
+        print(f"{experiment.name}: counts weights, trains nothing")
+        return 0
+    selection = _with_seeds(_selection(options, experiment))
+    print(make_plan(experiment, selection, _config(options, experiment), _results(options)))
+    return 0
+
+
+def _with_seeds(selection: Selection) -> Selection:
+    return Selection(selection.seeds or DEFAULT_SEEDS, selection.methods, selection.envs, selection.levels)
 
 
 def _run(options: argparse.Namespace) -> int:
-    from sb3_saf.experiments.run import run
+    from sb3_saf.experiments.run import RunOptions, run
 
-    experiment = find_experiment(options.name)
+    experiment = _experiment(options)
     if not experiment.is_grid:
         return _print_parameters()
-    results, machine = results_of(options), machine_of(options)
-    choice, protocol, shard = choice_of(options), protocol_of(options), Shard.parse(options.shard)
-    engine = engine_of(options)
+    results = _results(options)
+    selection, config = _with_seeds(_selection(options, experiment)), _config(options, experiment)
+    shard = Shard.parse(options.shard)
+    for name in ("workers", "threads"):
+        _positive(f"--{name}", getattr(options, name))
+    if options.retries < 0:
+        raise ValueError(f"--retries must be 0 or more, got {options.retries}")
+    how = RunOptions(
+        check_device(options.device), options.threads, options.retries, options.tensorboard, options.resume
+    )
     try:
-        with _ending_like_interrupted(signal.SIGTERM):
-            summary = run(experiment, choice, protocol, results, engine, machine, shard)
+        with _sigterm_like_control_c():
+            summary = run(experiment, selection, config, results, _engine(options), how, shard)
     except KeyboardInterrupt:
         print(
             "\ninterrupted: workers have ended, finished cells and checkpoints are kept; the same command continues",
@@ -111,47 +318,35 @@ def _run(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _ending_like_interrupted(number: int) -> Iterator[None]:
+def _sigterm_like_control_c() -> Iterator[None]:
     """Batch systems send SIGTERM before they kill: end as after Ctrl-C."""
 
     def interrupt(*_: object) -> NoReturn:
         raise KeyboardInterrupt
 
-    before = signal.signal(number, interrupt)
+    before = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
-        signal.signal(number, before)
-
-
-def _plan(options: argparse.Namespace) -> int:
-    from sb3_saf.experiments.plan import make_plan
-
-    experiment = find_experiment(options.name)
-    if not experiment.is_grid:
-        print(f"{experiment.name}: counts weights, trains nothing")
-        return 0
-    plan = make_plan(
-        experiment,
-        choice_of(options),
-        protocol_of(options),
-        results_of(options),
-        workers=workers_of(options),
-        threads=options.threads,
-        device=options.device,
-        rate=positive("--rate", options.rate),
-    )
-    print(plan)
-    return 0
+        signal.signal(signal.SIGTERM, before)
 
 
 def _report(options: argparse.Namespace) -> int:
-    experiment = find_experiment(options.name)
+    results, name = _results(options), _name(options)
+    experiment = _experiment(options)
     if not experiment.is_grid:
         return _print_parameters()
-    from sb3_saf.experiments.report import write_report
+    remedy = f"run it first: {PROGRAM} run {name} --size {_size(options)} -f {results.folder}"
+    if not results.folder.is_dir():
+        raise ValueError(f"there is no folder {results.folder}; name another with -f, or {remedy}")
+    if results.config() is None or not results.selections(name):
+        damaged = "".join(f" ({error})" for error in results.damaged.values())
+        raise ValueError(f"{results.folder} has no results of {name!r}{damaged}; {remedy}")
+    from sb3_saf.experiments.report import read_scale, write_report
 
-    report = write_report(experiment, existing_results_of(options), wanted_of(options))
+    path = options.scale or (DEFAULT_SCALE if DEFAULT_SCALE.is_file() else None)
+    scale = None if path is None else read_scale(path)
+    report = write_report(experiment, results, _selection(options, experiment), scale)
     print(f"page: {report.page}")
     print(f"figures: {', '.join(path.name for path in report.figures)}")
     if report.missing:
@@ -164,3 +359,32 @@ def _print_parameters() -> int:
 
     print(format_table(parameter_table()))
     return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    from sb3_saf.experiments.check import check_cell
+
+    check = check_cell(options.cell, check_device(options.device))
+    if check.equal:
+        print(f"equal, bit for bit: {', '.join(check.equal)}")
+    for difference in check.different:
+        print(f"different: {difference}")
+    if check.software:
+        print(f"software has changed: {check.software}")
+    return 1 if check.different else 0
+
+
+def _cell(options: argparse.Namespace) -> int:
+    from sb3_saf.experiments.cell import run_job
+
+    if options.until_stdin_closes:
+        threading.Thread(target=_end_with_stdin, daemon=True).start()
+    run_job(options.cell)
+    return 0
+
+
+def _end_with_stdin() -> None:
+    """End at once when the process that started this one is gone, however it ended."""
+    while os.read(0, 1024):
+        pass
+    os._exit(1)

@@ -1,84 +1,85 @@
-"""What the paper's experiments are: methods, tasks and levels by name. No code here trains anything."""
+"""What experiments are: methods, environments and levels by name. No code here trains anything."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Final, NamedTuple
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
-from hecogrid_envs.task import TaskName
 from sb3_saf.training.names import unknown_name
-from sb3_saf.training.yaml_files import Size
 
-#: Seeds of a run that names none. The spec asks for at least three; smoke is for tests.
-DEFAULT_SEEDS: Final[dict[Size, tuple[int, ...]]] = {"paper": (0, 1, 2), "small": (0, 1, 2), "smoke": (0, 1)}
+#: Seeds of a run that names none: the paper's experiments have at least three.
+DEFAULT_SEEDS: Final = (0, 1, 2)
 
 #: The untrained team that every experiment has beside its methods.
 RANDOM: Final = "random"
 
+#: How levels abbreviate the names of parameters.
+_SHORT: Final = {"coordination": "c", "heterogeneity": "h", "n_agents": "n"}
+#: Values that may be part of a folder's name.
+_PLAIN: Final = re.compile(r"[\w.+-]+")
+
 
 class Level(NamedTuple):
     """
-    How hard a task is.
+    Parameters of the environment that an experiment varies.
 
-    :param coordination: c, agents that one treasure needs
-    :param heterogeneity: h, zones with different dynamics
+    :param parameters: names and values; empty for the environment as it is
     """
 
-    coordination: int
-    heterogeneity: int
+    parameters: tuple[tuple[str, Any], ...] = ()
 
-    def __str__(self) -> str:
-        return f"c={self.coordination}, h={self.heterogeneity}"
+    @classmethod
+    def of(cls, **parameters: Any) -> Level:
+        """Return the level with these parameters: ``Level.of(coordination=2, heterogeneity=1)``."""
+        return cls(tuple(parameters.items()))
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """The parameters as arguments of the environment."""
+        return dict(self.parameters)
 
     @property
     def slug(self) -> str:
-        """For names of files and folders."""
-        return f"c{self.coordination}-h{self.heterogeneity}"
+        """Return a name for files and folders, such as ``"c2-h1"``."""
+        return "-".join(f"{_SHORT.get(name, name)}{value}" for name, value in self.parameters) or "default"
 
-
-class Setting(NamedTuple):
-    """
-    One level to train at, and the levels to test at.
-
-    :param train: trained at
-    :param tests: tested at
-    """
-
-    train: Level
-    tests: tuple[Level, ...]
+    def __str__(self) -> str:
+        return ", ".join(f"{_SHORT.get(name, name)}={value}" for name, value in self.parameters) or "default"
 
 
 class View(NamedTuple):
     """
-    One row of levels: what a bar chart shows.
+    A row of levels along one parameter: what a bar chart shows.
 
-    :param axis: the dial that is turned, as figures name it
+    :param parameter: that is varied; empty if there is one level only
     :param levels: tested at
     :param train: trained at; None where every level is trained at itself
+    :param label: of the axis; empty for the parameter's name
     """
 
-    axis: str
+    parameter: str
     levels: tuple[Level, ...]
     train: Level | None = None
-
-    def position(self, level: Level) -> int:
-        """Where a level is on the axis."""
-        return level.heterogeneity if self.axis == HETEROGENEITY else level.coordination
-
-    def at(self, positions: Collection[int]) -> View:
-        """The same with fewer levels to test at: those whose position is among the given ones."""
-        return self._replace(levels=tuple(level for level in self.levels if self.position(level) in positions))
-
-    def shows(self, train: Level, test: Level) -> bool:
-        """Whether something trained and tested at these levels belongs to it."""
-        return test in self.levels and train == (self.train or test)
+    label: str = ""
 
     @property
-    def settings(self) -> list[Setting]:
-        """What has to be trained and tested for it."""
-        if self.train is not None:
-            return [Setting(self.train, self.levels)]
-        return [Setting(level, (level,)) for level in self.levels]
+    def axis(self) -> str:
+        """Return the axis as figures name it."""
+        return self.label or self.parameter or "level"
+
+    @property
+    def suffix(self) -> str:
+        """Return where it is trained, for titles; empty where every level is trained at itself."""
+        return "" if self.train is None else f", trained at {self.train}"
+
+    def position(self, level: Level) -> Any:
+        """Return where a level is on the axis."""
+        return level.env_kwargs.get(self.parameter, "default")
+
+    def at(self, positions: Collection[str]) -> View:
+        """Return the view with fewer levels to test at: those at the given positions."""
+        return self._replace(levels=tuple(level for level in self.levels if str(self.position(level)) in positions))
 
     def __str__(self) -> str:
         levels = "; ".join(map(str, self.levels))
@@ -87,83 +88,108 @@ class View(NamedTuple):
 
 class Experiment(NamedTuple):
     """
-    One row of the paper's list.
+    A grid of methods, environments and levels.
 
     :param name: as the commands know it
     :param question: what it asks
-    :param tasks: the games
-    :param methods: algorithms as in ``--algo``
+    :param envs: environments, as ``sb3_saf.train --env`` takes them
+    :param methods: algorithms, as ``sb3_saf.train --algo`` takes them
     :param views: levels
-    :param n_agents: N where it is not the size's own
     """
 
     name: str
     question: str
-    tasks: tuple[TaskName, ...] = ()
+    envs: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
     views: tuple[View, ...] = ()
-    n_agents: int | None = None
 
     @property
     def is_grid(self) -> bool:
         """Whether there is anything to train."""
         return bool(self.views)
 
-    @property
-    def settings(self) -> list[Setting]:
-        """Each level that is trained at, once, with where it is tested."""
-        return list(dict.fromkeys(setting for view in self.views for setting in view.settings))
+    def tests(self) -> dict[Level, tuple[Level, ...]]:
+        """Return the levels to train at, each with the levels to test at."""
+        tests: dict[Level, dict[Level, None]] = {}
+        for view in self.views:
+            for level in view.levels:
+                tests.setdefault(view.train or level, {})[level] = None
+        return {train: tuple(levels) for train, levels in tests.items()}
 
-    def at(self, positions: Collection[int]) -> Experiment:
+    def at(self, positions: Collection[str]) -> Experiment:
         """
-        The part of it at some positions of its dials.
+        Return the part of it at some positions of its axes.
 
-        :param positions: such as 1, 3, 5; empty for all of it
-        :raises ValueError: for a position that none of its dials has
+        :param positions: such as 1, 3, 5, as text; empty for all of it
+        :raises ValueError: for a position that no axis has
         """
         if not positions:
             return self
-        known = sorted({view.position(level) for view in self.views for level in view.levels})
+        known = dict.fromkeys(str(view.position(level)) for view in self.views for level in view.levels)
         for position in positions:
             if position not in known:
-                raise ValueError(
-                    f"{self.name} has no level {position} on its dials; there are {', '.join(map(str, known))}"
-                )
+                raise ValueError(f"{self.name} has no level {position} on its axes; there are {', '.join(known)}")
         views = (view.at(positions) for view in self.views)
         return self._replace(views=tuple(view for view in views if view.levels))
+
+
+def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[Any]]) -> Experiment:
+    """
+    Return an experiment on any environment, with the paper's methods.
+
+    :param name: for the folder of its report
+    :param envs: environments, as ``sb3_saf.train --env`` takes them
+    :param vary: at most one parameter of the environment, with its values
+    :raises ValueError: for names or values that cannot name a folder
+    """
+    if not _PLAIN.fullmatch(name) or name in EXPERIMENTS:
+        raise ValueError(
+            f"an experiment of your own needs a name of letters, digits, '.', '_' and '-' that the paper's do not "
+            f"have, got {name!r}; write one before --env"
+        )
+    if len(vary) > 1:
+        raise ValueError(f"--vary takes one parameter, got {', '.join(vary)}; give the others with --env-kwargs")
+    views = tuple(_view(parameter, values) for parameter, values in vary.items()) or (View("", (Level(),)),)
+    return Experiment(name, f"methods on {', '.join(envs)}", tuple(envs), _METHODS, views)
+
+
+def _view(parameter: str, values: object) -> View:
+    values = values if isinstance(values, list) else [values]
+    for value in values:
+        if not isinstance(value, (bool, int, float, str)) or not _PLAIN.fullmatch(str(value)):
+            raise ValueError(f"--vary {parameter} expects numbers or words, such as {parameter}:[1,2], got {value!r}")
+    return View(parameter, tuple(Level(((parameter, value),)) for value in dict.fromkeys(values)))
 
 
 COORDINATION: Final = "coordination"
 HETEROGENEITY: Final = "heterogeneity"
 
+
+def _level(coordination: int, heterogeneity: int) -> Level:
+    return Level.of(coordination=coordination, heterogeneity=heterogeneity)
+
+
 _METHODS: Final = ("saf", "mappo", "ippo")
-_BY_COORDINATION: Final = tuple(Level(c, 1) for c in (1, 2, 3))
-_BY_HETEROGENEITY: Final = tuple(Level(1, h) for h in (1, 2, 3, 4, 5))
-_BOTH: Final = tuple(Level(level, level) for level in (2, 3, 4))
 #: Not all tasks that there are: one more must not enlarge the paper's experiments.
-_PAPER_TASKS: Final[tuple[TaskName, ...]] = ("TeamTogether", "TeamSupport", "KeyForTreasure")
-_TWO_TASKS: Final[tuple[TaskName, ...]] = ("TeamTogether", "TeamSupport")
-_COORDINATION: Final = View(COORDINATION, _BY_COORDINATION)
-_HETEROGENEITY: Final = View(HETEROGENEITY, _BY_HETEROGENEITY)
-_OOD_COORDINATION: Final = View(COORDINATION, _BY_COORDINATION, train=Level(2, 1))
-_OOD_HETEROGENEITY: Final = View(HETEROGENEITY, _BY_HETEROGENEITY, train=Level(1, 2))
+_THREE_TASKS: Final = ("TeamTogether-v0", "TeamSupport-v0", "KeyForTreasure-v0")
+_TWO_TASKS: Final = _THREE_TASKS[:2]
+_BY_COORDINATION: Final = View(COORDINATION, tuple(_level(c, 1) for c in (1, 2, 3)))
+_BY_HETEROGENEITY: Final = View(HETEROGENEITY, tuple(_level(1, h) for h in (1, 2, 3, 4, 5)))
+_BOTH: Final = View(COORDINATION, tuple(_level(n, n) for n in (2, 3, 4)), label=f"{COORDINATION} = {HETEROGENEITY}")
+_OOD_COORDINATION: Final = _BY_COORDINATION._replace(train=_level(2, 1))
+_OOD_HETEROGENEITY: Final = _BY_HETEROGENEITY._replace(train=_level(1, 2))
+_FIVE_AGENTS: Final = View(COORDINATION, (Level.of(coordination=1, heterogeneity=1, n_agents=5),))
 
 _ALL: Final = (
-    Experiment("coordination", "how hard is coordination?", _PAPER_TASKS, _METHODS, (_COORDINATION,)),
-    Experiment("heterogeneity", "how hard are zones?", _PAPER_TASKS, _METHODS, (_HETEROGENEITY,)),
-    Experiment(
-        "joint",
-        "how hard are both at once?",
-        ("TeamSupport",),
-        _METHODS,
-        (View(f"{COORDINATION} = {HETEROGENEITY}", _BOTH),),
-    ),
+    Experiment("coordination", "how hard is coordination?", _THREE_TASKS, _METHODS, (_BY_COORDINATION,)),
+    Experiment("heterogeneity", "how hard are zones?", _THREE_TASKS, _METHODS, (_BY_HETEROGENEITY,)),
+    Experiment("joint", "how hard are both at once?", ("TeamSupport-v0",), _METHODS, (_BOTH,)),
     Experiment(
         "ablation",
         "what does each part of SAF give?",
-        _PAPER_TASKS,
+        _THREE_TASKS,
         ("saf-no-pool", *_METHODS),
-        (_COORDINATION, _HETEROGENEITY),
+        (_BY_COORDINATION, _BY_HETEROGENEITY),
     ),
     Experiment("ood-coordination", "robustness to unseen coordination", _TWO_TASKS, _METHODS, (_OOD_COORDINATION,)),
     Experiment("ood-heterogeneity", "robustness to unseen heterogeneity", _TWO_TASKS, _METHODS, (_OOD_HETEROGENEITY,)),
@@ -175,12 +201,7 @@ _ALL: Final = (
         (_OOD_COORDINATION, _OOD_HETEROGENEITY),
     ),
     Experiment(
-        "qplex",
-        "does a pool help value factorisation?",
-        _PAPER_TASKS,
-        ("qplex", "qplex-pool"),
-        (View(COORDINATION, (Level(1, 1),)),),
-        n_agents=5,
+        "qplex", "does a pool help value factorisation?", _THREE_TASKS, ("qplex", "qplex-pool"), (_FIVE_AGENTS,)
     ),
     Experiment("parameters", "the parameter table"),
 )
@@ -189,7 +210,7 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 
 def find_experiment(name: str) -> Experiment:
     """
-    An experiment by name.
+    Return an experiment of the paper by name.
 
     :raises ValueError: with the nearest name that exists
     """

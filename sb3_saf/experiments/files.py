@@ -13,7 +13,7 @@ from typing import Any
 
 
 def pack(folder: Path) -> bytes:
-    """The files of a folder as one archive; models are compressed already."""
+    """Return the files of a folder as one archive; models are compressed already."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as packed:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
@@ -21,18 +21,9 @@ def pack(folder: Path) -> bytes:
     return buffer.getvalue()
 
 
-def pack_texts(files: Mapping[str, str]) -> bytes:
-    """Texts by file name as one archive."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as packed:
-        for name, text in files.items():
-            packed.writestr(name, text)
-    return buffer.getvalue()
-
-
 def unpack(archive: bytes, folder: Path) -> None:
     """
-    The opposite of :func:`pack`.
+    Write the files of :func:`pack`.
 
     :param folder: made if it is not there
     :raises ValueError: before anything is written, if a name leads out of the folder
@@ -45,23 +36,31 @@ def unpack(archive: bytes, folder: Path) -> None:
         packed.extractall(folder)
 
 
-def to_json(value: object) -> str:
-    """Readable, with a line's end."""
-    return json.dumps(value, indent=2) + "\n"
+def plain(value: Any) -> Any:
+    """Return a value as JSON gives it back: tuples are lists."""
+    return json.loads(json.dumps(value, default=str))
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """What a file holds; None if it is not there."""
+    """
+    Return what a file holds; None if it is not there.
+
+    :raises ValueError: naming the file, if it holds no JSON object
+    """
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds no JSON object")
     return content
 
 
-def plain(value: Any) -> Any:
-    """As JSON gives it back: tuples are lists."""
-    return json.loads(json.dumps(value, default=str))
+def write_json(path: Path, value: object) -> None:
+    """Write a value readably, as a whole."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -75,7 +74,7 @@ def write_text(path: Path, text: str) -> None:
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], most: int = 3) -> str:
     """
-    What differs between two mappings, with dotted names.
+    Return what differs between two mappings, with dotted names.
 
     :param most: named differences
     """

@@ -1,25 +1,26 @@
-"""A report's Markdown page."""
+"""A report's Markdown page: means, losses, aggregates, comparisons, and how to make them again."""
 
 from __future__ import annotations
 
+import math
 import shlex
-from collections.abc import Sequence
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
 
 import pandas as pd
 
-from sb3_saf.experiments.cells import Cell, LeftOut, Protocol
-from sb3_saf.experiments.definitions import RANDOM, Experiment
-from sb3_saf.experiments.files import write_text
-from sb3_saf.experiments.options import PROGRAM
-from sb3_saf.experiments.page_tables import aggregates, comparisons, losses, means, numbers
-from sb3_saf.experiments.results import FAILED, Results
+from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Experiment, Level, View
+from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
+from sb3_saf.experiments.results import Results
+from sb3_saf.experiments.tables import FEWEST_SEEDS, compare, complete, of_view, strata
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
+from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
+PROGRAM: Final = "python -m sb3_saf.experiments"
 #: Missing cells that are named.
-_MOST_NAMED = 20
+_MOST_NAMED: Final = 20
+_NOTHING: Final = "–"
 
 
 class Content(NamedTuple):
@@ -27,121 +28,273 @@ class Content(NamedTuple):
     What a page is about.
 
     :param experiment: the experiment
-    :param protocol: how its cells were trained and tested
+    :param config: how its cells were trained and tested
     :param results: where they are
     :param cells: all that were asked for
     :param missing: those that are not finished
     :param left_out: levels that do not fit the size
-    :param table: columns of ``Row``
-    :param figures: pictures beside the page
+    :param table: of tests, see ``tables``
+    :param figures: names of the pictures beside the page
     """
 
     experiment: Experiment
-    protocol: Protocol
+    config: RunConfig
     results: Results
     cells: Sequence[Cell]
     missing: Sequence[Cell]
     left_out: Sequence[LeftOut]
     table: pd.DataFrame
-    figures: Sequence[Path]
+    figures: Sequence[str]
 
 
-def write_page(content: Content, path: Path) -> Path:
-    """Write the page."""
+def page(content: Content) -> str:
+    """Return the page."""
+    views, table = content.experiment.views, content.table
     sections = [
         _head(content),
         _missing(content),
         _pictures(content, "levels-", "aggregates"),
-        *(means(content.table, view) for view in content.experiment.views),
-        *(losses(content.table, view) for view in content.experiment.views),
-        aggregates(content.experiment, content.table),
-        *(comparisons(content.table, view) for view in content.experiment.views),
+        *(means(table, view) for view in views),
+        *(losses(table, view) for view in views),
+        aggregates(content.experiment, table),
+        *(comparisons(table, view) for view in views),
         _pictures(content, "curve-"),
         _reproduction(content),
     ]
-    write_text(path, "\n\n".join(section for section in sections if section) + "\n")
-    return path
+    return "\n\n".join(section for section in sections if section) + "\n"
 
 
 def _head(content: Content) -> str:
-    experiment, protocol, table = content.experiment, content.protocol, content.table
+    experiment, config, table = content.experiment, content.config, content.table
     trained = table[table["method"] != RANDOM]
     methods = list(dict.fromkeys(trained["method"]))
     steps = " or ".join(f"{count:,}" for count in sorted(trained["game_steps"].unique()))
-    actions = "their most likely actions" if protocol.deterministic else "sampled actions"
-    if not protocol.deterministic and not all(ALGOS[method].draws_actions for method in methods):
+    actions = "their most likely actions" if config.deterministic else "sampled actions"
+    if not config.deterministic and not all(ALGOS[method].draws_actions for method in methods):
         actions += " (the best ones of methods that learn values)"
+    of_treasures = table["max_return"].notna().all()
+    treasures = f", {_numbers(table['max_return'])} treasures" if of_treasures else ""
+    meaning = "a team return (treasures collected)" if of_treasures else "a team return (rewards of all agents)"
     lines = [
         f"# {experiment.name}: {experiment.question}",
         "",
-        f"Size `{protocol.size}`: {numbers(table['n_agents'])} agents, {numbers(table['n_treasures'])} treasures, "
-        f"{steps} game steps of training. {', '.join(methods) or 'No method'} and a random team, seeds "
-        f"{numbers(table['seed'])}. Each number is a team return (treasures collected) over {protocol.episodes} "
-        f"episodes with {actions}, in games that no run trains on and that are the same for all methods of a seed.",
+        f"Size `{config.size}`: {_numbers(table['n_agents'])} agents{treasures}, {steps} game steps of training. "
+        f"{', '.join(methods) or 'No method'} and a random team, seeds {_numbers(table['seed'])}. Each number is "
+        f"{meaning} over {config.episodes} episodes with {actions}, in games that no run trains on and that are the "
+        "same for all methods of a seed.",
     ]
-    if protocol.overrides:
-        lines += ["", f"Settings in the place of the zoo's: `{dict(protocol.overrides)}`."]
+    if config.overrides:
+        lines += ["", f"Settings in the place of those of `zoo_configs`: `{dict(config.overrides)}`."]
     return "\n".join(lines)
 
 
+def _numbers(column: pd.Series) -> str:
+    """Return the different whole numbers of a column, in order."""
+    return ", ".join(str(int(value)) for value in sorted(column.unique()))
+
+
 def _missing(content: Content) -> str:
+    results = content.results
     lines = [f"- {left_out}" for left_out in content.left_out]
     if content.missing:
         lines.append(
             f"- **{len(content.missing)} of {len(content.cells)} cells are missing**; numbers below lack them:"
         )
         for cell in content.missing[:_MOST_NAMED]:
-            failed = content.results.status(cell).get("state") == FAILED
-            why = f"failed, see `{content.results.cell_folder(cell) / 'error.txt'}`" if failed else "not run yet"
-            lines.append(f"  - {cell}: {why}")
+            failure = results.failure(cell)
+            lines.append(f"  - {cell}: {'not run yet' if failure is None else f'failed, see `{failure}`'}")
         if len(content.missing) > _MOST_NAMED:
             lines.append(f"  - and {len(content.missing) - _MOST_NAMED} more")
+    lines += [f"- damaged: {error}" for error in results.damaged.values()]
     return "\n".join(["## What is missing", "", *lines]) if lines else ""
 
 
 def _pictures(content: Content, *prefixes: str) -> str:
-    names = [path.name for path in content.figures if path.name.startswith(prefixes)]
+    names = [name for name in content.figures if name.startswith(prefixes)]
     heading = "## Learning curves\n\nMean and 95 % interval over seeds, returns of the training episodes.\n\n"
     pictures = "\n\n".join(f"![{name.removesuffix('.png')}]({name})" for name in names)
     return (heading if "curve-" in prefixes else "") + pictures if names else ""
 
 
+def _table(head: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table."""
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *body)]
+
+
+def _show(estimate: Estimate, digits: int = 2) -> str:
+    """Return an estimate as text; the interval only if there is one."""
+    value = f"{estimate.value:.{digits}f}"
+    if math.isnan(estimate.low):
+        return value
+    return f"{value} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+
+
+def means(table: pd.DataFrame, view: View) -> str:
+    """Return mean returns: a table for each task, a column for each level."""
+    rows = of_view(table, view)
+    if rows.empty:
+        return ""
+    levels = [level for level in view.levels if level.slug in set(rows["level"])]
+    parts = [f"## Team return by {view.axis}{view.suffix}", "", "Mean over seeds, 95 % interval (Student's t).", ""]
+    for task, of_task in rows.groupby("task", sort=False):
+        body = []
+        for method, of_method in of_task.groupby("method", sort=False):
+            by_level = [of_method.loc[of_method["level"] == level.slug, "return_mean"] for level in levels]
+            counts = sorted({len(values) for values in by_level if len(values)})
+            body.append([str(method), *map(_mean, by_level), " or ".join(map(str, counts))])
+        parts += [*_table([f"{task}", *map(str, levels), "seeds"], body), ""]
+    return "\n".join(parts).rstrip()
+
+
+def _mean(values: pd.Series) -> str:
+    return _NOTHING if values.empty else _show(mean_over_seeds(values.to_numpy()))
+
+
+def losses(table: pd.DataFrame, view: View) -> str:
+    """Return what harder levels cost: the share of the first level's return that is lost, seed by seed."""
+    rows = of_view(table, view)
+    first, *harder = view.levels
+    harder = [level for level in harder if level.slug in set(rows["level"])]
+    if view.train is not None or not harder:
+        return ""
+    body = []
+    for task, of_task in rows.groupby("task", sort=False):
+        for method, of_method in of_task.groupby("method", sort=False):
+            easy, *hard = (_by_seed(of_method, level) for level in (first, *harder))
+            body.append([str(task), str(method), *(_loss(easy, each) for each in hard)])
+    text = (
+        f"Share of the return at {first} that is lost, in percent: mean over seeds of each seed's own loss, 95 % "
+        f"interval (Student's t). {_NOTHING} where a seed has no return at {first} to lose."
+    )
+    return "\n".join([f"## Loss by {view.axis}", "", text, "", *_table(["task", "", *map(str, harder)], body)])
+
+
+def _by_seed(rows: pd.DataFrame, level: Level) -> pd.DataFrame:
+    return rows.loc[rows["level"] == level.slug, ["seed", "return_mean"]]
+
+
+def _loss(easy: pd.DataFrame, hard: pd.DataFrame) -> str:
+    pairs = easy.merge(hard, on="seed", suffixes=("_easy", "_hard"))
+    if pairs.empty or not (pairs["return_mean_easy"] > 0).all():
+        return _NOTHING
+    share = pairs["return_mean_hard"] / pairs["return_mean_easy"]
+    return _show(mean_over_seeds((100 * (1 - share)).to_numpy()), digits=0)
+
+
+def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
+    """Return interquartile means over the tasks, for each level and over everything."""
+    common = complete(strata(experiment, table))
+    if common.empty:
+        return "## Aggregates\n\nNone yet: the methods have no seed in common on the same settings."
+    of_treasures = common["max_return"].notna().all()
+    what = "the share of treasures collected" if of_treasures else "the place in the range of all returns on a setting"
+    text = (
+        f"Interquartile mean of {what}, over tasks and the seeds {_numbers(common['seed'])}, which all methods have; "
+        "95 % stratified bootstrap intervals (rliable)."
+    )
+    parts = ["## Aggregates", "", text, ""]
+    methods = list(dict.fromkeys(common["method"]))
+    for view in experiment.views:
+        columns = {str(level): found for level in view.levels if (found := _of_level(common, view, level))}
+        if columns:
+            parts += [*_estimates([f"by {view.axis}{view.suffix}", *columns], methods, columns.values()), ""]
+    over_all = interquartile_means(score_matrices(common, "stratum"))
+    return "\n".join([*parts, *_estimates(["over everything", "all"], methods, [over_all])])
+
+
+def _of_level(common: pd.DataFrame, view: View, level: Level) -> dict[str, Estimate]:
+    """Return interquartile means at one level; empty if nothing is known of it."""
+    rows = of_view(common, view)
+    rows = rows[rows["level"] == level.slug].drop_duplicates(["method", "seed", "task"])
+    return {} if rows.empty else interquartile_means(score_matrices(rows, "task"))
+
+
+def _estimates(head: Sequence[str], methods: Iterable[str], columns: Iterable[Mapping[str, Estimate]]) -> list[str]:
+    found = list(columns)
+    return _table(head, [[method, *(_show(column[method], 3) for column in found)] for method in methods])
+
+
+def comparisons(table: pd.DataFrame, view: View) -> str:
+    """Return the first method against each other one, seed by seed."""
+    rows = of_view(table, view)
+    methods = list(dict.fromkeys(rows["method"]))
+    if len(methods) < 2:
+        return ""
+    ours = "saf" if "saf" in methods else methods[0]
+    body = list(_compared(rows, view, ours, [method for method in methods if method != ours]))
+    head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", f"{ours} is"]
+    text = (
+        "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
+        f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than "
+        f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner "
+        "by chance now and then."
+    )
+    return "\n".join([f"## Paired comparisons by {view.axis}{view.suffix}", "", text, "", *_table(head, body)])
+
+
+def _compared(rows: pd.DataFrame, view: View, ours: str, others: Sequence[str]) -> Iterator[list[str]]:
+    names = {level.slug: str(level) for level in view.levels}
+    for (task, level), here in rows.groupby(["task", "level"], sort=False):
+        for other in others:
+            first, second = (here.loc[here["method"] == method, ["seed", "return_mean"]] for method in (ours, other))
+            found = compare(first, second)
+            if found is not None:
+                numbers = [_show(found.first), _show(found.second), _show(found.difference)]
+                yield [str(task), names[level], other, ", ".join(map(str, found.seeds)), *numbers, found.verdict]
+
+
 def _reproduction(content: Content) -> str:
     folder = content.results.folder
+    experiment = content.results.experiment(content.experiment.name)  # with all levels
     lines = ["## Run it again", "", "```sh"]
-    for request in content.results.requests(content.experiment.name):
-        words = [*PROGRAM.split(), "run", content.experiment.name, *_protocol_words(content.protocol)]
-        for option in ("seeds", "methods", "tasks", "levels"):
-            if values := getattr(request, option):
-                words += [f"--{option}", *map(str, values)]
+    for selection in content.results.selections(experiment.name):
+        words = [*PROGRAM.split(), "run", *experiment_words(experiment), *config_words(content.config)]
+        words += ["--seeds", *map(str, selection.seeds)]
+        for option, values in (("methods", selection.methods), ("levels", selection.levels)):
+            words += [f"--{option}", *values] if values else []
+        if experiment.name in EXPERIMENTS and selection.envs:
+            words += ["--tasks", *(env.removesuffix("-v0") for env in selection.envs)]
         lines.append(f"{shlex.join(words)} -f {shlex.quote(str(folder))}")
-    lines += [f"{PROGRAM} report {content.experiment.name} -f {shlex.quote(str(folder))}", "```", ""]
-    lines.append(f"Every cell by itself (`{folder}/cells/*/*/*/command.txt`):")
+    lines += [f"{PROGRAM} report {experiment.name} -f {shlex.quote(str(folder))}", "```", ""]
+    lines.append(
+        f"`{PROGRAM} check {folder}/cells/TASK-LEVEL/METHOD/seed-N` runs a cell again and compares. Each cell:"
+    )
     commands = [content.results.cell_folder(cell) / "command.txt" for cell in content.cells]
     texts = [path.read_text(encoding="utf-8").strip() for path in commands if path.exists()]
     lines += ["", "<details><summary>Commands</summary>", "", "```sh", *texts, "```", "", "</details>"]
     return "\n".join([*lines, "", _versions(content)])
 
 
-def _protocol_words(protocol: Protocol) -> list[str]:
-    """The options that make a protocol."""
-    overrides = dict(protocol.overrides)
-    words = ["--size", protocol.size]
+def experiment_words(experiment: Experiment) -> list[str]:
+    """Return the words of a command line that name an experiment."""
+    if experiment.name in EXPERIMENTS:
+        return [experiment.name]
+    words = [experiment.name, "--env", *experiment.envs]
+    (view,) = experiment.views
+    if view.parameter:
+        words += option_words("--vary", {view.parameter: [view.position(level) for level in view.levels]})
+    return words
+
+
+def config_words(config: RunConfig) -> list[str]:
+    """Return the options of a command line that make a configuration."""
+    overrides = dict(config.overrides)
+    words = ["--size", config.size]
     if "game_steps" in overrides:
         words += ["--game-steps", str(overrides.pop("game_steps"))]
     words += option_words("--env-kwargs", overrides.pop("env_kwargs", {}))
     words += option_words("--hyperparams", overrides)
-    if protocol.episodes != Protocol(protocol.size).episodes:
-        words += ["--episodes", str(protocol.episodes)]
-    return words + ["--deterministic"] * protocol.deterministic
+    if config.episodes != RunConfig(config.size).episodes:
+        words += ["--episodes", str(config.episodes)]
+    return words + ["--deterministic"] * config.deterministic
 
 
 def _versions(content: Content) -> str:
-    """What the cells ran on; more than one line is worth a look."""
+    """Return what the cells ran on; more than one line is worth a look."""
     found: dict[str, set[str]] = {}
     for cell in content.cells:
         for name, version in content.results.versions(cell).items():
-            found.setdefault(name, set()).add(version)
+            found.setdefault(name, set()).add(str(version))
     lines = [f"{name} {' and '.join(sorted(versions))}" for name, versions in found.items() if name != "host"]
     mixed = [name for name, versions in found.items() if len(versions) > 1 and name not in ("host", "commit")]
     warning = f" **Cells differ in {', '.join(mixed)}.**" if mixed else ""

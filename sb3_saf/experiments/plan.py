@@ -1,64 +1,55 @@
-"""What a run would cost, before it runs."""
+"""What an experiment consists of, and what is left to do."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
-from sb3_saf.experiments.cells import Cell, Choice, Protocol, expand
 from sb3_saf.experiments.definitions import Experiment
-from sb3_saf.experiments.measure import Measurement, measure
+from sb3_saf.experiments.grid import Cell, RunConfig, Selection, expand
 from sb3_saf.experiments.results import Results
 
 _UNITS: Final = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
-def make_plan(
-    experiment: Experiment,
-    choice: Choice,
-    protocol: Protocol,
-    results: Results,
-    *,
-    workers: int,
-    threads: int,
-    device: str,
-    rate: float | None,
-) -> str:
-    """
-    The number of cells, game steps, time and memory, as text.
-
-    :param workers: cells at the same time
-    :param threads: of each worker
-    :param device: as SB3 takes it
-    :param rate: game steps per second of one worker; None to measure
-    """
-    grid = expand(experiment, choice, protocol)
-    results.agree_on(grid.cells, protocol)
+def make_plan(experiment: Experiment, selection: Selection, config: RunConfig, results: Results) -> str:
+    """Return the cells, the game steps and, once cells are finished, the time that is left, as text."""
+    grid = expand(experiment, selection, config)
+    results.agree(config, grid.cells)
     trained = [cell for cell in grid.cells if cell.is_trained]
-    todo = [cell for cell in trained if not results.is_finished(cell)]
+    finished = [cell for cell in trained if results.is_finished(cell)]
+    steps = {cell.id: config.settings(cell).game_steps for cell in trained}
+    left = sum(steps.values()) - sum(steps[cell.id] for cell in finished)
     n_tests = sum(len(results.missing_tests(cell)) for cell in grid.cells)
+    each = " or ".join(f"{count:,}" for count in sorted(set(steps.values())))
     lines = [
-        f"{experiment.name}, size {protocol.size}: {experiment.question}",
-        f"cells       {len(trained)} to train ({_factors(trained)}); {len(trained) - len(todo)} of them are finished",
-        f"tests       {n_tests} to play, of {protocol.episodes} team episodes each, random teams included",
+        f"{experiment.name}, size {config.size}: {experiment.question}",
+        *_settings(trained),
         *(f"left out    {left_out}" for left_out in grid.left_out),
+        f"cells       {len(trained)} to train ({_factors(trained)}), {len(finished)} of them finished",
+        f"tests       {n_tests} to play, of {config.episodes} team episodes each, random teams included",
+        f"game steps  {left:,} left of {sum(steps.values()):,} ({each} a cell)",
     ]
-    game_steps = {cell.id: protocol.settings(cell).game_steps for cell in todo}
-    if not todo:
-        return "\n".join([*lines, "time        nothing is left to train"])
-    lines.append(f"game steps  {sum(game_steps.values()):,} ({' or '.join(_counts(game_steps))} a cell)")
-    if rate is not None:
-        lines.append(f"rate        {rate:,.0f} game steps/s for each worker, as given")
-        rates = dict.fromkeys((cell.method for cell in todo), rate)
-        return "\n".join([*lines, _time(todo, game_steps, rates, workers)])
-    measured = _measured(todo, protocol, threads, device)
-    lines += [f"measured    {measurement}" for measurement in measured]
-    rates = {measurement.method: measurement.rate for measurement in measured}
-    return "\n".join([*lines, _time(todo, game_steps, rates, workers), _memory(measured, len(todo), workers)])
+    seconds = sum(status["wall_seconds"] for cell in finished if (status := results.status(cell)) is not None)
+    if seconds:
+        rate = sum(steps[cell.id] for cell in finished) / seconds
+        lines.append(f"rate        {rate:,.0f} game steps/s of one worker in the finished cells")
+        lines.append(f"time        about {duration(left / rate)} of one worker at this rate" if left else "")
+    return "\n".join(line for line in lines if line)
+
+
+def _settings(cells: Sequence[Cell]) -> Iterator[str]:
+    """Yield a line for each setting, with the methods and seeds that are trained in it."""
+    for task, level, tests in dict.fromkeys((cell.task, cell.level, cell.tests) for cell in cells):
+        here = [cell for cell in cells if (cell.task, cell.level) == (task, level)]
+        methods = " ".join(dict.fromkeys(cell.method for cell in here))
+        seeds = " ".join(str(seed) for seed in dict.fromkeys(cell.seed for cell in here))
+        tested = "" if tests == (level,) else f", tested at {'; '.join(map(str, tests))}"
+        yield f"            {task}, {level}{tested}: {methods}, seeds {seeds}"
 
 
 def _factors(cells: Sequence[Cell]) -> str:
-    """What a number of cells is made of."""
+    """Return what a number of cells is made of."""
     counts: dict[str, set[object]] = {
         "methods": {cell.method for cell in cells},
         "settings": {(cell.task, cell.level) for cell in cells},
@@ -67,42 +58,8 @@ def _factors(cells: Sequence[Cell]) -> str:
     return " x ".join(f"{len(values)} {name}" for name, values in counts.items())
 
 
-def _counts(game_steps: Mapping[str, int]) -> list[str]:
-    return [f"{count:,}" for count in sorted(set(game_steps.values()))]
-
-
-def _measured(todo: Sequence[Cell], protocol: Protocol, threads: int, device: str) -> list[Measurement]:
-    """One measurement for each method, at its first setting: the levels cost the same."""
-    first = {cell.method: cell for cell in reversed(todo)}
-    return [measure(cell, protocol, threads, device) for cell in reversed(first.values())]
-
-
-def _time(todo: Sequence[Cell], game_steps: Mapping[str, int], rates: Mapping[str, float], workers: int) -> str:
-    """
-    The time of all trainings, divided among workers.
-
-    Tests are left out: at the paper's size they are some thousandths of it.
-    """
-    seconds = [game_steps[cell.id] / rates[cell.method] for cell in todo]
-    together = max(sum(seconds) / workers, *seconds)
-    each = " to ".join(dict.fromkeys((_duration(min(seconds)), _duration(max(seconds)))))
-    return (
-        f"time        about {_duration(together)} with {workers} worker{'s' * (workers > 1)} of this speed, each with "
-        f"cores of its own ({each} a cell, {_duration(sum(seconds))} in all)"
-    )
-
-
-def _memory(measured: Sequence[Measurement], n_cells: int, workers: int) -> str:
-    largest = max(measurement.megabytes for measurement in measured)
-    at_once = min(workers, n_cells)
-    return (
-        f"memory      about {at_once * largest / 1000:.1f} GB, {largest / 1000:.1f} GB for each of {at_once} workers "
-        "(measured, extrapolated to all games; without a GPU's own)"
-    )
-
-
-def _duration(seconds: float) -> str:
-    """Two units at most: 2 d 3 h."""
+def duration(seconds: float) -> str:
+    """Return a time in two units at most: 2 d 3 h."""
     left = max(1, round(seconds))
     parts = []
     for unit, size in _UNITS:

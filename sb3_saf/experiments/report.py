@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from sb3_saf.experiments.cells import Cell, Choice
-from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
-from sb3_saf.experiments.frames import frame_of_curves, frame_of_tests
-from sb3_saf.experiments.page import Content, write_page
+from sb3_saf.experiments.definitions import RANDOM, Experiment
+from sb3_saf.experiments.grid import Cell, RunConfig, Selection
+from sb3_saf.experiments.page import Content, page
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.selection import complete, of_view, strata
-from sb3_saf.experiments.table import requested, rows, write_table
-from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_levels
-from sb3_saf.training.statistics import score_matrices
+from sb3_saf.experiments.tables import (
+    complete,
+    frame_of_curves,
+    frame_of_tests,
+    of_view,
+    requested,
+    strata,
+    write_table,
+)
+from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_levels
+from sb3_saf.training.statistics import require_columns, score_matrices
+
+#: Columns of a file of reference teams; all others are parameters of the environment.
+_SCALE_COLUMNS: Final = ("task", "name", "mean", "low", "high")
+_AGAINST_STEPS: Final = "against game steps"
+_AGAINST_TIME: Final = "against processor time"
 
 
 class Report(NamedTuple):
@@ -35,87 +49,136 @@ class Report(NamedTuple):
     n_cells: int
 
 
-def write_report(experiment: Experiment, results: Results, wanted: Choice) -> Report:
+def write_report(
+    experiment: Experiment, results: Results, wanted: Selection, scale: pd.DataFrame | None = None
+) -> Report:
     """
-    Draw and write what is there of an experiment, complete or not.
+    Draw and write what is there of an experiment, complete or not. The old report stays until the new one is complete.
 
-    :param wanted: the seeds, methods, tasks and levels to show; empty ones for all that were run
+    :param wanted: the seeds, methods, environments and levels to show; empty ones for all that were run
+    :param scale: returns of reference teams, from :func:`read_scale`
     :raises ValueError: if nothing is finished
     """
-    protocol = results.protocol()
-    assert protocol is not None
+    config = results.config()
+    assert config is not None
     asked, shown = requested(experiment, results), experiment.at(wanted.levels)
-    cells = [cell for cell in asked.cells if _is_wanted(cell, wanted, shown)]
-    finished = rows(results, cells)
-    if not finished:
+    cells = [cell for cell in asked.cells if wanted.has(cell, experiment)]
+    table, curves = frame_of_tests(results, cells), frame_of_curves(results, cells)
+    if table.empty:
         raise ValueError(f"{results.folder} has no finished cell of {experiment.name!r} among those to be shown")
-    folder = results.folder / experiment.name
-    write_table(experiment, results)
-    table = frame_of_tests(finished)
-    curves = frame_of_curves(results, cells)
-    figures = [
-        *_draw_views(shown, table, folder),
-        *_draw_aggregates(shown, table, folder),
-        *_draw_curves(shown, curves, table, folder),
-    ]
+    drawer = _Drawer(shown, table, curves, _references(scale, cells, config))
+    figures = {**drawer.views(), **drawer.aggregates(), **drawer.curves()}
     missing = [cell for cell in cells if results.missing_tests(cell)]
-    content = Content(shown, protocol, results, cells, missing, asked.left_out, table, figures)
-    return Report(write_page(content, folder / "report.md"), figures, missing, len(cells))
+    content = Content(shown, config, results, cells, missing, asked.left_out, table, list(figures))
+    folder = results.folder / experiment.name
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as name:
+        fresh = Path(name)
+        for file, figure in figures.items():
+            figure.savefig(fresh / file)
+        (fresh / "report.md").write_text(page(content), encoding="utf-8")
+        for file in (*figures, "report.md"):
+            os.replace(fresh / file, folder / file)
+    write_table(experiment, results)
+    return Report(folder / "report.md", [folder / file for file in figures], missing, len(cells))
 
 
-def _is_wanted(cell: Cell, wanted: Choice, shown: Experiment) -> bool:
-    """Whether a cell is to be shown; the random team always is, on what is."""
-    levels = {level for train, tests in shown.settings for level in ((train,) if cell.is_trained else tests)}
-    return (
-        (not wanted.seeds or cell.seed in wanted.seeds)
-        and (not wanted.tasks or cell.task in wanted.tasks)
-        and (not wanted.methods or cell.method in wanted.methods or not cell.is_trained)
-        and cell.level in levels
-    )
+def read_scale(path: Path) -> pd.DataFrame:
+    """
+    Return the returns of reference teams: columns ``task``, ``name``, ``mean`` and parameters of the environment.
+
+    :raises ValueError: if the file has other columns
+    """
+    try:
+        scale = pd.read_csv(path)
+        require_columns(scale, ("task", "name", "mean"))
+        return scale.astype({"task": str, "name": str, "mean": float})
+    except ValueError as error:
+        raise ValueError(f"{path} is no file of reference teams: {error}") from None
 
 
-def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path)
-    return path
+def _references(scale: pd.DataFrame | None, cells: Iterable[Cell], config: RunConfig) -> pd.DataFrame:
+    """Return the reference teams of the levels of some cells: columns ``task``, ``level``, ``name``, ``mean``."""
+    found = []
+    if scale is not None:
+        parameters = [name for name in scale.columns if name not in _SCALE_COLUMNS]
+        for env, level in dict.fromkeys((cell.env, level) for cell in cells for level in cell.tests):
+            cell = Cell(RANDOM, env, level, 0)
+            here = config.settings(cell).env_kwargs
+            rows = scale[scale["task"] == cell.task]
+            for name in parameters:
+                rows = rows[rows[name] == here.get(name)]
+            found += [(cell.task, level.slug, row["name"], row["mean"]) for _, row in rows.iterrows()]
+    return pd.DataFrame(found, columns=["task", "level", "name", "mean"])
 
 
-def _draw_views(experiment: Experiment, table: pd.DataFrame, folder: Path) -> list[Path]:
-    """One bar chart for each dial."""
-    paths = []
-    for view in experiment.views:
-        shown = of_view(table, view)
-        if shown.empty:
-            continue
-        trained = "" if view.train is None else f", trained at {view.train}"
-        drawn = shown.assign(score=shown["return_mean"])
-        figure = draw_levels(drawn, view.axis, title=f"{experiment.name}{trained}", panel="task")
-        paths.append(_save(figure, folder / f"levels-{view.axis.replace(' = ', '-')}.png"))
-    return paths
+class _Drawer:
+    """Figures of an experiment, by the names of their files."""
+
+    def __init__(self, experiment: Experiment, table: pd.DataFrame, curves: pd.DataFrame, scale: pd.DataFrame) -> None:
+        self._experiment, self._table, self._curves = experiment, table, curves
+        known = set(table["method"])
+        self._scale = scale[~scale["name"].isin(known)]
+        self._is_hecogrid = bool(table["max_return"].notna().all())
+        self._y_label = TEAM_RETURN if self._is_hecogrid else "team return"
+
+    def views(self) -> dict[str, Figure]:
+        """Return one bar chart for each axis of levels, with reference teams beside the methods."""
+        figures = {}
+        for view in self._experiment.views:
+            shown = of_view(self._table, view)
+            if shown.empty:
+                continue
+            positions = {level.slug: view.position(level) for level in view.levels}
+            here = self._scale[self._scale["level"].isin(positions) & self._scale["task"].isin(set(shown["task"]))]
+            reference = here.rename(columns={"name": "method", "mean": "score"})
+            reference = reference.assign(seed=0, **{view.axis: reference["level"].map(positions)})
+            columns = ["task", "method", "seed", "score", view.axis]
+            rows = _together(shown.assign(score=shown["return_mean"])[columns], reference[columns])
+            title = f"{self._experiment.name}{view.suffix}"
+            figures[f"levels-{view.axis.replace(' = ', '-')}.png"] = draw_levels(
+                rows, view.axis, title=title, panel="task", y_label=self._y_label
+            )
+        return figures
+
+    def aggregates(self) -> dict[str, Figure]:
+        """Return interquartile means and performance profiles over everything that all methods have."""
+        common = complete(strata(self._experiment, self._table))
+        if common.empty:
+            return {}
+        seeds = ", ".join(map(str, sorted(common["seed"].unique())))
+        title = f"{self._experiment.name}: {common['stratum'].nunique()} settings, seeds {seeds}"
+        label = "treasures collected (share)" if self._is_hecogrid else "normalised return"
+        return {"aggregates.png": draw_aggregates(score_matrices(common, "stratum"), title=title, x_label=label)}
+
+    def curves(self) -> dict[str, Figure]:
+        """Return the learning curves of each setting that was trained at, against game steps and processor time."""
+        figures: dict[str, Figure] = {}
+        if self._curves.empty:
+            return figures
+        names = {level.slug: str(level) for level in self._experiment.tests()}
+        for (task, level), runs in self._curves.groupby(["task", "level"], sort=False):
+            here = (self._table["task"] == task) & (self._table["level"] == level)
+            random = self._table[here & (self._table["method"] == RANDOM)]
+            random = random[["method", "seed", "return_mean"]].rename(columns={"return_mean": "score"})
+            panels = []
+            for name, x in ((_AGAINST_STEPS, "game_steps"), (_AGAINST_TIME, "processor_seconds")):
+                of_methods = runs[["method", "seed", "score"]].assign(game_steps=runs[x])
+                ends = pd.DataFrame({"game_steps": [runs[x].min(), runs[x].max()]})
+                panels.append(_together(of_methods, random.merge(ends, how="cross")).assign(panel=name))
+            scale = self._scale[(self._scale["task"] == task) & (self._scale["level"] == level)]
+            figure = draw_curves(
+                pd.concat(panels, ignore_index=True),
+                title=f"{self._experiment.name}: {task}, {names[level]}",
+                panel="panel",
+                y_label=self._y_label,
+                references=dict(zip(scale["name"], scale["mean"], strict=True)),
+            )
+            figure.axes[1].set_xlabel("processor time of the training (s)")
+            slug = str(task).replace(":", "-")
+            figures[f"curve-{slug}-{level}.png"] = figure
+        return figures
 
 
-def _draw_aggregates(experiment: Experiment, table: pd.DataFrame, folder: Path) -> list[Path]:
-    """Interquartile means and performance profiles over everything that all methods have."""
-    common = complete(strata(experiment, table))
-    if common.empty:
-        return []
-    seeds = ", ".join(map(str, sorted(common["seed"].unique())))
-    title = f"{experiment.name}: {common['stratum'].nunique()} settings, seeds {seeds}"
-    figure = draw_aggregates(score_matrices(common, "stratum"), title=title, x_label="treasures collected (share)")
-    return [_save(figure, folder / "aggregates.png")]
-
-
-def _draw_curves(experiment: Experiment, curves: pd.DataFrame, table: pd.DataFrame, folder: Path) -> list[Path]:
-    """One figure for each setting that was trained at, with the random team as a line."""
-    paths: list[Path] = []
-    if curves.empty:
-        return paths
-    for (task, *dials), runs in curves.groupby(["task", *Level._fields], sort=False):
-        level = Level(*dials)
-        at_level = (table["coordination"] == level.coordination) & (table["heterogeneity"] == level.heterogeneity)
-        random = table[(table["method"] == RANDOM) & (table["task"] == task) & at_level]
-        steps = pd.DataFrame({"game_steps": [runs["game_steps"].min(), runs["game_steps"].max()]})
-        line = random[["method", "seed", "return_mean"]].rename(columns={"return_mean": "score"})
-        together = pd.concat([runs, line.merge(steps, how="cross")], ignore_index=True)
-        figure = draw_curves(together, title=f"{experiment.name}: {task}, {level}")
-        paths.append(_save(figure, folder / f"curve-{task}-{level.slug}.png"))
-    return paths
+def _together(*tables: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of all tables that have any: pandas warns of others."""
+    return pd.concat([table for table in tables if not table.empty], ignore_index=True)

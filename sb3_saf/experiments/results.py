@@ -1,247 +1,239 @@
 """
-The folder of results. One cell is one folder, which appears at once and complete, or not at all.
+The folder of results. A finished cell is one folder, which appears at once and complete.
 
-    settings.json                    the protocol, the same for every cell
+    settings.json                    what is the same for every cell
     cells/TeamTogether-c2-h1/saf/seed-0/
-        config.json                  everything that decides the result, but the seed
+        cell.json  config.json       what was trained; everything that decides the result
         command.txt                  trains it again
-        versions.json  status.json   what it ran on; how it ended and what it cost
+        versions.json  status.json   commit and software; what it cost
         curve.csv  model.zip         returns of the training episodes; the model
         tests/c2-h1.json             returns of the test episodes
-        error.txt                    in the place of all this for a cell that failed
-    unfinished/                          checkpoints of cells that are at work, or were killed at it
-    coordination/requests/*.json     what somebody asked for, so that a report knows what is missing
+    unfinished/TeamTogether-c2-h1/saf/seed-1/
+        job.json  training/          what to do; checkpoints and monitor of the training
+        error.txt  log.txt           why the last attempt failed
+    coordination/experiment.json     an experiment of one's own
+    coordination/selections/*.json   what was asked for, so that a report knows what is missing
     coordination/table.csv           one row per cell and test level, made from the cells
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any, Final
 
 import filelock
 
-from sb3_saf.experiments.cells import Cell, Choice, Protocol, Shard
-from sb3_saf.experiments.definitions import Level
-from sb3_saf.experiments.files import differences, pack_texts, plain, read_json, to_json, unpack, write_text
+from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, Level, find_experiment, own_experiment
+from sb3_saf.experiments.files import differences, plain, read_json, write_json
+from sb3_saf.experiments.grid import Cell, RunConfig, Selection
 
-FINISHED: Final = "finished"
-FAILED: Final = "failed"
+Types = Mapping[str, type | tuple[type, ...]]
+
+#: What must be in files for them to be ours.
+_SETTINGS: Final[Types] = {"size": str, "overrides": dict, "episodes": int, "deterministic": bool}
+_STATUS: Final[Types] = {"wall_seconds": float, "processor_seconds": float}
+_SELECTION: Final[Types] = {"seeds": list, "methods": list, "envs": list, "levels": list}
+_TEST: Final[Types] = {
+    **{"level": dict, "n_agents": int, "max_return": (int, type(None)), "evaluation_seed": int},
+    **{"returns": list, "return_mean": float, "return_low": float, "return_high": float, "wall_seconds": float},
+}
 
 
 class Results:
     """
-    A folder of results.
+    A folder of results. A file in it that is damaged counts as not there, and is noted.
 
     :param folder: made when something is written
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        #: Unfinished files, on the same disk, so that a rename moves them; nothing there is a result.
-        self.scratch = folder / "scratch"
+        #: What is wrong with damaged files, by file.
+        self.damaged: dict[Path, str] = {}
 
-    # The protocol
+    def _read(self, path: Path, types: Types) -> dict[str, Any] | None:
+        """Return what a file holds; None if it is not there or not ours."""
+        try:
+            content = read_json(path)
+            wrong = [name for name, kind in types.items() if content and not isinstance(content.get(name), kind)]
+            if wrong or content == {}:
+                raise ValueError(f"{path} has no {', '.join(wrong or types)}")
+        except ValueError as error:
+            self.damaged[path] = str(error)
+            return None
+        return content
 
-    def protocol(self) -> Protocol | None:
-        """What the folder's cells have in common; None for a folder without results."""
-        stored = read_json(self.folder / "settings.json")
-        return None if stored is None else Protocol(**stored)
+    # Settings
 
-    def agree(self, protocol: Protocol) -> None:
+    def config(self) -> RunConfig | None:
+        """Return what the folder's cells have in common; None for a folder without results."""
+        stored = self._read(self.folder / "settings.json", _SETTINGS)
+        return None if stored is None else RunConfig(**{name: stored[name] for name in _SETTINGS})
+
+    def agree(self, config: RunConfig, cells: Iterable[Cell] = ()) -> None:
         """
-        Write the protocol down, or check that it is the one that is there.
+        Check that the folder and its finished cells have these settings. Nothing is written.
 
         :raises ValueError: with what differs
         """
-        stored, wanted = read_json(self.folder / "settings.json"), plain(asdict(protocol))
-        if stored is None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_text(self.folder / "settings.json", to_json(wanted))
-        elif stored != wanted:
+        stored = self.config()
+        if stored is not None and plain(asdict(stored)) != plain(asdict(config)):
+            changed = differences(asdict(stored), plain(asdict(config)))
             raise ValueError(
-                f"the results in {self.folder} have other settings: {differences(stored, wanted)}; run with theirs, or "
-                "choose another folder with -f"
+                f"the results in {self.folder} have other settings: {changed}; run with theirs, or choose another "
+                "folder with -f"
             )
-
-    def agree_on(self, cells: Iterable[Cell], protocol: Protocol) -> None:
-        """
-        Check that finished cells were trained with the settings of today.
-
-        :raises ValueError: with what differs
-        """
         for cell in cells:
-            if not self.is_finished(cell):
-                continue
-            stored, wanted = self.config(cell), config_of(cell, protocol)
-            if stored != wanted:
+            if self.is_finished(cell) and (found := self.cell_config(cell)) != (wanted := config.describe(cell)):
                 raise ValueError(
-                    f"{self.cell_folder(cell)} was trained with other settings: {differences(stored, wanted)}; restore "
+                    f"{self.cell_folder(cell)} was trained with other settings: {differences(found, wanted)}; restore "
                     "them, delete that cell, or choose another folder with -f"
                 )
 
-    # Cells
+    def save_config(self, config: RunConfig) -> None:
+        """Write down what the folder's cells have in common, unless it is there."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.config() is None:
+            write_json(self.folder / "settings.json", plain(asdict(config)))
+
+    # Finished cells
 
     def cell_folder(self, cell: Cell) -> Path:
-        """Where a cell is, or will be."""
+        """Return where a cell is, or will be."""
         return self.folder / "cells" / cell.id
 
-    def unfinished(self, cell: Cell) -> Path:
-        """Checkpoints of a training that has not reached its end."""
-        return self.folder / "unfinished" / cell.id
+    def status(self, cell: Cell) -> dict[str, Any] | None:
+        """Return what a cell cost; None if it is not finished."""
+        return self._read(self.cell_folder(cell) / "status.json", _STATUS)
 
-    def status(self, cell: Cell) -> dict[str, Any]:
-        """How a cell ended; empty if it has not."""
-        return read_json(self.cell_folder(cell) / "status.json") or {}
-
-    def config(self, cell: Cell) -> dict[str, Any]:
-        """What a cell was trained with; empty before."""
-        return read_json(self.cell_folder(cell) / "config.json") or {}
+    def cell_config(self, cell: Cell) -> dict[str, Any]:
+        """Return what a cell was trained with; empty before."""
+        return self._read(self.cell_folder(cell) / "config.json", {"algo": str}) or {}
 
     def versions(self, cell: Cell) -> dict[str, str]:
-        """What a cell ran on; empty before."""
-        return read_json(self.cell_folder(cell) / "versions.json") or {}
+        """Return what a cell ran on; empty before."""
+        return self._read(self.cell_folder(cell) / "versions.json", {"python": str}) or {}
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether a cell is trained."""
-        return self.status(cell).get("state") == FINISHED
-
-    def missing_tests(self, cell: Cell) -> tuple[Level, ...]:
-        """Levels that a cell has not been tested at; all of them if it is not trained."""
-        if not self.is_finished(cell):
-            return cell.tests
-        return tuple(level for level in cell.tests if not self._test_file(cell, level).exists())
-
-    def _test_file(self, cell: Cell, level: Level) -> Path:
-        return self.cell_folder(cell) / "tests" / f"{level.slug}.json"
+        return self.status(cell) is not None and bool(self.cell_config(cell))
 
     def test(self, cell: Cell, level: Level) -> dict[str, Any] | None:
-        """What a test has found; None before it."""
-        return read_json(self._test_file(cell, level)) if self.is_finished(cell) else None
+        """Return what a test has found; None before it."""
+        path = self.cell_folder(cell) / "tests" / f"{level.slug}.json"
+        found = self._read(path, _TEST) if self.is_finished(cell) else None
+        if found is not None and not (found["returns"] and all(isinstance(value, float) for value in found["returns"])):
+            self.damaged[path] = f"{path} has no returns"
+            return None
+        return found
 
-    def model(self, cell: Cell) -> bytes | None:
-        """A trained model's file; None before it, and for random teams."""
-        path = self.cell_folder(cell) / "model.zip"
-        return path.read_bytes() if self.is_finished(cell) and path.exists() else None
+    def missing_tests(self, cell: Cell) -> tuple[Level, ...]:
+        """Return the levels that a cell has not been tested at; all of them if it is not trained."""
+        return tuple(level for level in cell.tests if self.test(cell, level) is None)
 
-    def add(self, cell: Cell, archive: bytes) -> None:
-        """
-        Take a cell in: as a new folder, or its further tests into the folder that is there.
+    # Cells that are at work
 
-        :param archive: from :func:`pack`
-        """
-        with self._unpacked(archive) as fresh:
-            if not self.is_finished(cell):
-                self._replace_cell(cell, fresh)
-                self._forget_checkpoints(cell)
-                return
-            tests = self.cell_folder(cell) / "tests"
-            tests.mkdir(exist_ok=True)
-            for path in (fresh / "tests").iterdir():
-                os.replace(path, tests / path.name)
-            (self.cell_folder(cell) / "error.txt").unlink(missing_ok=True)
+    def unfinished(self, cell: Cell) -> Path:
+        """Return where a cell is trained and tested, and where its checkpoints stay if it is killed."""
+        return self.folder / "unfinished" / cell.id
 
-    def add_failure(self, cell: Cell, protocol: Protocol, error: str) -> None:
-        """
-        Say in a cell's folder why it failed; the next run tries again.
+    def failure(self, cell: Cell) -> Path | None:
+        """Return the file that says why a cell has failed; None if it has not."""
+        path = self.unfinished(cell) / "error.txt"
+        return path if path.exists() else None
 
-        A trained cell whose further test failed stays trained.
-        """
+    def lock(self, cell: Cell) -> filelock.BaseFileLock | None:
+        """Keep other runs away from a cell; None if another one is at it. The system releases it when we end."""
+        folder = self.folder / ".locks"
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / f"{cell.id.replace('/', '_')}.lock")
+        try:
+            lock.acquire(timeout=0)
+        except filelock.Timeout:
+            return None
+        return lock
+
+    def publish(self, cell: Cell) -> None:
+        """Move what an attempt has left into the cell's folder: a new folder, or further tests of a finished one."""
+        result, target = self.unfinished(cell) / "result", self.cell_folder(cell)
         if self.is_finished(cell):
-            write_text(self.cell_folder(cell) / "error.txt", error)
-            return
-        files = {
-            "config.json": to_json(config_of(cell, protocol)),
-            "status.json": to_json({"state": FAILED}),
-            "error.txt": error,
-        }
-        with self._unpacked(pack_texts(files)) as fresh:
-            self._replace_cell(cell, fresh)
+            (target / "tests").mkdir(exist_ok=True)
+            for path in (result / "tests").iterdir():
+                os.replace(path, target / "tests" / path.name)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists():  # damaged; cut off between these two lines, the cell is run again
+                shutil.rmtree(target)
+            os.replace(result, target)
+        self.forget(cell)
 
-    def _forget_checkpoints(self, cell: Cell) -> None:
+    def forget(self, cell: Cell) -> None:
+        """Remove what an unfinished cell has left."""
         folder = self.unfinished(cell)
         shutil.rmtree(folder, ignore_errors=True)
         for parent in folder.parents[: len(Path(cell.id).parts)]:
             with suppress(OSError):  # others are at work beside it
                 parent.rmdir()
 
-    def _replace_cell(self, cell: Cell, fresh: Path) -> None:
-        target = self.cell_folder(cell)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if target.exists():  # a failure; cut off between these two lines, the cell starts over
-            shutil.rmtree(target)
-        os.replace(fresh, target)
+    # What was asked for
 
-    @contextmanager
-    def _unpacked(self, archive: bytes) -> Iterator[Path]:
-        """The files of an archive, on the disk of the results so that a rename moves them."""
-        self.scratch.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder:
-            fresh = Path(folder) / "cell"
-            unpack(archive, fresh)
-            yield fresh
+    def add_selection(self, experiment: Experiment, selection: Selection) -> None:
+        """
+        Remember what was asked for.
 
-    # Requests
-
-    def add_request(self, experiment: str, choice: Choice) -> None:
-        """Remember what was asked for."""
-        text = to_json(plain(asdict(choice)))
-        name = hashlib.sha256(text.encode()).hexdigest()[:12]
-        folder = self.folder / experiment / "requests"
+        :raises ValueError: if another experiment has the same name here
+        """
+        folder = self.folder / experiment.name / "selections"
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / f"{name}.json", text)
+        if experiment.name not in EXPERIMENTS:
+            write_json(folder.parent / "experiment.json", _own(experiment))
+        content = plain(asdict(selection))
+        name = hashlib.sha256(repr(content).encode()).hexdigest()[:12]
+        write_json(folder / f"{name}.json", content)
 
-    def requests(self, experiment: str) -> list[Choice]:
-        """Everything that was asked for."""
-        paths = (self.folder / experiment / "requests").glob("*.json")
-        stored = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-        choices = [Choice(**{key: tuple(value) for key, value in entry.items()}) for entry in stored]
-        return sorted(choices, key=astuple)
+    def selections(self, experiment: str) -> list[Selection]:
+        """Return everything that was asked for."""
+        paths = sorted((self.folder / experiment / "selections").glob("*.json"))
+        stored = [found for path in paths if (found := self._read(path, _SELECTION)) is not None]
+        return sorted((Selection(**{name: tuple(entry[name]) for name in _SELECTION}) for entry in stored), key=astuple)
 
-    # Only one run at a time
-
-    @contextmanager
-    def locked(self, shard: Shard) -> Iterator[None]:
+    def check_experiment(self, experiment: Experiment) -> None:
         """
-        Keep a second run of the same cells away, and clear away what a killed one left unfinished.
+        Check that no other experiment has the same name here.
 
-        :raises ValueError: if there is one
+        :raises ValueError: with what differs
         """
-        part = f"{shard.index}-of-{shard.count}"
-        lock = filelock.FileLock(self.folder / f".lock-{part}")
-        try:
-            lock.acquire(timeout=0)
-        except filelock.Timeout:
+        stored = self._read(self.folder / experiment.name / "experiment.json", {"envs": list, "vary": dict})
+        if stored is not None and stored != _own(experiment):
             raise ValueError(
-                f"another process is running part {shard} of {self.folder}; wait for it, divide the cells among "
-                "processes with --shard 1/2 and --shard 2/2, or choose another folder with -f"
-            ) from None
-        self.scratch = self.folder / "scratch" / part
-        shutil.rmtree(self.scratch, ignore_errors=True)
-        self.scratch.mkdir(parents=True)
-        try:
-            yield
-        finally:
-            shutil.rmtree(self.scratch, ignore_errors=True)
-            lock.release()
+                f"{self.folder} has another experiment {experiment.name!r}: {differences(stored, _own(experiment))}; "
+                "write another name before --env"
+            )
+
+    def experiment(self, name: str) -> Experiment:
+        """
+        Return an experiment by name: of the paper, or one of one's own in this folder.
+
+        :raises ValueError: with the nearest name that exists
+        """
+        if name in EXPERIMENTS:
+            return EXPERIMENTS[name]
+        path = self.folder / name / "experiment.json"
+        stored = self._read(path, {"envs": list, "vary": dict})
+        if path in self.damaged:
+            raise ValueError(f"{self.damaged[path]}; the same run command writes it anew")
+        return find_experiment(name) if stored is None else own_experiment(name, stored["envs"], stored["vary"])
 
 
-def config_of(cell: Cell, protocol: Protocol) -> dict[str, Any]:
-    """
-    Everything that decides a cell's result, but its seed, which its folder names.
-
-    :return: plain data, as it comes back from a file
-    """
-    settings = protocol.settings(cell).as_dict()
-    if not cell.is_trained:
-        settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
-    test = {"episodes": protocol.episodes, "deterministic": protocol.deterministic}
-    return plain({**settings, "test": test})
+def _own(experiment: Experiment) -> dict[str, Any]:
+    """Return what makes an experiment of one's own, as plain data."""
+    vary = {view.parameter: [view.position(level) for level in view.levels] for view in experiment.views}
+    vary.pop("", None)
+    content: dict[str, Any] = plain({"envs": experiment.envs, "vary": vary})
+    return content

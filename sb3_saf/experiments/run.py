@@ -2,41 +2,46 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from textwrap import shorten
 from typing import NamedTuple
 
+from filelock import BaseFileLock
 from tqdm import tqdm
 
-from sb3_saf.experiments.cells import Cell, Choice, Grid, Protocol, Shard, expand
+from sb3_saf.experiments.cell import Job
 from sb3_saf.experiments.definitions import Experiment
-from sb3_saf.experiments.engine import Ending, Engine, Job
+from sb3_saf.experiments.engines import Engine
+from sb3_saf.experiments.files import read_json, write_json, write_text
+from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
+from sb3_saf.experiments.plan import duration
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.table import write_table
-from sb3_saf.experiments.work import Work, do
+from sb3_saf.experiments.tables import write_table
 
 
 @dataclass(frozen=True)
-class Machine:
+class RunOptions:
     """
-    How cells run, which changes nothing in their results but the last digits.
+    How cells are run, which changes nothing in their results but the last digits.
 
     :param device: as SB3 takes it
     :param threads: of torch in each worker
     :param retries: further attempts for a cell that failed or whose process died
     :param tensorboard: whether cells keep TensorBoard logs
-    :param shared_disk: whether workers see the folder of results
-    :param resume: whether cells that were killed go on from their last checkpoint, which takes a shared disk
+    :param resume: whether cells that were killed go on from their last checkpoint
     """
 
     device: str = "auto"
     threads: int = 1
     retries: int = 1
     tensorboard: bool = False
-    shared_disk: bool = True
     resume: bool = True
 
 
@@ -46,97 +51,173 @@ class Summary(NamedTuple):
 
     :param finished: cells that it finished
     :param failed: cells that failed for good
+    :param elsewhere: cells that another run is at
     """
 
     finished: int
     failed: list[Cell]
+    elsewhere: list[Cell]
+
+
+class Attempt(NamedTuple):
+    """
+    A cell that is at work.
+
+    :param cell: the cell
+    :param number: from 1
+    :param lock: that keeps other runs away from it
+    """
+
+    cell: Cell
+    number: int
+    lock: BaseFileLock
 
 
 def run(
     experiment: Experiment,
-    choice: Choice,
-    protocol: Protocol,
+    selection: Selection,
+    config: RunConfig,
     results: Results,
     engine: Engine,
-    machine: Machine,
-    shard: Shard,
+    options: RunOptions | None = None,
+    shard: Shard = Shard(),  # noqa: B008 (immutable)
 ) -> Summary:
     """
-    Run the cells that are not finished.
+    Run the cells that are not finished. Several runs may share a folder: each cell is run by one of them.
 
+    :param engine: closed at the end
     :raises ValueError: if something is wrong before the first cell starts
     """
-    grid = expand(experiment, choice, protocol)
-    results.agree(protocol)
-    results.agree_on(grid.cells, protocol)
-    with results.locked(shard):
-        results.add_request(experiment.name, choice)
-        cells = shard.of(grid.cells)
-        todo = [cell for cell in cells if results.missing_tests(cell)]
-        print(_opening(experiment, grid, cells, todo, shard, results))
-        summary = _run_all(todo, protocol, results, engine, machine)
+    grid = expand(experiment, selection, config)
+    results.check_experiment(experiment)
+    results.agree(config, grid.cells)
+    results.save_config(config)
+    results.add_selection(experiment, selection)
+    cells = shard.of(grid.cells)
+    todo = [cell for cell in cells if results.missing_tests(cell)]
+    for left_out in grid.left_out:
+        print(left_out)
+    for error in results.damaged.values():
+        print(f"damaged, what it belongs to is run again: {error}")
+    part = "" if shard.parts == 1 else f", {len(cells)} of them in part {shard}"
+    print(
+        f"{experiment.name}: {len(grid.cells)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
+        f"{results.folder}"
+    )
+    progress = _Progress(todo, config, results, engine, options or RunOptions())
+    # On a terminal a bar with the time that is left; in a log file a line per cell.
+    with tqdm(total=len(todo), unit="cell", disable=None, dynamic_ncols=True) as bar, progress, engine:
+        for line in progress.lines():
+            bar.update(progress.n_ended - bar.n)
+            bar.write(line, file=sys.stdout)
+    summary = progress.summary()
+    if summary.elsewhere:
+        print(f"{len(summary.elsewhere)} cells were left to another run in {results.folder}")
     write_table(experiment, results)
     return summary
 
 
-def _opening(
-    experiment: Experiment, grid: Grid, cells: Sequence[Cell], todo: Sequence[Cell], shard: Shard, results: Results
-) -> str:
-    lines = [str(left_out) for left_out in grid.left_out]
-    part = "" if shard.count == 1 else f", {len(cells)} of them in part {shard}"
-    lines.append(
-        f"{experiment.name}: {len(grid.cells)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
-        f"{results.folder}"
-    )
-    return "\n".join(lines)
+class _Progress:
+    """The cells of one run: waiting, at work, ended."""
 
+    def __init__(
+        self, todo: Sequence[Cell], config: RunConfig, results: Results, engine: Engine, options: RunOptions
+    ) -> None:
+        self._config, self._results, self._engine, self._options = config, results, engine, options
+        self._waiting = deque((cell, 1) for cell in todo)
+        self._at_work: dict[Future[None], Attempt] = {}
+        self._finished: list[Cell] = []
+        self._failed: list[Cell] = []
+        self._elsewhere: list[Cell] = []
+        self._n_cells, self._clock = len(todo), time.monotonic()
+        self._game_steps = {cell.id: config.settings(cell).game_steps for cell in todo if cell.is_trained}
 
-def _run_all(todo: Sequence[Cell], protocol: Protocol, results: Results, engine: Engine, machine: Machine) -> Summary:
-    cells = {cell.id: cell for cell in todo}
-    jobs = [Job(cell.id, partial(_work, cell, protocol, results, machine)) for cell in todo]
-    finished, failed = 0, []
-    endings = engine.run(do, jobs, machine.retries)
-    # On a terminal a bar with the time that is left; in a log file a line per cell.
-    with tqdm(total=len(jobs), unit="cell", disable=None, dynamic_ncols=True) as bar:
-        try:
-            for ended in endings:
-                cell = cells[ended.job.name]
-                if ended.result is not None:
-                    results.add(cell, ended.result)
-                    finished += 1
-                elif ended.final:
-                    results.add_failure(cell, protocol, ended.error or "")
-                    failed.append(cell)
-                bar.update(int(ended.final))
-                bar.write(_line(cell, ended, results, f"{finished + len(failed)}/{len(jobs)}"), file=sys.stdout)
-        finally:
-            endings.close()  # type: ignore[attr-defined]
-    return Summary(finished, failed)
+    def __enter__(self) -> _Progress:
+        return self
 
+    def __exit__(self, *_: object) -> None:
+        """Let other runs at the cells."""
+        for attempt in self._at_work.values():
+            attempt.lock.release()
 
-def _work(cell: Cell, protocol: Protocol, results: Results, machine: Machine) -> Work:
-    """What a worker is told when it takes a cell."""
-    scratch = str(results.scratch) if machine.shared_disk else None
-    return Work(
-        cell,
-        protocol,
-        results.missing_tests(cell),
-        results.model(cell),
-        machine.device,
-        machine.threads,
-        machine.tensorboard,
-        scratch,
-        str(results.unfinished(cell)) if machine.shared_disk and machine.resume else None,
-    )
+    @property
+    def n_ended(self) -> int:
+        """Cells that will not be run again here."""
+        return len(self._finished) + len(self._failed) + len(self._elsewhere)
 
+    def summary(self) -> Summary:
+        """Return how the run has ended."""
+        return Summary(len(self._finished), self._failed, self._elsewhere)
 
-def _line(cell: Cell, ended: Ending, results: Results, count: str) -> str:
-    """One line about an ending."""
-    if ended.error is None:
-        tests = [(level, results.test(cell, level)) for level in cell.tests]
-        returns = ", ".join(f"{test['return_mean']:.2f} ({level})" for level, test in tests if test is not None)
-        return f"[{count}] {cell}: return {returns}"
-    reason = shorten(ended.error.strip().splitlines()[-1], width=160, placeholder=" ...")
-    if ended.final:
-        return f"[{count}] {cell}: FAILED: {reason}; see {results.cell_folder(cell) / 'error.txt'}"
-    return f"[{count}] {cell}: attempt {ended.attempt} failed, trying again: {reason}"
+    def lines(self) -> Iterator[str]:
+        """Run all cells; yield a line about each attempt."""
+        self._start_some()
+        while self._at_work:
+            done, _ = wait(self._at_work, return_when=FIRST_COMPLETED)
+            for future in done:
+                attempt = self._at_work[future]
+                line = self._end(attempt, future.exception())
+                del self._at_work[future]
+                attempt.lock.release()
+                yield line
+            self._start_some()
+
+    def _start_some(self) -> None:
+        while self._waiting and len(self._at_work) < self._engine.slots:
+            cell, number = self._waiting.popleft()
+            lock = self._results.lock(cell)
+            tests = () if lock is None else self._results.missing_tests(cell)
+            if lock is None or not tests:  # another run is at it, or has finished it
+                self._elsewhere.append(cell)
+                if lock is not None:
+                    lock.release()
+                continue
+            self._at_work[self._start(replace(cell, tests=tests))] = Attempt(cell, number, lock)
+
+    def _start(self, cell: Cell) -> Future[None]:
+        """Put everything into the cell's folder that a worker needs, and hand it over."""
+        results, options, folder = self._results, self._options, self._results.unfinished(cell)
+        description = self._config.describe(cell)
+        with suppress(ValueError):
+            if not options.resume or read_json(folder / "config.json") != description:
+                shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in ("error.txt", "model.zip"):
+            (folder / name).unlink(missing_ok=True)
+        model = results.cell_folder(cell) / "model.zip"
+        if results.is_finished(cell) and model.exists():
+            shutil.copy(model, folder)
+        write_json(folder / "config.json", description)
+        Job(cell, self._config, options.device, options.threads, options.tensorboard).write(folder)
+        return self._engine.submit(folder)
+
+    def _end(self, attempt: Attempt, error: BaseException | None) -> str:
+        """Keep the result or the error of an attempt; return a line about it."""
+        cell = attempt.cell
+        if error is None:
+            self._results.publish(cell)
+            self._finished.append(cell)
+            found = [(level, self._results.test(cell, level)) for level in cell.tests]
+            returns = ", ".join(f"{test['return_mean']:.2f} ({level})" for level, test in found if test is not None)
+            return f"{self._count()} {cell}: return {returns}{self._rate()}"
+        reason = shorten(str(error).strip().splitlines()[-1], width=160, placeholder=" ...")
+        if attempt.number <= self._options.retries:
+            self._waiting.append((cell, attempt.number + 1))
+            return f"{self._count()} {cell}: attempt {attempt.number} failed, trying again: {reason}"
+        self._failed.append(cell)
+        path = self._results.unfinished(cell) / "error.txt"
+        write_text(path, str(error))
+        return f"{self._count()} {cell}: FAILED: {reason}; see {path}"
+
+    def _count(self) -> str:
+        return f"[{self.n_ended}/{self._n_cells}]"
+
+    def _rate(self) -> str:
+        """Return how fast this run is, and how long it will take at that rate."""
+        ended = {cell.id for cell in (*self._finished, *self._failed, *self._elsewhere)}
+        played = sum(self._game_steps.get(cell.id, 0) for cell in self._finished)
+        left = sum(steps for cell_id, steps in self._game_steps.items() if cell_id not in ended)
+        if not played or not left:
+            return ""
+        rate = played / (time.monotonic() - self._clock)
+        return f"; {rate:,.0f} game steps/s, about {duration(left / rate)} left"

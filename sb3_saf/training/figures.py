@@ -42,6 +42,9 @@ _COLOURS: Final = {
     "random": "#666666",
 }
 _WITH_MEMORY: Final = "-lstm"
+#: Horizontal lines of reference teams.
+_REFERENCE: Final = "#222222"
+_REFERENCE_LINES: Final = ("-.", ":", (0, (1, 3)), (0, (5, 5)))
 
 _PANEL_WIDTH: Final = 4.6
 _MOST_IN_A_ROW: Final = 4
@@ -136,7 +139,11 @@ def _start_at_zero(axes: Axes, values: Floats) -> None:
 
 
 def draw_curves(
-    runs: pd.DataFrame, title: str | None = None, panel: str | None = None, y_label: str = TEAM_RETURN
+    runs: pd.DataFrame,
+    title: str | None = None,
+    panel: str | None = None,
+    y_label: str = TEAM_RETURN,
+    references: Mapping[str, float] | None = None,
 ) -> Figure:
     """
     Learning curves: mean and 95 % interval (Student's t) over seeds.
@@ -145,6 +152,7 @@ def draw_curves(
     :param title: of the figure
     :param panel: column whose values get a panel each, for instance ``"task"``
     :param y_label: what a score is
+    :param references: names and scores of horizontal lines, for instance of scripted teams
     """
     require_columns(runs, CURVE_COLUMNS)
     panels, methods = _panels(runs, panel), _methods_of(runs)
@@ -159,6 +167,8 @@ def draw_curves(
             steps = curve["game_steps"]
             ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
             ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
+        for index, (label, score) in enumerate((references or {}).items()):
+            ax.axhline(score, color=_REFERENCE, linestyle=_REFERENCE_LINES[index % len(_REFERENCE_LINES)], label=label)
         ax.set(xlabel="game steps", ylabel=y_label, title=name)
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         _start_at_zero(ax, rows["score"].to_numpy())

@@ -99,7 +99,7 @@ def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
     steps = steps[(steps >= first) & (steps <= last)]
     scores = np.stack([np.interp(steps, *curve) for curve in curves])
     estimates = [mean_over_seeds(column) for column in scores.T]
-    return pd.DataFrame(estimates, columns=["value", "low", "high"]).assign(game_steps=steps)
+    return pd.DataFrame(estimates, columns=["value", "low", "high"], dtype=np.float64).assign(game_steps=steps)
 
 
 def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Floats]:

@@ -1,0 +1,278 @@
+"""
+Where cells run: in processes of this machine, or on Ray.
+
+An engine is given the folder of a job and returns a future of :mod:`concurrent.futures`. On this machine every cell has
+a process of its own, ``python -m sb3_saf.experiments cell FOLDER``: one that crashes or is killed ends no other cell. A
+``ProcessPoolExecutor`` would be broken by the death of one worker, and all that it runs lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import Any, Final
+
+from sb3_saf.experiments.files import pack, unpack
+
+#: Read by libraries when they are imported; sums of other numbers of threads come out in another order.
+THREAD_VARIABLES: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: Does the job of a folder, and ends when its parent does.
+CELL_COMMAND: Final = (sys.executable, "-m", "sb3_saf.experiments", "cell", "--until-stdin-closes")
+#: Seconds that a process has to write its last checkpoint and end.
+_PATIENCE: Final = 30.0
+#: Characters of a log that are kept of a failure.
+_LOG_TAIL: Final = 20_000
+#: Jobs handed to a Ray cluster for each that could run: enough for it to grow, too few to fill its memory.
+_QUEUED_PER_SLOT: Final = 2
+_FEWEST_QUEUED: Final = 64
+
+
+class CellError(RuntimeError):
+    """A cell's process has failed; the text is its log, or how it died."""
+
+
+class Engine(ABC):
+    """Runs jobs elsewhere. A context manager; leaving it ends what is running."""
+
+    @property
+    @abstractmethod
+    def slots(self) -> int:
+        """Jobs to hand over at the same time."""
+
+    @abstractmethod
+    def submit(self, folder: Path) -> Future[None]:
+        """
+        Start a job.
+
+        :param folder: with ``job.json``
+        :return: done when ``FOLDER/result`` is there
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End what is running."""
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class LocalEngine(Engine):
+    """
+    Processes of this machine.
+
+    :param workers: processes at the same time
+    :param threads: of each process
+    :param command: that is given the folder of a job
+    """
+
+    def __init__(self, workers: int, threads: int = 1, command: Sequence[str] = CELL_COMMAND) -> None:
+        self.workers = workers
+        self._command = command
+        self._environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
+        self._waiting = ThreadPoolExecutor(workers)
+        self._processes: dict[Path, subprocess.Popen[bytes]] = {}
+
+    @property
+    def slots(self) -> int:
+        """Jobs to hand over at the same time."""
+        return self.workers
+
+    def submit(self, folder: Path) -> Future[None]:
+        """Start a job; see :meth:`Engine.submit`."""
+        with (folder / "log.txt").open("wb") as log:
+            # A session of its own: Ctrl-C in a terminal reaches every process of ours, but is for us alone.
+            self._processes[folder] = subprocess.Popen(
+                [*self._command, str(folder)],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,
+            )
+        return self._waiting.submit(self._wait, folder)
+
+    def _wait(self, folder: Path) -> None:
+        with self._processes[folder] as process:
+            code = process.wait()
+        if code:
+            with (folder / "log.txt").open(encoding="utf-8", errors="replace") as log:
+                text = log.read()[-_LOG_TAIL:]
+            raise CellError(text if code == 1 and text else f"{text}\nthe worker process died ({_death(code)})\n")
+
+    def close(self) -> None:
+        """End the processes: SIGTERM lets them write a last checkpoint."""
+        for process in self._processes.values():
+            process.terminate()
+        end = time.monotonic() + _PATIENCE
+        for process in self._processes.values():
+            try:
+                process.wait(max(0.0, end - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+        self._waiting.shutdown()
+
+
+def _death(code: int) -> str:
+    if code >= 0:
+        return f"exit code {code}"
+    name = signal.Signals(-code).name
+    return f"{name}; if the machine ran out of memory, use fewer --workers" if name == "SIGKILL" else name
+
+
+class RayEngine(Engine):
+    """
+    Tasks of a Ray cluster, or of a Ray started on this machine.
+
+    A task that sees the folder of its job works in it, so that another one goes on from its checkpoints if it is lost.
+    Where nodes do not share a disk the job's files travel through Ray, and a lost cell starts over.
+
+    :param address: of a running cluster, ``"auto"`` to find it; None to start Ray on this machine
+    :param cpus: of each job
+    :param gpus: of each job; may be a fraction, so that several share one
+    :param workers: processors of a Ray that is started here; None for all
+    """
+
+    def __init__(
+        self, address: str | None = None, cpus: float = 1, gpus: float = 0, workers: int | None = None
+    ) -> None:
+        self.address = address
+        self.cpus = cpus
+        self.gpus = gpus
+        self._ray = require_ray()
+        self._is_ours = not self._ray.is_initialized()
+        if self._is_ours:
+            self._connect(workers)
+        try:
+            self._check_resources()
+        except ValueError:
+            self.close()
+            raise
+        # Attempts are counted by the run, so that those of failures and of lost nodes are the same ones.
+        self._task = self._ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_run_on_ray)
+        self._references: list[Any] = []
+
+    def _connect(self, workers: int | None) -> None:
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+        if self.address is None:
+            options |= {"num_cpus": workers, "include_dashboard": False}
+        try:
+            self._ray.init(address=self.address or "local", **options)
+        except ConnectionError as error:
+            raise ValueError(
+                f"no Ray cluster at --address {self.address} ({_first_line(error)}); start one with `ray start "
+                "--head`, or leave --address out to start Ray on this machine"
+            ) from None
+
+    def _check_resources(self) -> None:
+        """
+        Refuse jobs that fit on no node: they would wait for ever.
+
+        :raises ValueError: if no node can come that has room; a cluster may still grow, so there it is only said
+        """
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        if any(node.get("CPU", 0) >= self.cpus and node.get("GPU", 0) >= self.gpus for node in nodes):
+            return
+        largest = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
+        message = f"a cell wants {self.cpus:g} CPUs and {self.gpus:g} GPUs of one node, the nodes have {largest}"
+        if self.address is None:
+            raise ValueError(f"{message}; lower --cpus-per-cell or --gpus-per-cell")
+        print(f"{message}: waiting for a node that is large enough", file=sys.stderr)
+
+    @property
+    def slots(self) -> int:
+        """Jobs to hand over at the same time."""
+        resources = self._ray.cluster_resources()
+        slots = resources.get("CPU", 0) / self.cpus
+        if self.gpus:
+            slots = min(slots, resources.get("GPU", 0) / self.gpus)
+        return max(_FEWEST_QUEUED, int(_QUEUED_PER_SLOT * slots))
+
+    def submit(self, folder: Path) -> Future[None]:
+        """Start a job; see :meth:`Engine.submit`."""
+        inputs = {name: (folder / name).read_bytes() for name in ("job.json", "model.zip") if (folder / name).exists()}
+        reference = self._task.remote(str(folder.resolve()), inputs)
+        self._references.append(reference)
+        done: Future[None] = Future()
+        reference.future().add_done_callback(lambda answer: self._settle(done, answer, folder))
+        return done
+
+    def _settle(self, done: Future[None], answer: Future[bytes | None], folder: Path) -> None:
+        """Give a task's result or error on."""
+        try:
+            if (error := answer.exception()) is not None:
+                is_lost = not isinstance(error, self._ray.exceptions.RayTaskError)
+                lost = f"\n\nlost by Ray ({type(error).__name__}): {_first_line(error)}\n" if is_lost else ""
+                raise CellError(f"{error}{lost}")
+            if (archive := answer.result()) is not None:
+                unpack(archive, folder / "result")
+            done.set_result(None)
+        except Exception as problem:
+            done.set_exception(problem)
+
+    def close(self) -> None:
+        """Cancel the tasks, and end a Ray that was started or connected to here."""
+        for reference in getattr(self, "_references", []):
+            self._ray.cancel(reference, force=True)
+        if self._is_ours:
+            self._ray.shutdown()
+
+
+def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
+    """
+    Do a job on a node.
+
+    :param name: its folder, if this node sees it
+    :param inputs: the files of the job
+    :return: None if the result is in that folder, else the result's files as an archive
+    """
+    from sb3_saf.experiments.cell import run_job
+
+    folder = Path(name)
+    with contextlib.ExitStack() as stack:
+        is_shared = all((folder / file).exists() and (folder / file).read_bytes() == inputs[file] for file in inputs)
+        if not is_shared:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            for file, content in inputs.items():
+                (folder / file).write_bytes(content)
+        log = stack.enter_context((folder / "log.txt").open("w", encoding="utf-8"))
+        with contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+            run_job(folder)
+        return None if is_shared else pack(folder / "result")
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__).rstrip(".")
+
+
+def require_ray() -> ModuleType:
+    """
+    Return Ray, quiet.
+
+    :raises ValueError: if it is not installed
+    """
+    # Nothing is reported to anybody, and a future default is taken now, about which Ray would warn.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError:
+        raise ValueError(
+            "--ray needs Ray, which is not installed: pip install 'sb3-saf[ray]', or leave --ray out to run in "
+            "processes of this machine"
+        ) from None
+    return ray

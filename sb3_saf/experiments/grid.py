@@ -1,0 +1,269 @@
+"""From an experiment to its cells: what is trained, where it is tested, and what does not fit."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
+from sb3_saf.experiments.files import plain
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.names import unknown_name
+from sb3_saf.training.settings import Settings, load_settings
+from sb3_saf.training.yaml_files import Size
+
+#: An algorithm whose settings give the random team its environment, which is the same for all.
+_ANY_ALGORITHM = "ippo"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """
+    One training and its tests. The name of its folder says what is trained.
+
+    Cells do not know their experiment, so experiments in one folder share them.
+
+    :param method: name of the algorithm, or ``"random"`` for the untrained team
+    :param env: the environment, as ``sb3_saf.train --env`` takes it
+    :param level: trained at
+    :param seed: of the run
+    :param tests: levels to test at
+    """
+
+    method: str
+    env: str
+    level: Level
+    seed: int
+    tests: tuple[Level, ...] = ()
+
+    @property
+    def task(self) -> str:
+        """The environment without its version."""
+        return self.env.removesuffix("-v0")
+
+    @property
+    def id(self) -> str:
+        """Return the folder of the cell below ``cells``, with slashes."""
+        return f"{re.sub(r'[^A-Za-z0-9_.]', '-', self.task)}-{self.level.slug}/{self.method}/seed-{self.seed}"
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether there is anything to learn."""
+        return self.method != RANDOM
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data for :meth:`from_dict`."""
+        tests = [level.env_kwargs for level in self.tests]
+        return {**self.__dict__, "level": self.level.env_kwargs, "tests": tests}
+
+    @classmethod
+    def from_dict(cls, saved: Mapping[str, Any]) -> Cell:
+        """Return the cell that :meth:`as_dict` has described."""
+        tests = tuple(Level.of(**level) for level in saved["tests"])
+        return cls(**{**saved, "level": Level.of(**saved["level"]), "tests": tests})
+
+    def __str__(self) -> str:
+        return f"{self.method} {self.task} {self.level} seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """
+    What is the same for all cells of a folder.
+
+    :param size: of the settings in ``zoo_configs``
+    :param overrides: replace settings of ``zoo_configs``, with the same keys: ``{"game_steps": 1000, "n_envs": 8}``
+    :param episodes: team episodes of each test
+    :param deterministic: whether tests take the most likely actions
+    """
+
+    size: Size
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    episodes: int = 32
+    deterministic: bool = False
+
+    def settings(self, cell: Cell, level: Level | None = None) -> Settings:
+        """
+        Return the settings of a cell.
+
+        :param cell: for its method and environment
+        :param level: where it is tested; None for where it is trained
+        """
+        algo = cell.method if cell.is_trained else _ANY_ALGORITHM
+        # The environment is all that a random team needs.
+        overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key == "env_kwargs"}
+        level = cell.level if level is None else level
+        overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
+        return load_settings(algo, cell.env, self.size, overrides=overrides)
+
+    def describe(self, cell: Cell) -> dict[str, Any]:
+        """Return everything that decides a cell's result, as plain data."""
+        settings = self.settings(cell).as_dict()
+        if not cell.is_trained:
+            settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
+        test = {"episodes": self.episodes, "deterministic": self.deterministic}
+        result: dict[str, Any] = plain({**settings, "seed": cell.seed, "test": test})
+        return result
+
+
+class LeftOut(NamedTuple):
+    """
+    A level that does not fit the size.
+
+    :param task: the environment
+    :param level: trained at
+    :param test: the level that does not fit, the trained one or a tested one
+    :param reason: why
+    """
+
+    task: str
+    level: Level
+    test: Level
+    reason: str
+
+    def __str__(self) -> str:
+        where = "training" if self.test == self.level else f"the test at {self.test} after training"
+        return f"{self.task}: {where} at {self.level} is left out: {self.reason}"
+
+
+class Grid(NamedTuple):
+    """
+    All cells of an experiment.
+
+    :param cells: in an order in which every stretch has all methods
+    :param left_out: what does not fit
+    """
+
+    cells: list[Cell]
+    left_out: list[LeftOut]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """
+    A part of an experiment.
+
+    :param seeds: seeds of the runs
+    :param methods: empty for the experiment's own
+    :param envs: empty for the experiment's own
+    :param levels: positions on the experiment's axes, as text; empty for all of them
+    """
+
+    seeds: tuple[int, ...]
+    methods: tuple[str, ...] = ()
+    envs: tuple[str, ...] = ()
+    levels: tuple[str, ...] = ()
+
+    def has(self, cell: Cell, experiment: Experiment) -> bool:
+        """Whether a cell belongs to this part, where nothing named is everything. The random team always does."""
+        tests = experiment.at(self.levels).tests()
+        levels = set(tests) if cell.is_trained else {level for group in tests.values() for level in group}
+        return (
+            (not self.seeds or cell.seed in self.seeds)
+            and (not self.envs or cell.env in self.envs)
+            and (not self.methods or cell.method in self.methods or not cell.is_trained)
+            and cell.level in levels
+        )
+
+
+def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> Grid:
+    """
+    Return the grid of an experiment: its methods and a random team, at every level that fits.
+
+    :raises ValueError: for methods that are no algorithms, levels that it does not have, or if nothing fits
+    """
+    methods = check_methods(experiment, selection.methods)
+    left_out: list[LeftOut] = []
+    trained: list[Cell] = []
+    fitting: list[tuple[str, Level, tuple[Level, ...]]] = []
+    for env in selection.envs or experiment.envs:
+        for level, tests in experiment.at(selection.levels).tests().items():
+            bad = dict(_misfits(env, {level, *tests}, config))
+            wrong = [level] if level in bad else [test for test in tests if test in bad]
+            left_out += [LeftOut(env.removesuffix("-v0"), level, test, bad[test]) for test in wrong]
+            if level not in bad:
+                fitting.append((env, level, tuple(test for test in tests if test not in bad)))
+    if not fitting:
+        raise ValueError(f"no level of {experiment.name} fits the size {config.size!r}: {left_out[0].reason}")
+    for seed in selection.seeds:
+        trained += [Cell(method, env, level, seed, tests) for env, level, tests in fitting for method in methods]
+    random = [Cell(RANDOM, cell.env, level, cell.seed, (level,)) for cell in trained for level in cell.tests]
+    return Grid(merge([*trained, *random]), left_out)
+
+
+def merge(cells: Iterable[Cell]) -> list[Cell]:
+    """Return each training once, with all tests that are asked of it."""
+    merged: dict[str, Cell] = {}
+    for cell in cells:
+        known = merged.setdefault(cell.id, cell)
+        merged[cell.id] = replace(known, tests=tuple(dict.fromkeys((*known.tests, *cell.tests))))
+    return list(merged.values())
+
+
+def check_methods(experiment: Experiment, methods: Sequence[str]) -> tuple[str, ...]:
+    """
+    Return the methods of a run.
+
+    :raises ValueError: for names that are no algorithms
+    """
+    for method in methods:
+        if method not in ALGOS:
+            raise unknown_name("method", method, ALGOS)
+    missing = [method for method in experiment.methods if method not in ALGOS]
+    if missing and not methods:
+        raise ValueError(
+            f"the experiment {experiment.name!r} needs the algorithms {', '.join(missing)}, which this installation "
+            f"does not have; name others with --methods (there are {', '.join(ALGOS)})"
+        )
+    return tuple(dict.fromkeys(methods)) or experiment.methods
+
+
+def _misfits(env: str, levels: Iterable[Level], config: RunConfig) -> Iterator[tuple[Level, str]]:
+    """Yield the levels that cannot be built, with the reason."""
+    for level in levels:
+        try:
+            config.settings(Cell(RANDOM, env, level, 0))
+        except ValueError as error:
+            yield level, str(error)
+
+
+class Shard(NamedTuple):
+    """
+    One of several parts of a grid, for machines that do not share a folder.
+
+    :param number: from 1
+    :param parts: how many there are
+    """
+
+    number: int = 1
+    parts: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """
+        Read ``3/8``.
+
+        :raises ValueError: for anything that is no part
+        """
+        number, slash, parts = text.partition("/")
+        if not (slash and number.isdecimal() and parts.isdecimal() and 1 <= int(number) <= int(parts)):
+            raise ValueError(f"expected a part such as 3/8 (the third of eight), got {text!r}")
+        return cls(int(number), int(parts))
+
+    def of(self, cells: Sequence[Cell]) -> list[Cell]:
+        """
+        Return its cells: a stretch, so that each part has cheap and expensive methods alike.
+
+        :param cells: the whole grid; the same for all parts, whatever is finished
+        """
+        trained = [cell for cell in cells if cell.is_trained]
+        others = [cell for cell in cells if not cell.is_trained]
+        return [cell for group in (trained, others) for cell in group[self._stretch(len(group))]]
+
+    def _stretch(self, n: int) -> slice:
+        return slice((self.number - 1) * n // self.parts, self.number * n // self.parts)
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.parts}"

@@ -1,0 +1,243 @@
+"""
+Results as tidy pandas tables, for reports and for figures of one's own.
+
+Tables of tests have one row per cell and test level, made anew from the cells whenever they are needed:
+
+``method``, ``task``                 name of the algorithm, or ``"random"``; the environment
+``train_level``, ``level``           where it was trained and tested, such as ``"c2-h1"``
+``train_...``, one column each       parameters of these levels, such as ``train_coordination``, ``coordination``
+``seed``, ``evaluation_seed``        of the run; from which the games of the test got theirs
+``n_agents``, ``max_return``         N; the largest team return there is, where it is known
+``game_steps``, ``episodes``         of the training, 0 for a random team; of the test
+``return_mean``, ``return_low``,     mean team return with its 95 % interval over episodes (Student's t)
+``return_high``
+``score``                            share of the largest return; where that is not known, of the range of all returns
+                                     in the table on this task and level
+``returns``                          team return of every episode, with spaces between
+``processor_seconds``,               what the training cost, and the test
+``wall_seconds_training``, ``wall_seconds_test``
+``cell``                             folder below ``cells``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sb3_saf.experiments.definitions import RANDOM, Experiment, View
+from sb3_saf.experiments.files import write_text
+from sb3_saf.experiments.grid import Cell, Grid, expand, merge
+from sb3_saf.experiments.results import Results
+from sb3_saf.training.statistics import Estimate, mean_over_seeds
+
+#: Columns that differ between two runs of the same cells; all others are equal, bit for bit.
+TIME_COLUMNS: Final = ("processor_seconds", "wall_seconds_training", "wall_seconds_test")
+#: Two seeds may agree by chance, and an interval then has no width.
+FEWEST_SEEDS: Final = 3
+
+
+class Frames(NamedTuple):
+    """
+    What is there of an experiment.
+
+    :param tests: see the module
+    :param curves: one row for each point of a learning curve, columns ``method``, ``task``, ``level``, the level's
+        parameters, ``seed``, ``game_steps``, ``processor_seconds`` and ``score``, the mean team return of training
+        episodes
+    """
+
+    tests: pd.DataFrame
+    curves: pd.DataFrame
+
+
+def read_results(folder: str | Path, name: str) -> Frames:
+    """
+    Return the results of an experiment, complete or not.
+
+    :param folder: of the results, as given to ``python -m sb3_saf.experiments run NAME -f FOLDER``
+    :param name: of the experiment
+    :raises ValueError: for an unknown name, or if nothing of it is finished
+    """
+    results = Results(Path(folder))
+    experiment = results.experiment(name)
+    cells = [] if results.config() is None else requested(experiment, results).cells
+    tests = frame_of_tests(results, cells)
+    if tests.empty:
+        raise ValueError(
+            f"{folder} has no finished cell of {name!r}; run it first: "
+            f"python -m sb3_saf.experiments run {name} -f {folder}"
+        )
+    return Frames(tests.drop(columns=["returns", "cell"]), frame_of_curves(results, cells))
+
+
+def requested(experiment: Experiment, results: Results) -> Grid:
+    """
+    Return all cells that were ever asked for in a folder, random teams last.
+
+    :param results: a folder with settings
+    """
+    config = results.config()
+    assert config is not None
+    grids = [expand(experiment, selection, config) for selection in results.selections(experiment.name)]
+    cells = merge(cell for grid in grids for cell in grid.cells)
+    left_out = dict.fromkeys(left_out for grid in grids for left_out in grid.left_out)
+    return Grid(sorted(cells, key=lambda cell: not cell.is_trained), list(left_out))
+
+
+def frame_of_tests(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
+    """Return what is finished of some cells, in their order, then their tests'."""
+    table = pd.DataFrame([row for cell in cells for row in _rows(results, cell)])
+    if not table.empty:
+        table["score"] = _scores(table)
+    return table
+
+
+def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
+    status = results.status(cell)
+    for level in cell.tests:
+        test = results.test(cell, level)
+        if status is None or test is None:
+            continue
+        trained = {f"train_{name}": value for name, value in cell.level.parameters}
+        yield {
+            **{"method": cell.method, "task": cell.task, "train_level": cell.level.slug, "level": level.slug},
+            **trained,
+            **level.env_kwargs,
+            **{name: test[name] for name in ("n_agents", "max_return", "evaluation_seed")},
+            "seed": cell.seed,
+            "game_steps": int(results.cell_config(cell).get("game_steps", 0)),
+            "episodes": len(test["returns"]),
+            **{name: test[name] for name in ("return_mean", "return_low", "return_high")},
+            "score": float("nan"),
+            "returns": " ".join(f"{value:.12g}" for value in test["returns"]),
+            "processor_seconds": status["processor_seconds"],
+            "wall_seconds_training": status["wall_seconds"],
+            "wall_seconds_test": test["wall_seconds"],
+            "cell": cell.id,
+        }
+
+
+def _scores(table: pd.DataFrame) -> pd.Series:
+    """Return the share of the largest return, or of the range of returns on the same task and level."""
+    here = table.groupby(["task", "level"])["return_mean"]
+    low, high = here.transform("min"), here.transform("max")
+    of_range = ((table["return_mean"] - low) / (high - low).where(high > low, 1.0)).astype(float)
+    known = pd.to_numeric(table["max_return"])
+    return (table["return_mean"] / known).where(known.notna(), of_range)
+
+
+def write_table(experiment: Experiment, results: Results) -> None:
+    """Write ``table.csv`` from all that was ever asked for and is finished; floats come back as they were."""
+    table = frame_of_tests(results, requested(experiment, results).cells)
+    write_text(results.folder / experiment.name / "table.csv", table.to_csv(index=False, lineterminator="\n"))
+
+
+def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
+    """Return the learning curves of all trained cells in one table; empty if there are none."""
+    found = []
+    for cell in cells:
+        path = results.cell_folder(cell) / "curve.csv"
+        if not (results.is_finished(cell) and path.exists()):
+            continue
+        try:
+            curve = pd.read_csv(path).rename(columns={"mean_return": "score"})
+            curve = curve[["game_steps", "processor_seconds", "score"]].astype(float)
+        except (ValueError, KeyError) as error:
+            results.damaged[path] = f"{path} is no learning curve: {error}"
+            continue
+        names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, **cell.level.env_kwargs}
+        found.append(curve.assign(**names, seed=cell.seed))
+    return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+
+
+def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
+    """
+    Return the rows that a view shows, with their place on the axis in a column of the axis's name.
+
+    The random team belongs to every view: it is the same whatever others were trained at.
+
+    :param table: of tests
+    """
+    positions = {level.slug: view.position(level) for level in view.levels}
+    trained_at = table["level"] if view.train is None else view.train.slug
+    rows = table[table["level"].isin(positions) & ((table["method"] == RANDOM) | (table["train_level"] == trained_at))]
+    return rows.assign(**{view.axis: rows["level"].map(positions)})
+
+
+def strata(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
+    """
+    Return the rows of all views, each once, with a column ``stratum``: what aggregates count as one task.
+
+    :param table: of tests
+    """
+    parts = []
+    for view in experiment.views:
+        shown = of_view(table, view)
+        parts.append(shown.assign(stratum=shown["task"] + " " + shown["level"] + view.suffix))
+    return pd.concat(parts, ignore_index=True).drop_duplicates(["method", "seed", "stratum"])
+
+
+def complete(rows: pd.DataFrame) -> pd.DataFrame:
+    """
+    Return the strata and seeds that every method has, so that aggregates compare like with like.
+
+    :param rows: columns ``method``, ``seed``, ``stratum``, one row for each
+    :return: some of the rows; none if the methods have nothing in common
+    """
+    n_methods = rows["method"].nunique()
+    rows = rows[rows.groupby("stratum")["method"].transform("nunique") == n_methods]
+    n_strata = rows["stratum"].nunique()
+    return rows[rows.groupby("seed")["stratum"].transform("size") == n_methods * n_strata]
+
+
+class Comparison(NamedTuple):
+    """
+    Two methods on the same seeds and the same test games.
+
+    :param seeds: that both have
+    :param first: mean return of the first, with its 95 % interval over these seeds
+    :param second: of the second
+    :param difference: mean of first - second, seed by seed
+    """
+
+    seeds: list[int]
+    first: Estimate
+    second: Estimate
+    difference: Estimate
+
+    @property
+    def sign(self) -> int:
+        """Return 1 if the first is higher, -1 if the second is, 0 if nothing can be said."""
+        if len(self.seeds) < FEWEST_SEEDS:
+            return 0
+        if self.first.low > self.second.high and self.difference.low > 0:
+            return 1
+        return -int(self.first.high < self.second.low and self.difference.high < 0)
+
+    @property
+    def verdict(self) -> str:
+        """Return the sign in words."""
+        if len(self.seeds) < FEWEST_SEEDS:
+            return f"no winner: fewer than {FEWEST_SEEDS} seeds"
+        return {1: "higher", -1: "lower", 0: "no winner: intervals overlap"}[self.sign]
+
+
+def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
+    """
+    Compare two methods at one level of one task, naming a winner only where intervals do not overlap.
+
+    :param first: columns ``seed`` and ``return_mean``
+    :param second: the same
+    :return: None if they have no seed in common
+    """
+    pairs = first.merge(second, on="seed", suffixes=("_first", "_second")).sort_values("seed")
+    if pairs.empty:
+        return None
+    ours, theirs = (pairs[f"return_mean_{side}"].to_numpy(dtype=np.float64) for side in ("first", "second"))
+    return Comparison(
+        pairs["seed"].tolist(), mean_over_seeds(ours), mean_over_seeds(theirs), mean_over_seeds(ours - theirs)
+    )

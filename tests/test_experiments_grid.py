@@ -1,0 +1,176 @@
+"""The paper's experiments and one's own: what is in each, and what does not fit."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Level, find_experiment, own_experiment
+from sb3_saf.experiments.grid import Cell, Grid, RunConfig, Selection, Shard, expand, merge
+from sb3_saf.experiments.plan import duration
+
+THREE_SEEDS = Selection((0, 1, 2))
+PAPER = RunConfig("paper")
+
+
+def at(coordination: int, heterogeneity: int) -> Level:
+    return Level.of(coordination=coordination, heterogeneity=heterogeneity)
+
+
+def grid_of(name: str, config: RunConfig = PAPER, selection: Selection = THREE_SEEDS) -> Grid:
+    return expand(find_experiment(name), selection, config)
+
+
+def trained(grid: Grid) -> list[Cell]:
+    return [cell for cell in grid.cells if cell.is_trained]
+
+
+#: Methods x tasks x levels x three seeds, and the levels that a random team plays.
+SIZES = {
+    "coordination": (3 * 3 * 3 * 3, 3 * 3 * 3),
+    "heterogeneity": (3 * 3 * 5 * 3, 3 * 5 * 3),
+    "joint": (3 * 1 * 3 * 3, 3 * 3),
+    "ablation": (4 * 3 * 7 * 3, 3 * 7 * 3),
+    "ood-coordination": (3 * 2 * 1 * 3, 2 * 3 * 3),
+    "ood-heterogeneity": (3 * 2 * 1 * 3, 2 * 5 * 3),
+    "ood-ablation": (2 * 2 * 2 * 3, 2 * 7 * 3),
+    "qplex": (2 * 3 * 1 * 3, 3 * 3),
+}
+
+
+def test_every_row_of_the_paper_has_a_name() -> None:
+    assert list(EXPERIMENTS) == [*SIZES, "parameters"]
+
+
+@pytest.mark.parametrize(("name", "n_trained", "n_random"), [(name, *counts) for name, counts in SIZES.items()])
+def test_number_of_cells(name: str, n_trained: int, n_random: int) -> None:
+    grid = grid_of(name)
+    assert len(trained(grid)) == n_trained
+    assert len(grid.cells) - n_trained == n_random
+    assert len({cell.id for cell in grid.cells}) == len(grid.cells)
+    assert grid.left_out == []
+
+
+def test_levels_of_the_paper() -> None:
+    levels = {name: list(find_experiment(name).tests()) for name in SIZES}
+    assert levels["coordination"] == [at(1, 1), at(2, 1), at(3, 1)]
+    assert levels["heterogeneity"] == [at(1, h) for h in (1, 2, 3, 4, 5)]
+    assert levels["joint"] == [at(2, 2), at(3, 3), at(4, 4)]
+    assert set(levels["ablation"]) == {*levels["coordination"], *levels["heterogeneity"]}
+    cells = trained(grid_of("ood-heterogeneity", selection=Selection((5,), ("saf",))))
+    assert [(cell.task, cell.level) for cell in cells] == [("TeamTogether", at(1, 2)), ("TeamSupport", at(1, 2))]
+    assert [cell.tests for cell in cells] == [tuple(levels["heterogeneity"])] * 2
+
+
+def test_paper_size_is_the_papers() -> None:
+    for cell in trained(grid_of("ablation", selection=Selection((0,), ("saf",)))):
+        settings = PAPER.settings(cell)
+        assert settings.game_steps == 10_000_000
+        assert settings.n_agents == 10
+        assert {name: settings.env_kwargs[name] for name in cell.level.env_kwargs} == cell.level.env_kwargs
+    assert PAPER.episodes == 32
+    (cell, *_) = grid_of("qplex").cells
+    assert PAPER.settings(cell).n_agents == 5
+    assert cell.id == "TeamTogether-c1-h1-n5/qplex/seed-0"
+
+
+def test_levels_that_do_not_fit_are_named_with_the_reason() -> None:
+    grid = grid_of("coordination", replace(PAPER, overrides={"env_kwargs": {"n_agents": 2}}))
+    assert {cell.level for cell in grid.cells} == {at(1, 1), at(2, 1)}
+    assert [(left.task, left.test) for left in grid.left_out] == [
+        (env.removesuffix("-v0"), at(3, 1)) for env in find_experiment("coordination").envs
+    ]
+    assert str(grid.left_out[0]) == (
+        "TeamTogether: training at c=3, h=1 is left out: coordination must be an integer from 1 to 2 "
+        "(1 <= coordination <= n_agents), got 3"
+    )
+    with pytest.raises(ValueError, match=r"no level of joint fits the size 'paper': .*coordination"):
+        grid_of("joint", replace(PAPER, overrides={"env_kwargs": {"n_agents": 1}}))
+
+
+def test_tests_that_do_not_fit_leave_the_training_alone() -> None:
+    narrow = replace(PAPER, overrides={"env_kwargs": {"grid_size": 6, "n_treasures": 2}})
+    grid = grid_of("ood-heterogeneity", narrow)
+    assert {cell.tests for cell in trained(grid)} == {tuple(at(1, h) for h in (1, 2, 3, 4))}
+    assert {(left.level, left.test) for left in grid.left_out} == {(at(1, 2), at(1, 5))}
+    assert "the test at c=1, h=5 after training at c=1, h=2 is left out" in str(grid.left_out[0])
+
+
+def test_experiments_share_cells() -> None:
+    alone = grid_of("coordination").cells
+    together = merge([*alone, *grid_of("ood-coordination").cells])
+    assert len(together) == len(alone)
+    shared = next(cell for cell in together if cell.id == "TeamSupport-c2-h1/saf/seed-0")
+    assert set(shared.tests) == {at(1, 1), at(2, 1), at(3, 1)}
+    assert Cell.from_dict(shared.as_dict()) == shared
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(ValueError, match=r"unknown experiment 'coordinaton' \(did you mean 'coordination'\?\)"):
+        find_experiment("coordinaton")
+    with pytest.raises(ValueError, match=r"unknown method 'mapo' \(did you mean 'mappo'\?\)"):
+        grid_of("coordination", selection=Selection((0,), ("mapo",)))
+
+
+def test_shards_are_a_partition_and_have_all_methods() -> None:
+    cells = grid_of("coordination").cells
+    for count in (1, 2, 7, 200):
+        parts = [Shard(number, count).of(cells) for number in range(1, count + 1)]
+        assert sorted(cell.id for part in parts for cell in part) == sorted(cell.id for cell in cells)
+    for number in (1, 2, 3):
+        counts = Counter(cell.method for cell in Shard(number, 3).of(cells))
+        assert counts == {"saf": 9, "mappo": 9, "ippo": 9, RANDOM: 9}
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "3", "1/0", "a/b", "-1/2", "1/2/3"])
+def test_bad_shards(text: str) -> None:
+    with pytest.raises(ValueError, match=r"expected a part such as 3/8"):
+        Shard.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "levels", "trains", "tests"),
+    [
+        ("heterogeneity", "513", {at(1, 1), at(1, 3), at(1, 5)}, {at(1, 1), at(1, 3), at(1, 5)}),
+        ("coordination", "2", {at(2, 1)}, {at(2, 1)}),
+        ("ood-coordination", "13", {at(2, 1)}, {at(1, 1), at(3, 1)}),
+        ("ablation", "3", {at(3, 1), at(1, 3)}, {at(3, 1), at(1, 3)}),
+        ("ablation", "4", {at(1, 4)}, {at(1, 4)}),
+    ],
+)
+def test_some_levels_only(name: str, levels: str, trains: set[Level], tests: set[Level]) -> None:
+    part = Selection((0,), levels=tuple(levels))
+    cells = grid_of(name, selection=part).cells
+    assert {cell.level for cell in cells if cell.is_trained} == trains
+    assert {level for cell in cells for level in cell.tests} == tests
+    everything = grid_of(name, selection=Selection((0,))).cells
+    assert {cell.id for cell in everything if part.has(cell, find_experiment(name))} == {cell.id for cell in cells}
+
+
+def test_levels_that_are_not_there_are_refused() -> None:
+    with pytest.raises(ValueError, match="coordination has no level 4 on its axes; there are 1, 2, 3"):
+        grid_of("coordination", selection=Selection((0,), levels=("1", "4")))
+
+
+def test_an_experiment_of_ones_own() -> None:
+    spread = own_experiment("mine", ["TeamSupport-v0", "a.b:c"], {"max_cycles": [5, 9]})
+    assert spread.tests() == {Level.of(max_cycles=value): (Level.of(max_cycles=value),) for value in (5, 9)}
+    assert Cell("saf", "a.b:c", Level.of(max_cycles=5), 0).id == "a.b-c-max_cycles5/saf/seed-0"
+    assert Cell("saf", "a.b:c", Level(), 0).id == "a.b-c-default/saf/seed-0"
+    with pytest.raises(ValueError, match="--vary takes one parameter, got a, b"):
+        own_experiment("mine", ["a.b"], {"a": [1], "b": [2]})
+    with pytest.raises(ValueError, match="expects numbers or words, such as a:"):
+        own_experiment("mine", ["a.b"], {"a": ["../x"]})
+    for name in ("joint", "../x", ""):
+        with pytest.raises(ValueError, match="needs a name of letters"):
+            own_experiment(name, ["a.b"], {})
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.2, "1 s"), (59.6, "1 min"), (3_661, "1 h 1 min"), (3_605, "1 h"), (90_000, "1 d 1 h"), (86_460, "1 d")],
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
