@@ -147,7 +147,7 @@ class GameBatch:
 
     def observe(self, out: U8 | None = None) -> U8:
         """
-        Views of all agents.
+        Return the views of all agents.
 
         :param out: contiguous array to write to; a new one by default
         :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
@@ -332,7 +332,7 @@ class GameBatch:
 
     def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:
         """
-        Which cells each agent sees.
+        Return which cells each agent sees.
 
         :return: (N, W, H)
         """

@@ -16,7 +16,7 @@ RenderMode = Literal["rgb_array", "human", "ansi"]
 
 
 class Command(IntEnum):
-    """What an agent can do. In zone 0 the action integer is the command; elsewhere the zone permutes them."""
+    """Commands of an agent. In zone 0 the action integer is the command; elsewhere the zone permutes them."""
 
     LEFT = 0
     RIGHT = 1
@@ -28,7 +28,7 @@ class Command(IntEnum):
 
 
 class Direction(IntEnum):
-    """Where an agent faces; y grows downwards."""
+    """Directions that an agent can face; y grows downwards."""
 
     EAST = 0
     SOUTH = 1
@@ -37,7 +37,7 @@ class Direction(IntEnum):
 
 
 class Terrain(IntEnum):
-    """What a cell holds apart from agents."""
+    """Contents of a cell apart from agents."""
 
     EMPTY = 0
     WALL = 1
@@ -124,7 +124,7 @@ def zone_colour(zone: int) -> Colour:
 
 def action_permutations() -> npt.NDArray[np.uint8]:
     """
-    All orders of the seven actions, lexicographically.
+    Return all orders of the seven actions, lexicographically.
 
     :return: (5040, 7); in zone z command k is triggered by the action integer ``table[stride * z, k]``
     """

@@ -25,7 +25,7 @@ Infos = dict[str, dict[str, Any]]
 
 
 class StepResult(NamedTuple):
-    """What a step returns, one entry per agent in each dict."""
+    """Results of a step, one entry per agent in each dict."""
 
     observations: Observations
     rewards: dict[str, float]
@@ -97,11 +97,11 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         self.state_space = spaces.Box(0, 255, (size, size, len(STATE_PLANES)), np.uint8)
 
     def observation_space(self, agent: str) -> spaces.Box:
-        """Space of an agent's observation."""
+        """Return the space of an agent's observation."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Discrete:
-        """Seven action integers; what they do depends on the agent's zone."""
+        """Return the space of seven action integers; what they do depends on the agent's zone."""
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observations, Infos]:
@@ -171,15 +171,15 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         return row
 
     def observations(self) -> Observations:
-        """Views of all agents at this moment, also after :meth:`set_state`."""
+        """Return the views of all agents at this moment, also after :meth:`set_state`."""
         return dict(zip(self.possible_agents, self._batch.observe_game(self._game), strict=True))
 
     def state(self) -> npt.NDArray[np.uint8]:
-        """The central view: (W, H, 10), planes as in :data:`hecogrid_envs.state.STATE_PLANES`."""
+        """Return the central view: (W, H, 10), planes as in :data:`hecogrid_envs.state.STATE_PLANES`."""
         return central_view(self.get_state(), self.params.zone_of_column())
 
     def get_state(self) -> StateMapping:
-        """The whole game as plain arrays (see :class:`hecogrid_envs.state.StateMapping`)."""
+        """Return the whole game as plain arrays (see :class:`hecogrid_envs.state.StateMapping`)."""
         return self._batch.get_state(self._game)
 
     def set_state(self, state: object) -> None:

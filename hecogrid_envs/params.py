@@ -168,7 +168,7 @@ class HECOGridParams:
 
     def zone_of_column(self) -> npt.NDArray[np.int64]:
         """
-        Zone of each column x.
+        Return the zone of each column x.
 
         The released rules make one zone too many (or more) when h does not divide the width.
 
@@ -181,7 +181,7 @@ class HECOGridParams:
 
     def command_of(self) -> npt.NDArray[np.uint8]:
         """
-        What each action integer triggers in each zone.
+        Return what each action integer triggers in each zone.
 
         Beyond the last permutation the table starts again; the paper's rules never get there.
 

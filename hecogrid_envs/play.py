@@ -132,7 +132,7 @@ class Session:
         self.message += f"; game over, {self.env.collected} collected, r starts a new one" if self.over else ""
 
     def action_for(self, key: str) -> int:
-        """Action integer that a key sends for the selected agent."""
+        """Return the action integer that a key sends for the selected agent."""
         if key in RAW_ACTIONS:
             return int(key)
         return int(COMMANDS[key]) if self.raw else self._action(self.selected, COMMANDS[key])
@@ -143,7 +143,7 @@ class Session:
         return self._action(agent, Command.DONE)
 
     def _action(self, agent: int, command: Command) -> int:
-        """Action integer that triggers ``command`` where the agent stands."""
+        """Return the action integer that triggers ``command`` where the agent stands."""
         return int(np.flatnonzero(self._command_of[self._zone(agent)] == command)[0])
 
     def _zone(self, agent: int) -> int:
@@ -155,14 +155,14 @@ class Session:
 
     @property
     def status(self) -> str:
-        """Who is selected and what happened last."""
+        """The selected agent, and what happened last."""
         agent, state = self.selected, self.env.get_state()
         facing = Direction(int(state["agent_dir"][agent])).name.lower()
         key = ", has a key" if state["agent_has_key"][agent] else ""
         return f"agent {agent} (zone {self._zone(agent)}, facing {facing}{key}): {self.message}"
 
     def text(self, colour: bool) -> str:
-        """The game as text, then the status."""
+        """Write the game as text, then the status."""
         env = self.env
         several = int(self._zones[-1]) > 0
         page = render_text(
@@ -175,7 +175,7 @@ class Session:
         return f"{page}\n{self.status}"
 
     def picture(self, tile_size: int) -> Picture:
-        """The game as a picture, the selected agent marked."""
+        """Draw the game as a picture, the selected agent marked."""
         env, state = self.env, self.env.get_state()
         visible = seen_cells(
             self._views, state["agent_pos"], state["agent_dir"], env.params.view_offset, env.params.grid_size
@@ -233,7 +233,7 @@ def play_text(session: Session, stdin: TextIO, stdout: TextIO) -> None:
 
 def line_keys(stdin: TextIO) -> Iterator[str]:
     """
-    Keys from lines such as ``up up left p``.
+    Read keys from lines such as ``up up left p``.
 
     :return: the words, in lower case
     """
@@ -246,7 +246,7 @@ _ESCAPES: Final = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": 
 
 def terminal_keys(descriptor: int) -> Iterator[str]:
     """
-    Keys from a terminal in single key mode; arrow keys arrive as escape sequences, Esc as a lone escape.
+    Read keys from a terminal in single key mode; arrow keys arrive as escape sequences, Esc as a lone escape.
 
     :param descriptor: file descriptor to read bytes from
     :return: names as :class:`~hecogrid_envs.rendering.HumanWindow` gives them, until the input ends
@@ -297,7 +297,7 @@ class _SingleKeys:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Options of the command line: one per parameter of the world, and the player's own."""
+    """Make the options of the command line: one per parameter of the world, and the player's own."""
     parser = argparse.ArgumentParser(
         prog="python -m hecogrid_envs.play",
         description="Play a HECOGrid game with the keyboard.",

@@ -56,7 +56,7 @@ _LEGIBLE: Final = 15
 
 class Scene(NamedTuple):
     """
-    What a picture shows.
+    Content of a picture.
 
     :param task: name of the task
     :param params: parameters of the world

@@ -12,7 +12,7 @@ _SEED_BITS = 63
 
 def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
     """
-    Seeds of the games of a vector environment.
+    Return the seeds of the games of a vector environment.
 
     Game ``i`` gets the same seed whatever the number of games, and the seeds of neighbouring runs
     (``seed`` and ``seed + 1``) have nothing in common.
@@ -32,7 +32,7 @@ def _game_seed(seed: int, index: int) -> int:
 
 def generator_word(seed: int) -> np.uint64:
     """
-    First state of a game's random generator.
+    Return the first state of a game's random generator.
 
     :param seed: 0 or larger, of any size
     :raises ValueError: for anything else
@@ -44,5 +44,5 @@ def generator_word(seed: int) -> np.uint64:
 
 
 def fresh_seed() -> int:
-    """A seed from the operating system, for games that nobody seeded; no global generator is touched."""
+    """Draw a seed from the operating system, for games that nobody seeded; no global generator is touched."""
     return secrets.randbits(_SEED_BITS)

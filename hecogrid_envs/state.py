@@ -76,7 +76,7 @@ def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
 
 def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> StateMapping | None:
     """
-    The state that the options of a reset ask for, if any.
+    Return the state that the options of a reset ask for, if any.
 
     :raises ValueError: naming the first fault of an inconsistent mapping
     """
@@ -142,7 +142,7 @@ def _check_agents(state: StateMapping) -> None:
 
 def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
     """
-    The whole game in planes, for a critic that may see everything.
+    Draw the whole game in planes, for a critic that may see everything.
 
     :param zone_of_column: (W,)
     :return: (W, H, 10) uint8, planes as in :data:`STATE_PLANES`; counts stop at 255

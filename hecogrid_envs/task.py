@@ -1,4 +1,4 @@
-"""What a task declares, and the declared tasks by name."""
+"""Declarations of tasks, by name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Condition = Callable[["Games", "World", int, int, int, int], bool]
 
 class Task(NamedTuple):
     """
-    What makes a task: all else is common to all tasks.
+    Declaration of a task: all else is common to all tasks.
 
     :param name: its name
     :param condition: decides whether an agent collects a treasure

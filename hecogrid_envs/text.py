@@ -108,7 +108,7 @@ def render_text(
 
 
 def _characters(state: Mapping[str, Any]) -> npt.NDArray[np.str_]:
-    """(W, H) the character of each cell."""
+    """Return the character of each cell, (W, H)."""
     treasures = np.asarray(state["treasures"])
     characters = np.full(treasures.shape, FLOOR)
     characters[np.asarray(state["walls"], dtype=bool)] = WALL
@@ -131,7 +131,7 @@ def _agents(state: Mapping[str, Any]) -> list[_Agent]:
 
 
 def _agent_lines(state: Mapping[str, Any]) -> list[str]:
-    """Who stands where on what: ``index, direction, x,y, ground``, wrapped into lines of a page's width."""
+    """List the agents as ``index, direction, x,y, ground``, wrapped into lines of a page's width."""
     grounds = {TreasureState.NONE: "", TreasureState.AVAILABLE: TREASURE, TreasureState.COLLECTED: COLLECTED}
     lines: list[str] = []
     for index, agent in enumerate(_agents(state)):
@@ -162,7 +162,7 @@ def _zone_ink(character: str, zone: int) -> _Ink:
 
 
 def _cell_ink(character: str, zone: int) -> _Ink:
-    """The ground is the zone's colour, darkened; agents are the zone's colour, lightened."""
+    """Choose colours: the ground is the zone's colour, darkened; agents are the zone's colour, lightened."""
     red, green, blue = zone_colour(zone)
     if character in AGENT:
         front: Colour = (64 + 3 * red // 4, 64 + 3 * green // 4, 64 + 3 * blue // 4)
@@ -209,7 +209,7 @@ def parse_level(text: str) -> StateMapping:
 
 
 def _sort_lines(text: str) -> tuple[list[str], list[str]]:
-    """Rows of the map, words about agents."""
+    """Return the rows of the map, and the words about agents."""
     rows: list[str] = []
     words: list[str] = []
     ended = False

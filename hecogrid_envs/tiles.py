@@ -63,13 +63,13 @@ def treasure_colours(task: TaskName, rules: Rules) -> TreasureColours:
 
 
 def quarter_turns(facing: int) -> int:
-    """Counterclockwise quarter turns that bring the map, drawn with north up, to a viewer facing ``facing``."""
+    """Count the counterclockwise quarter turns from the map, north up, to the view of a viewer facing ``facing``."""
     return (facing + 1) % 4
 
 
 def tile_atlas(task: TaskName, rules: Rules, tile_size: int) -> Image:
     """
-    Pixels of every tile code.
+    Draw every tile code.
 
     :param task: decides the colour of treasures
     :param rules: decides the colour of collected treasures
@@ -82,7 +82,7 @@ def tile_atlas(task: TaskName, rules: Rules, tile_size: int) -> Image:
 
 def turned_atlases(task: TaskName, rules: Rules, tile_size: int) -> Image:
     """
-    Pixels of every tile code for viewers facing each direction.
+    Draw every tile code for viewers facing each direction.
 
     :return: (4, n_codes, t, t, 3) uint8, read-only; the four are equal up to :data:`MAX_CODED_TILE_SIZE`
     """
@@ -98,7 +98,7 @@ def _atlases(colours: TreasureColours, size: int) -> Image:
 
 
 def _plain_tiles(colours: TreasureColours, size: int) -> Image:
-    """(n_codes, t, t, 3) tiles without grid lines."""
+    """Draw the tiles without grid lines, (n_codes, t, t, 3)."""
     tiles = np.empty((N_CODES, size, size, 3), dtype=np.uint8)
     tiles[INVISIBLE] = _solid(INVISIBLE_COLOUR, size)
     solids = (EMPTY_COLOUR, WALL_COLOUR, colours.available, colours.collected)
@@ -119,7 +119,7 @@ def _solid(colour: Colour, size: int) -> Image:
 
 
 def _canvas_points(size: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Centres of the supersampled pixels as x, y in [0, 1], each (3t, 3t)."""
+    """Return the centres of the supersampled pixels as x, y in [0, 1], each (3t, 3t)."""
     centres = (np.arange(size * _SUPERSAMPLING) + 0.5) / (size * _SUPERSAMPLING)
     return np.meshgrid(centres, centres)
 
@@ -138,7 +138,7 @@ def _drawn(shape: Shape, colour: Colour, size: int) -> Image:
 
 
 def _agent_shape(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81): an agent that faces east."""
+    """Return where the triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81) is: an agent that faces east."""
     slope = (0.50 - 0.19) / (0.87 - 0.12)
     return (x >= 0.12) & (y >= 0.19 + slope * (x - 0.12)) & (y <= 0.81 - slope * (x - 0.12))
 
@@ -155,7 +155,7 @@ def _turned(shape: Shape, direction: int) -> Shape:
 
 
 def _key(size: int) -> Image:
-    """MiniGrid's key: a shaft with two teeth and a ring."""
+    """Draw MiniGrid's key: a shaft with two teeth and a ring."""
     x, y = _canvas_points(size)
     canvas = np.zeros((size * _SUPERSAMPLING, size * _SUPERSAMPLING, 3), dtype=np.uint8)
     shaft = _in_rectangle(x, y, 0.50, 0.63, 0.31, 0.88)
@@ -182,7 +182,7 @@ def _blend(ground: Image, agent: Image) -> Image:
 
 
 def _with_grid_lines(tiles: Image, turns: int) -> Image:
-    """Tiles with a pure black corner get a thin line on the map's north and east side, if they are large enough."""
+    """Draw a thin line on the north and east side of large tiles with a pure black corner."""
     size = tiles.shape[1]
     line = np.full((size, size, 3), max(0, min(20, size - MAX_CODED_TILE_SIZE)), dtype=np.uint8)
     line[1:, :-1] = 0
@@ -220,7 +220,7 @@ class TileSpace(spaces.Box):
 
 def observation_space(task: TaskName, params: HECOGridParams) -> spaces.Box:
     """
-    Space of one agent's observation.
+    Return the space of one agent's observation.
 
     :return: ``Box(0, 255, (V t, V t, 3), uint8)`` for ``"rgb"``, a :class:`TileSpace` for ``"tiles"``
     """

@@ -72,7 +72,7 @@ class HumanWindow:
 
     def poll(self) -> list[str]:
         """
-        Keys pressed since the last call.
+        Return the keys pressed since the last call.
 
         :return: names such as ``"left"``, ``"space"``, ``"p"``, ``"3"``; ``"quit"`` if the window was closed
         """

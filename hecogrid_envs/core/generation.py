@@ -135,7 +135,7 @@ def _draw_terrain(games: Games, world: World, e: int) -> None:
 
 @inlined
 def present_colour(games: Games, world: World, e: int, agent: int) -> int:
-    """Palette index of an agent by its present zone and key."""
+    """Return the palette index of an agent by its present zone and key."""
     if games.has_key[e, agent]:
         return world.key_colour
     return world.zone_colour[world.zone_of_column[games.x[e, agent]]]

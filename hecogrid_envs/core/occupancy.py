@@ -1,4 +1,4 @@
-"""Who stands where, in order of arrival, and what every cell looks like from the four directions."""
+"""Agents by cell, in order of arrival, and the looks of every cell from the four directions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def leave(games: Games, e: int, agent: int, cell: int) -> None:
 
 @inlined
 def count_around(games: Games, world: World, e: int, x: int, y: int) -> int:
-    """Agents within ``support_radius`` (Chebyshev) of a cell."""
+    """Count the agents within ``support_radius`` (Chebyshev) of a cell."""
     radius, width = world.support_radius, world.width
     total = 0
     if (2 * radius + 1) * (2 * radius + 1) > world.n_agents:
@@ -60,14 +60,14 @@ def count_around(games: Games, world: World, e: int, x: int, y: int) -> int:
 
 @inlined
 def count_here(games: Games, world: World, e: int, agent: int) -> int:
-    """Agents on an agent's cell, itself included."""
+    """Count the agents on an agent's cell, itself included."""
     return whole(games.crowd[e, games.y[e, agent] * world.width + games.x[e, agent]])
 
 
 @inlined
 def count_near(games: Games, world: World, e: int, agent: int, old_x: int, old_y: int) -> int:
     """
-    Agents within ``support_radius`` of an agent, itself included.
+    Count the agents within ``support_radius`` of an agent, itself included.
 
     The released rules count around the cell where its action began, (old_x, old_y), at that moment: the others have not
     moved since.
@@ -82,7 +82,7 @@ def count_near(games: Games, world: World, e: int, agent: int, old_x: int, old_y
 
 @inlined
 def agent_code(ground: int, colour: int, direction: int) -> int:
-    """Tile code of an agent; ``ground`` is the terrain it stands on."""
+    """Return the tile code of an agent; ``ground`` is the terrain it stands on."""
     layer = 0
     if ground == _TREASURE:
         layer = 1
@@ -94,7 +94,7 @@ def agent_code(ground: int, colour: int, direction: int) -> int:
 @inlined
 def plane_offset(world: World, facing: int, x: int, y: int) -> int:
     """
-    Where a cell lies in the plane that is turned for a viewer facing ``facing``.
+    Return where a cell lies in the plane that is turned for a viewer facing ``facing``.
 
     In each plane the viewer looks towards smaller rows and its right is towards larger columns, so opposite directions
     read the same plane from opposite ends.

@@ -70,7 +70,7 @@ def act(games: Games, world: World, e: int, agent: int, action: int) -> None:
 
 @inlined
 def _front(games: Games, e: int, agent: int) -> tuple[int, int]:
-    """Cell in front of an agent; agents are never on the outer wall, so it exists."""
+    """Return the cell in front of an agent; agents are never on the outer wall, so it exists."""
     direction = games.direction[e, agent]
     dx = (direction == 0) - (direction == 2)
     dy = (direction == 1) - (direction == 3)

@@ -1,4 +1,4 @@
-"""What kernels work on: the games of a batch, the world they share, and buffers."""
+"""Arguments of kernels: the games of a batch, the world they share, and buffers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an agent sees: visibility on bit masks, the view in tile codes, and its pixels."""
+"""An agent's view: visibility on bit masks, the view in tile codes, and its pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHUNK_BYTES = 16
 
 @inlined
 def view_corner(games: Games, world: World, e: int, agent: int) -> int:
-    """Offset of the top left cell of an agent's view in the plane turned for it."""
+    """Return the offset of the top left cell of an agent's view in the plane turned for it."""
     facing, x, y = whole(games.direction[e, agent]), whole(games.x[e, agent]), whole(games.y[e, agent])
     here = plane_offset(world, facing, x, y)
     return here - (world.view_size - 1 - world.view_offset) * world.stride - world.view_size // 2
@@ -25,7 +25,7 @@ def view_corner(games: Games, world: World, e: int, agent: int) -> int:
 
 @inlined
 def _spread_right(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
-    """Cells that light reaches from ``seen`` towards larger columns through ``clear`` cells, by doubling."""
+    """Return the cells that light reaches from ``seen`` towards larger columns through ``clear`` cells, by doubling."""
     reached, path = seen & clear, clear
     shift = 1
     while shift < size:
