@@ -21,7 +21,7 @@ from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests import test_contrib
 from tests.contrib_teams import random_masks
 from tests.test_contrib import ACTIONS, MASKABLE
-from tests.test_export import ROOT, LoneAgent, exported, rewrite
+from tests.test_export import LoneAgent, exported, rewrite
 from tests.test_policies import SMALL, SMALL_SAF, constant, make_policy
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import VECTOR, samples
@@ -293,7 +293,3 @@ def test_agents_in_processes_of_their_own_play_as_the_model_would(
     for lone in agents:
         lone.process.communicate(timeout=60)
         assert lone.process.returncode == 0
-
-
-def test_the_script_is_the_one_that_is_exported() -> None:
-    assert (ROOT / "sb3_saf" / "export" / "act.py").read_text(encoding="utf-8").startswith('"""\nAct with an exported')
