@@ -1,7 +1,7 @@
 """
 What does ``InspectionCallback`` cost at its default frequency? ``python -m benchmarks.inspection``
 
-Trains SAF as ``make train`` does (TeamSupport, 5 agents, 64 games, light encoder) with an inspection at the start and
+Trains SAF as ``make train`` does (TeamSupport, 5 agents, 16 games, light encoder) with an inspection at the start and
 one at the end, and compares the seconds of one inspection with those of training for as long as the default lies
 between two. Seconds are of one processor: what other programs do at the same time is not counted.
 """
@@ -14,10 +14,8 @@ import tempfile
 import time
 from typing import NamedTuple
 
-from stable_baselines3 import PPO
-
 import sb3_saf
-from sb3_saf.quickstart import N_GAMES, PPO_SETTINGS, SMALL
+from sb3_saf.training.settings import load_settings
 
 
 class Cost(NamedTuple):
@@ -53,13 +51,14 @@ def measure(game_steps: int, pictures: bool) -> Cost:
     :param game_steps: of training
     :param pictures: whether inspections draw
     """
-    env = sb3_saf.make_team_env("TeamSupport", n_envs=N_GAMES, seed=0, **SMALL)
-    eval_env = sb3_saf.make_team_env("TeamSupport", n_envs=16, render_mode="rgb_array", **SMALL)
+    settings = load_settings("saf", "TeamSupport-v0", "small", overrides={"game_steps": game_steps})
+    env = settings.make_env(0)
+    eval_env = settings.make_env(0, evaluation=True, n_envs=16, render_mode="rgb_array")
     callback = Timed(eval_env, every_game_steps=game_steps // 3, pictures=pictures)
     with tempfile.TemporaryDirectory() as folder:
-        model = PPO("SAFPolicy", env, seed=0, tensorboard_log=folder, **PPO_SETTINGS)
+        model = settings.make_model(env, 0, tensorboard_log=folder)
         began = time.process_time()
-        model.learn(game_steps * env.n_agents, callback=callback)
+        model.learn(settings.total_timesteps, callback=callback)
         elapsed = time.process_time() - began
     return Cost(
         sum(callback.costs[1:]) / len(callback.costs[1:]),

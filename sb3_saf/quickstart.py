@@ -1,59 +1,45 @@
 """
 ``make train``: SAF on a HECOGrid task, from nothing to a model, a learning curve and a GIF in minutes on a laptop.
 
-Everything here is what a user would write: ``make_team_env``, stock ``PPO("SAFPolicy", ...)``, ``evaluate_team``.
+The settings are those of ``python -m sb3_saf.train --size small``; ``sb3_saf.training.run.train`` does the work.
 """
 
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 
-import hecogrid_envs
 from hecogrid_envs import TASK_NAMES
-from hecogrid_envs.task import check_task
-from sb3_saf import EvaluationResult, LightEncoder, RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team
+from sb3_saf.training.enjoy import TrainedTeam
+from sb3_saf.training.run import RunOptions, train
+from sb3_saf.training.settings import Settings, load_settings
+from sb3_saf.training.watching import play, write_video
 
-#: The ``small`` size of the experiments: 5 agents, grid 15, 25 treasures.
-SMALL: dict[str, Any] = {"n_agents": 5, "grid_size": 15, "n_treasures": 25, "n_keys": 8}
-
-#: What differs from the constructors of PPO and SAFPolicy. One rollout is one episode of every game.
-PPO_SETTINGS: dict[str, Any] = {
-    "n_steps": 50,
-    "batch_size": 2_000,
-    "n_epochs": 4,
-    "learning_rate": 7e-4,
-    "gae_lambda": 0.9,
-    "ent_coef": 0.01,
-    "max_grad_norm": 9.0,
-    "rollout_buffer_class": TeamRolloutBuffer,
-    "policy_kwargs": {"features_extractor_class": LightEncoder},
-}
-N_GAMES = 16
-#: Evaluation games are seeded apart from training's.
-EVALUATION_SEED = 10_000
 N_EPISODES = 64
+#: The pictures in TensorBoard cost a few seconds each.
+N_INSPECTIONS = 2
 
 
 class Options(NamedTuple):
-    """What the command line chooses."""
+    """
+    What the command line chooses.
 
-    task: str
-    coordination: int
-    heterogeneity: int
-    game_steps: int
+    :param settings: of the training
+    :param seed: of the run
+    :param output: folder for everything
+    :param progress_bar: whether to draw one
+    """
+
+    settings: Settings
     seed: int
     output: Path
     progress_bar: bool
-
-    @property
-    def level(self) -> dict[str, Any]:
-        """Parameters of the task."""
-        return {**SMALL, "coordination": self.coordination, "heterogeneity": self.heterogeneity}
 
 
 def parse(arguments: list[str] | None = None) -> Options:
@@ -66,33 +52,35 @@ def parse(arguments: list[str] | None = None) -> Options:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"))
     parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")
-    options = Options(**vars(parser.parse_args(arguments)))
+    given = parser.parse_args(arguments)
+    level = {"coordination": given.coordination, "heterogeneity": given.heterogeneity}
     try:
-        hecogrid_envs.HECOGridParams(**options.level).check_fits(check_task(options.task))
+        settings = load_settings("saf", f"{given.task}-v0", "small", level, {"game_steps": given.game_steps})
     except ValueError as error:
         parser.error(str(error))
-    return options
+    return Options(settings, given.seed, given.output, given.progress_bar)
 
 
-def train(options: Options) -> PPO:
+def train_team(options: Options) -> BaseAlgorithm:
     """Train, leaving TensorBoard logs, ``monitor.csv`` and the model in the output folder."""
-    env = make_team_env(
-        options.task, n_envs=N_GAMES, seed=options.seed, monitor_dir=str(options.output), **options.level
+    run = RunOptions(
+        tensorboard_log=options.output / "tb",
+        inspect_freq=max(1, options.settings.game_steps // N_INSPECTIONS),
+        progress=options.progress_bar,
     )
-    model = PPO("SAFPolicy", env, seed=options.seed, tensorboard_log=str(options.output / "tb"), **PPO_SETTINGS)
-    # SB3 counts every agent's step.
-    model.learn(options.game_steps * env.n_agents, tb_log_name="saf", progress_bar=options.progress_bar)
-    model.save(options.output / "model.zip")
-    env.close()
-    return model
+    return train(options.settings, options.seed, options.output, run)
 
 
 def evaluate(options: Options, model: Any) -> EvaluationResult:
     """Team returns over games that were not trained on, the same for every model."""
-    env = make_team_env(options.task, n_envs=N_EPISODES, seed=EVALUATION_SEED + options.seed, **options.level)
-    result = evaluate_team(model, env, n_eval_episodes=N_EPISODES, deterministic=False)
-    env.close()
-    return result
+    with closing(options.settings.make_env(options.seed, evaluation=True, n_envs=N_EPISODES)) as games:
+        return evaluate_team(model, games, n_eval_episodes=N_EPISODES, deterministic=False)
+
+
+def describe(settings: Settings) -> str:
+    """The game's name and level."""
+    level = settings.env_kwargs
+    return f"{settings.task}, coordination {level['coordination']}, heterogeneity {level['heterogeneity']}"
 
 
 def draw_curve(options: Options, random: EvaluationResult) -> Path:
@@ -104,14 +92,14 @@ def draw_curve(options: Options, random: EvaluationResult) -> Path:
     figure = Figure(figsize=(7, 4), dpi=120, layout="constrained")
     axes = figure.subplots()
     axes.plot(game_steps, returns, color="tab:blue", alpha=0.12, linewidth=0.5)
-    window = max(1, min(N_GAMES * 5, len(returns) // 10))
+    window = max(1, min(options.settings.n_envs * 5, len(returns) // 10))
     smooth = np.convolve(returns, np.ones(window) / window, mode="valid")
     axes.plot(game_steps[window - 1 :], smooth, color="tab:blue", label=f"SAF (mean of {window} episodes)")
     axes.axhline(random.mean, color="tab:grey", linestyle="--", label="random team")
     axes.set(
         xlabel="game steps",
         ylabel="team return (treasures)",
-        title=f"{options.task}, coordination {options.coordination}, heterogeneity {options.heterogeneity}",
+        title=describe(options.settings),
     )
     axes.legend(loc="upper left")
     path = options.output / "learning_curve.png"
@@ -119,19 +107,12 @@ def draw_curve(options: Options, random: EvaluationResult) -> Path:
     return path
 
 
-def record_episode(options: Options, model: PPO) -> Path:
+def record_episode(options: Options, model: BaseAlgorithm) -> Path:
     """Play one game, each agent seeing its own observation only, and keep it as a GIF."""
-    import imageio.v3 as imageio
-
-    env = hecogrid_envs.parallel_env(options.task, render_mode="rgb_array", observation="tiles", **options.level)
-    observations, _ = env.reset(seed=EVALUATION_SEED + options.seed)
-    frames = [env.render()]
-    while env.agents:
-        actions, _ = model.predict(np.stack(list(observations.values())), deterministic=False)
-        observations, *_ = env.step(dict(zip(env.agents, actions.tolist(), strict=True)))
-        frames.append(env.render())
     path = options.output / "episode.gif"
-    imageio.imwrite(path, np.stack(frames), duration=125, loop=0)  # type: ignore[arg-type]
+    with closing(options.settings.make_game("rgb_array")) as game:
+        team = TrainedTeam(options.settings, model.policy, options.output / "model.zip")
+        write_video(path, list(play(game, team, options.seed, deterministic=False)))
     return path
 
 
@@ -139,8 +120,12 @@ def main(arguments: list[str] | None = None) -> None:
     """Train, compare with a random team, and say where everything is."""
     options = parse(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
-    print(f"Training SAF on {options.task} {options.level} for {options.game_steps:,} game steps")
-    model = train(options)
+    settings = options.settings
+    print(
+        f"Training SAF on {describe(settings)}: {settings.game_steps:,} game steps with {settings.n_agents} agents in "
+        f"{settings.n_envs} games, in a few minutes"
+    )
+    model = train_team(options)
     trained = evaluate(options, model)
     random = evaluate(options, RandomPolicy(model.action_space, seed=options.seed))
     curve, gif = draw_curve(options, random), record_episode(options, model)

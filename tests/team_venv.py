@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 Array = npt.NDArray[Any]
@@ -123,3 +123,14 @@ class TeamVenv(VecEnv):
 def still(venv: VecEnv) -> Array:
     """Actions of agents that do nothing."""
     return np.zeros(venv.num_envs, dtype=np.int64)
+
+
+class DoublingWrapper(VecEnvWrapper):
+    """Doubles rewards."""
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, rewards * 2, dones, infos

@@ -1,31 +1,38 @@
-"""``python -m sb3_saf.train``: RL-Zoo3 underneath, and its traps for teams repaired."""
+"""``python -m sb3_saf.train``: RL-Zoo3's options and folders, in game steps, on any environment."""
 
 from __future__ import annotations
 
 import random
+import re
 import subprocess
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
+import pettingzoo
 import pytest
 import torch as th
 import yaml
-from pettingzoo import ParallelEnv
+from gymnasium import spaces
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_saf import QPLEX, SAFPolicy, evaluate_team
+from hecogrid_envs.play import main as play_main
+from sb3_saf import QPLEX, SAFPolicy, evaluate_team, quickstart
+from sb3_saf.experiments.cli import main as experiments_main
 from sb3_saf.randomness import own_randomness
+from sb3_saf.training import enjoy as zoo_enjoy
+from sb3_saf.training import folders
+from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.callbacks import GameStepsProgressBar
-from sb3_saf.training.settings import ENV_IDS, load_settings
-
-rl_zoo_train = pytest.importorskip("rl_zoo3.train")
+from sb3_saf.training.callbacks import GameStepsProgressBar, RemainingTime
+from sb3_saf.training.environments import find_environment
+from sb3_saf.training.settings import load_settings
 
 ENV = "TeamTogether-v0"
 
@@ -55,11 +62,8 @@ def by_hand() -> dict[str, th.Tensor]:
     return weights(model)
 
 
-@pytest.mark.parametrize("evaluation", [("--eval-freq", "-1"), ("--eval-freq", "60"), ("--save-freq", "100")])
-def test_the_command_trains_what_settings_train_with_and_without_evaluation(
-    evaluation: tuple[str, ...], by_hand: dict[str, th.Tensor], tmp_path: Path
-) -> None:
-    run = train(tmp_path, *evaluation)
+def test_the_command_trains_what_settings_train(by_hand: dict[str, th.Tensor], tmp_path: Path) -> None:
+    run = train(tmp_path, "--eval-freq", "-1")
     assert equal(by_hand, weights(PPO.load(run / f"{ENV}.zip")))
 
 
@@ -162,37 +166,31 @@ def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
 def test_runs_are_numbered_and_never_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert train(tmp_path, "--eval-freq", "-1").name == f"{ENV}_1"
     # As if another process had made its folder between our look and our own.
-    monkeypatch.setattr("rl_zoo3.exp_manager.get_latest_run_id", lambda *_: 0)
-    assert train(tmp_path, "--eval-freq", "-1").name == f"{ENV}_2"
+    found: list[Any] = [[], [(1, tmp_path)]]
+    monkeypatch.setattr(folders, "runs_of", lambda *_: found.pop(0))
+    assert folders.make_run_folder(tmp_path, "saf", ENV).name == f"{ENV}_2"
+    monkeypatch.undo()
+    assert re.fullmatch(rf"{ENV}_3_[0-9a-f-]{{36}}", folders.make_run_folder(tmp_path, "saf", ENV, unique=True).name)
+    assert [number for number, _ in folders.runs_of(tmp_path, "saf", ENV)] == [1, 2, 3]
 
 
-def test_a_model_is_trained_on(tmp_path: Path) -> None:
-    first = train(tmp_path, "--eval-freq", "-1") / f"{ENV}.zip"
-    second = train(tmp_path, "--eval-freq", "-1", "-i", str(first), "-params", "learning_rate:1e-30")
-    difference = [
-        float((a.float() - b.float()).abs().max())
-        for a, b in zip(
-            weights(PPO.load(first)).values(), weights(PPO.load(second / f"{ENV}.zip")).values(), strict=True
-        )
-    ]
-    assert max(difference) < 1e-5
-
-
-def test_rl_zoo_is_left_as_it_was(tmp_path: Path) -> None:
-    manager, argv = rl_zoo_train.ExperimentManager, sys.argv
-    train(tmp_path, "--eval-freq", "-1")
-    assert rl_zoo_train.ExperimentManager is manager
-    assert sys.argv is argv
+def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = train(tmp_path, "--eval-freq", "-1", "-n", "40") / f"{ENV}.zip"
+    again = ("-i", str(first), "-params", "learning_rate:1e-30")
+    second = train(tmp_path, "--eval-freq", "-1", "-n", "40", *again) / f"{ENV}.zip"
+    assert f"the weights and the optimiser of {first}; no code is loaded" in capsys.readouterr().out
+    pairs = zip(*(weights(PPO.load(path)).values() for path in (first, second)), strict=True)
+    assert all(th.allclose(a.float(), b.float(), atol=1e-5) for a, b in pairs)
 
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_progress_bar_is_for_terminals(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
     options = zoo_train.make_parser().parse_args([])
-    zoo_train._complete(options)
+    zoo_train._check(options)
     assert (options.progress, options.verbose) == (terminal, int(not terminal))
     options = zoo_train.make_parser().parse_args(["--no-progress"])
-    zoo_train._complete(options)
+    zoo_train._check(options)
     assert not options.progress
 
 
@@ -201,25 +199,124 @@ def test_the_progress_bar_counts_game_steps() -> None:
     bar = GameStepsProgressBar()
     settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=bar)
     assert (bar.pbar.n, bar.pbar.total) == (80, 80)
-    GameStepsProgressBar().on_training_end()  # of a training that never began
+    GameStepsProgressBar().close()  # of a training that never began
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
-def test_carriers_hold_the_game_and_refuse_to_be_stepped(env_id: str) -> None:
-    from sb3_saf.training.carriers import register_carriers
+def test_the_remaining_time_is_told_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = load_settings("ippo", ENV, "smoke", overrides={"game_steps": 400})
+    clock = iter(range(0, 10_000, 10))
+    monkeypatch.setattr("sb3_saf.training.callbacks.time.perf_counter", lambda: float(next(clock)))
+    settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=RemainingTime())
+    # Rollouts of 40 game steps in 10 seconds each, measured from the end of the first to that of the third.
+    assert capsys.readouterr().out == "4 game steps per second: about 0:01:10 (h:mm:ss) to go\n"
 
-    register_carriers()
-    register_carriers()
-    env = gym.make(env_id, n_agents=3)
-    game = env.get_wrapper_attr("parallel_env")
-    assert isinstance(game, ParallelEnv)
-    assert len(game.possible_agents) == 3
-    assert env.action_space == game.action_space("agent_0")
-    with pytest.raises(ValueError, match="make_team_env"):
-        env.reset()
-    with pytest.raises(ValueError, match="make_team_env"):
-        env.unwrapped.step(0)
-    env.close()
+
+# --- any environment --------------------------------------------------------------------------------------------------
+
+COUNTER = "tests.toy_envs:CounterEnv"
+
+
+@pytest.mark.parametrize("env_id", [COUNTER, "mpe2.simple_spread_v3"])
+def test_any_environment_is_trained_watched_drawn_and_tuned(
+    env_id: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a folder whose name is a pattern of files, twice, since the second run has to find the first."""
+    pytest.importorskip(env_id.partition(":")[0].partition(".")[0])
+    logs = str(tmp_path / "runs [a]")
+    short = ("--env", env_id, "--size", "smoke", "-n", "80", "-f", logs, "--eval-episodes", "2")
+    for _ in range(2):
+        zoo_train.main(["--seed", "0", "--env-kwargs", "max_cycles:5", "--eval-freq", "40", *short])
+    name = env_id.replace(":", "-")
+    run = Path(logs) / "saf" / f"{name}_2"
+    assert {f"{name}.zip", "best_model.zip", "evaluations.npz", "monitor.csv"} <= {path.name for path in run.iterdir()}
+    gif = tmp_path / "game.gif"
+    result = zoo_enjoy.enjoy(["--env", env_id, "-f", logs, "--episodes", "2", "--gif", str(gif)])
+    assert set(result.lengths) == {5} and gif.is_file()
+    zoo_plot.main(["curves", "-f", logs, "-o", str(tmp_path / "curves.png"), "--env", env_id])
+    assert (tmp_path / "curves.png").is_file()
+    zoo_train.main(["-optimize", "--n-trials", "1", *short])
+    assert "Best: trial 0" in capsys.readouterr().out
+
+
+def test_environments_by_other_names(tmp_path: Path) -> None:
+    assert find_environment(f"hecogrid/{ENV}") == find_environment(ENV)
+    assert find_environment("hecogrid/TeamSupport-v0").folder_name == "TeamSupport-v0"
+    pettingzoo.register("parallel", "own/counter-v0", "tests.toy_envs:CounterEnv")
+    try:
+        assert load_settings("saf", "own/counter-v0", env_kwargs={"n_agents": 3}).n_agents == 3
+        assert find_environment("own/counter-v0").folder_name == "own-counter-v0"
+    finally:
+        del pettingzoo.parallel_registry["own/counter-v0"]
+
+
+def test_wrappers_of_rl_zoo3(tmp_path: Path) -> None:
+    """Each changes what the policy sees, and ``enjoy`` plays with all of them."""
+    Path(tmp_path / "own.yml").write_text("""
+default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRolloutBuffer}
+"tests.toy_envs:CounterEnv":
+  env_wrapper: [{supersuit.dtype_v0: {dtype: float64}}]
+  vec_env_wrapper: tests.team_venv.DoublingWrapper
+  frame_stack: 2
+  normalize: true
+  callback: [{stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes: {max_episodes: 2}}]
+""")
+    given = [
+        "-conf",
+        str(tmp_path / "own.yml"),
+        "--env",
+        COUNTER,
+        "--seed",
+        "0",
+        "--size",
+        "smoke",
+        "-f",
+        str(tmp_path),
+    ]
+    zoo_train.main([*given, "--eval-freq", "-1", "-n", "400"])
+    run = tmp_path / "saf" / "tests.toy_envs-CounterEnv_1"
+    model = PPO.load(run / "tests.toy_envs-CounterEnv.zip")
+    assert isinstance(model.observation_space, spaces.Dict)
+    own = model.observation_space["obs"]
+    assert own.shape == (6,) and own.dtype == np.float64  # two frames of three numbers, converted
+    assert model.num_timesteps < 400 * 2  # the callback has stopped it
+    with np.load(run / "vecnormalize.npz") as statistics:
+        assert set(statistics) == {"obs", "returns"} and statistics["obs"].shape == (1 + 2 * 6,)
+        assert statistics["obs"][0] > 10
+    gif = str(tmp_path / "game.gif")
+    zoo_enjoy.enjoy(["--env", COUNTER, "-f", str(tmp_path), "--episodes", "2", "--gif", gif])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ("env_wrapper:os.system", "env_wrapper: .*(str|path)"),
+        ("callback:os.system", "callback must name classes"),
+        ("vec_env_wrapper:os.system", "vec_env_wrapper must be a class"),
+        ("env_wrapper:nowhere.Wrapper", "cannot import Wrapper from 'nowhere'"),
+        ("frame_stack:0", "frame_stack must be from 1"),
+    ],
+)
+def test_wrappers_that_are_none(settings: str, words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    line = failed(["--env", COUNTER, "--size", "smoke", "-f", str(tmp_path), "-params", settings], capsys)
+    assert re.search(words, line), line
+
+
+def test_weights_and_biases_follow_the_tensorboard_logs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert "pip install wandb" in failed(["--size", "smoke", "-n", "40", "--track"], capsys)
+    assert not list(Path("logs").rglob("*.yml"))
+    given: dict[str, Any] = {}
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=given.update))
+    short = ["--size", "smoke", "-n", "40", "--eval-freq", "-1", "--inspect-freq", "-1", "--env", ENV]
+    zoo_train.main([*short, "--track", "-tags", "one"])
+    assert (given["project"], given["tags"], given["sync_tensorboard"]) == ("sb3", ["one"], True)
+    assert list(Path("runs").rglob("events.*"))
+
+
+# --- mistakes, and help -----------------------------------------------------------------------------------------------
 
 
 def failed(options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -259,6 +356,23 @@ def failed(options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         (["-f", "/dev/null/logs"], ("Not a directory", "/dev/null/logs")),
         (["-tb", "/dev/null/tb"], ("Not a directory", "/dev/null/tb")),
         (["--game-step", "5"], ("unrecognized arguments", "--help")),
+        (["--env", "nowhere.game"], ("cannot import parallel_env from 'nowhere.game'",)),
+        (["--env", "tests.toy_envs:BareEnv", "--env-kwargs", "size:3"], ("cannot be made with {'size': 3}",)),
+        (["--gym-packages", "nowhere"], ("--gym-packages: cannot import 'nowhere'",)),
+        (["--vec-env", "subproc"], ("n_cpus", "native")),
+        (["--num-threads", "-4"], ("--num-threads must be at least 1, or -1, got -4",)),
+        (["-n", "0"], ("--game-steps must be at least 1, got 0",)),
+        (["-params", "gamma:50"], ("gamma must be from 0 to 1, got 50",)),
+        (["-params", "gae_lambda:7"], ("gae_lambda must be from 0 to 1",)),
+        (["-params", "clip_range:-0.2"], ("clip_range must be larger than 0",)),
+        (["-params", "clip_range:lin_-0.2"], ("clip_range must be larger than 0",)),
+        (["-params", "max_grad_norm:-1"], ("max_grad_norm must be larger than 0",)),
+        (["-params", "n_epochs:0"], ("n_epochs must be at least 1",)),
+        (["-params", "stats_window_size:-1"], ("stats_window_size must be at least 1",)),
+        (["-params", "n_envs:100000000"], ("n_envs must be from 1 to 100000",)),
+        (["-params", f"gamma:{'9' * 401}"], ("gamma must be a number",)),
+        (["-params", "n_steps:2001-01-01"], ("expected numbers, text, lists and mappings, got the date",)),
+        (["-params", "n_steps:!!set {a}"], ("got the set",)),
     ],
 )
 def test_mistakes_are_one_line(
@@ -285,6 +399,9 @@ def test_mistakes_are_one_line(
         ("default: {sizes: {tiny: {gamma: 0.9}}}", "unknown size 'tiny'"),
         ("TeamTogehter-v0: {}", "unknown environment 'TeamTogehter-v0' (did you mean 'TeamTogether-v0'?)"),
         ("default: !!python/object/apply:os.system ['touch evaluated']", "bad.yml is not valid YAML"),
+        ("base: sfa", "bad.yml: unknown base 'sfa' (did you mean 'saf'?)"),
+        ("a: &a {x: 1}\ndefault: {<<: [*a, *a]}", "merge keys (<<) are not supported"),
+        ("#" * 300_000, "it has more than 200,000 bytes"),
     ],
 )
 def test_bad_files_are_one_line(
@@ -296,10 +413,33 @@ def test_bad_files_are_one_line(
     assert not Path("evaluated").exists()
 
 
-def test_help_tells_defaults_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
-    text = zoo_train.make_parser().format_help()
-    assert "(default: saf)" in text
+def test_help_tells_defaults_and_units() -> None:
+    text = " ".join(zoo_train.make_parser().format_help().split())
+    assert "(default: saf)" in text and "(default: small)" in text
     assert not any(f"(default: {empty})" in text for empty in ("None", "{}", "", "False"))
+    for option in ("--game-steps", "--eval-freq", "--save-freq", "--inspect-freq", "--checkpoint-freq"):
+        assert "game steps" in text.rpartition(f"{option} ")[2][:80], option
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        zoo_train.main,
+        zoo_enjoy.main,
+        *(partial(zoo_plot.main, [kind]) for kind in ("curves", "levels", "aggregate")),
+        zoo_plot.main,
+        experiments_main,
+        quickstart.main,
+        play_main,
+    ],
+)
+def test_every_command_has_help(command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    before = list(command.args[0]) if isinstance(command, partial) else []
+    main = command.func if isinstance(command, partial) else command
+    with pytest.raises(SystemExit) as ended:
+        main([*before, "--help"])
+    assert ended.value.code in (0, None)
+    assert "usage: " in capsys.readouterr().out
 
 
 def test_strings_are_not_evaluated(
@@ -318,6 +458,6 @@ def test_from_a_shell(tmp_path: Path) -> None:
     result = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
     assert result.returncode == 2
     assert result.stderr.splitlines() == [
-        "python -m sb3_saf.train: error: coordination must be an integer from 1 to 10 (1 <= coordination <= n_agents), "
+        "python -m sb3_saf.train: error: coordination must be an integer from 1 to 5 (1 <= coordination <= n_agents), "
         "got 99"
     ]

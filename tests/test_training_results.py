@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,17 +15,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-
-pytest.importorskip("rl_zoo3.train")
-
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 
-import hecogrid_envs
 from sb3_saf import EvaluationResult, evaluate_team
 from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
+from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.runs import Run, describe, find_runs, setting_names, training_curve
 from sb3_saf.training.settings import load_settings, saved_settings
 from sb3_saf.training.watching import play
@@ -108,8 +107,9 @@ def test_the_shown_game_is_the_first_that_is_measured(logs: Path, capsys: pytest
     measured = run.settings.make_env(9, evaluation=True, n_envs=1)
     measured.reset()
     (expected,) = measured.env_method("get_state", indices=0)
-    env = hecogrid_envs.parallel_env(run.settings.task, render_mode="ansi", **run.settings.env_kwargs)
-    first = next(iter(play(env, PPO.load(run.folder / f"{ENV}.zip").policy, 9, True)))
+    env = run.settings.make_game("ansi")
+    path = run.folder / f"{ENV}.zip"
+    first = next(iter(play(env, TrainedTeam(run.settings, PPO.load(path).policy, path), 9, True)))
     assert all(np.array_equal(env.get_state()[key], expected[key]) for key in ("treasures", "walls", "agent_pos"))
     assert first.startswith("step 0")
 
@@ -133,9 +133,9 @@ def test_a_window_needs_a_display(
         (["--env", "TeamTogehter-v0"], "did you mean 'TeamTogether-v0'"),
         (["--algo", "ippo"], "python -m sb3_saf.train --algo ippo"),
         (["-f", "nowhere"], "there is no folder nowhere/saf; train first"),
-        (["--exp-id", "9"], "TeamTogether-v0_9 folder was not found"),
-        (["--env", "TeamSupport-v0"], "No model found"),
-        (["--load-checkpoint", "81"], "No model found"),
+        (["--exp-id", "9"], "there is no run 9 of TeamTogether-v0"),
+        (["--env", "TeamSupport-v0"], "there is no run of TeamSupport-v0"),
+        (["--load-checkpoint", "81"], "has no rl_model_81_steps.zip"),
         (["--env-kwargs", "coordination:5"], "coordination must be an integer from 1 to 4"),
         (["--env-kwargs", "n_agents:5"], "trained with 4 agents"),
         (["--gif", "film.mp4"], "a file that ends with .gif"),
@@ -259,6 +259,38 @@ def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Pat
     picture = imageio.imread(output)
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 50
+
+
+@pytest.mark.parametrize("name", ["monitor.csv", "evaluations.npz"])
+def test_damaged_results_are_one_line(
+    name: str, logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "saf" / f"{ENV}_1"
+    shutil.copytree(logs / "saf" / f"{ENV}_1", run)
+    (run / name).write_text("a,b\nsome,text\n")
+    source = "training" if name == "monitor.csv" else "evaluation"
+    options = ["curves", "-f", str(tmp_path), "--source", source, "-o", str(tmp_path / "a.png")]
+    assert f"{name} is not what sb3_saf.train writes" in failed(zoo_plot.main, options, capsys)
+
+
+@pytest.mark.parametrize("module", ["plot_train", "all_plots"])
+def test_plots_of_rl_zoo3_read_the_folders(module: str, logs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("seaborn")
+    pytest.importorskip("rl_zoo3.plots")
+    options = {
+        "plot_train": ["-a", "saf", "-e", ENV, "-f", str(logs), "-w", "1"],
+        "all_plots": ["-a", "saf", "mappo", "-e", ENV, "-f", str(logs), "--no-display", "-o", str(tmp_path / "all")],
+    }
+    result = subprocess.run(
+        [sys.executable, "-m", f"rl_zoo3.plots.{module}", *options[module]],
+        env={**os.environ, "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "No data" not in result.stdout and "not found" not in result.stdout
+    if module == "all_plots":
+        assert "SAF" in result.stdout and ENV in result.stdout
 
 
 @pytest.mark.parametrize(

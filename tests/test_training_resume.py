@@ -11,13 +11,10 @@ import pytest
 import torch as th
 import yaml
 
-from sb3_saf.training import train as zoo_train
-from sb3_saf.training.devices import check_device
-
-pytest.importorskip("rl_zoo3.train")
-
 from sb3_saf.export.weights import _entry, _tensors
+from sb3_saf.training import train as zoo_train
 from sb3_saf.training.callbacks import SeededEvalCallback
+from sb3_saf.training.devices import check_device
 from sb3_saf.training.settings import load_settings
 
 ENV = "TeamTogether-v0"
@@ -30,6 +27,8 @@ OPTIONS = (
     "2",
     "--checkpoint-freq",
     "1",
+    "-n",
+    "200",
     "--inspect-freq",
     "100000",
 )
@@ -95,7 +94,7 @@ def test_ctrl_c_leaves_model_and_checkpoint_and_says_how_to_go_on(
     run = tmp_path / "saf" / f"{ENV}_1"
     assert (run / f"{ENV}.zip").is_file()
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("Stopped."))
-    command = line.partition("go on from there with: ")[2].removesuffix(".")
+    command = line.partition("go on from there with: ")[2]
     zoo_train.main(shlex.split(command)[3:])
     train(tmp_path / "undisturbed", "saf", "--seed", "3")
     assert left(run) == left(tmp_path / "undisturbed" / "saf" / f"{ENV}_1")
@@ -104,10 +103,10 @@ def test_ctrl_c_leaves_model_and_checkpoint_and_says_how_to_go_on(
 def test_other_settings_begin_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     struck(monkeypatch, RuntimeError)
     with pytest.raises(RuntimeError):
-        train(tmp_path, "saf", "--seed", "3")
+        train(tmp_path, "saf", "--seed", "3", "-n", "80")
     monkeypatch.undo()
     for number, options in enumerate((["--seed", "4"], ["--env-kwargs", "coordination:2"], ["--eval-freq", "50"]), 2):
-        train(tmp_path, "saf", "--resume", *options)
+        train(tmp_path, "saf", "--resume", "-n", "80", *options)
         run = tmp_path / "saf" / f"{ENV}_{number}"
         assert (run / f"{ENV}.zip").is_file()
     assert yaml.safe_load((run / ENV / "args.yml").read_text())["seed"] is not None

@@ -23,7 +23,7 @@ from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.seeds import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ENV_IDS, SIZES, Settings, load_settings, saved_settings
 from sb3_saf.training.values import algorithm_arguments
-from sb3_saf.training.yaml_files import Size, load_yaml, read_config
+from sb3_saf.training.yaml_files import Size, config_names, load_yaml, read_config
 
 ENV = "TeamTogether-v0"
 
@@ -49,7 +49,7 @@ def test_every_entry_builds_and_smoke_learns_one_rollout(algo: str, env_id: str,
     ("algo", "gae_lambda", "max_grad_norm"), [("saf", 1.0, 9.0), ("mappo", 0.95, 10.0), ("ippo", 0.95, 10.0)]
 )
 def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: float) -> None:
-    settings = load_settings(algo, ENV)
+    settings = load_settings(algo, ENV, "paper")
     assert (settings.n_envs, settings.game_steps, settings.total_timesteps) == (128, 10_000_000, 100_000_000)
     assert asdict(HECOGridParams(observation="tiles")) == settings.env_kwargs
     assert settings.time_limit == "terminal"
@@ -70,7 +70,7 @@ def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: floa
 
 
 def test_paper_optimizer() -> None:
-    settings = load_settings("saf", ENV, overrides={"n_envs": 1, "n_steps": 2})
+    settings = load_settings("saf", ENV, "paper", overrides={"n_envs": 1, "n_steps": 2})
     group = settings.make_model(settings.make_env(0), 0, device="cpu").policy.optimizer.param_groups[0]
     assert (group["lr"], group["eps"], group["weight_decay"]) == (7e-4, 1e-5, 0)
 
@@ -80,12 +80,12 @@ def _defaults(algorithm: type) -> dict[str, Any]:
     return {parameter.name: parameter.default for parameter in parameters}
 
 
-@pytest.mark.parametrize("config", sorted({spec.config for spec in ALGOS.values()}))
-def test_files_have_default_first_and_only_what_differs(config: str) -> None:
+@pytest.mark.parametrize("config", [name for name in config_names() if name != "levels"])
+def test_files_have_only_what_differs(config: str) -> None:
     content = read_config(config)
-    assert list(content) == ["default", *ENV_IDS]
-    spec = next(spec for spec in ALGOS.values() if spec.config == config)
-    defaults = _defaults(spec.algorithm)
+    assert set(content) <= {"default", "hecogrid", *ENV_IDS}
+    algorithm = next((spec.algorithm for spec in ALGOS.values() if spec.config == config), PPO)
+    defaults = _defaults(algorithm)
     repeated = {key for key, value in content["default"].items() if key in defaults and value == defaults[key]}
     assert repeated == set()
 
@@ -162,13 +162,14 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"env_kwargs": {"coordination": 11}}, "coordination must be an integer from 1 to 10"),
         ({"env_kwargs": {"grid_size": 6}}, "n_treasures must be"),
         ({"overrides": {"learning_rat": 1}}, r"unknown setting .* \(did you mean 'learning_rate'\?\)"),
-        ({"overrides": {"n_timesteps": 1}}, "use game_steps"),
+        ({"overrides": {"n_timesteps": 1, "game_steps": 1}}, "say the same thing"),
+        ({"overrides": {"normalize": "yes"}}, "normalize must be true or false or a mapping"),
         ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),
         ({"overrides": {"learning_rate": "fast"}}, "learning_rate must be a number or a schedule"),
         ({"overrides": {"learning_rate": "lin_x"}}, "learning_rate must be a number or a schedule"),
         ({"overrides": {"gamma": float("nan")}}, "gamma must be a number"),
         ({"overrides": {"n_steps": 1.5}}, "n_steps must be a whole number, got 1.5"),
-        ({"overrides": {"n_envs": 0}}, "n_envs must be at least 1"),
+        ({"overrides": {"n_envs": 0}}, "n_envs must be from 1 to 100000"),
         ({"overrides": {"n_envs": True}}, "n_envs must be a whole number"),
         ({"overrides": {"normalize_advantage": "yes"}}, "normalize_advantage must be true or false"),
         ({"overrides": {"time_limit": "end"}}, "time_limit must be 'terminal' or 'bootstrap'"),
@@ -186,7 +187,7 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
 )
 def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        load_settings(**{"algo": "saf", "env_id": ENV, **change})
+        load_settings(**{"algo": "saf", "env_id": ENV, "size": "paper", **change})
 
 
 @pytest.mark.parametrize(
@@ -209,6 +210,21 @@ def test_bad_files_are_refused(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message) as error:
         load_settings("saf", ENV, config=tmp_path / "bad.yml")
     assert "bad.yml" in str(error.value)
+
+
+def test_a_file_refines_another(tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text("base: mappo\ndefault: {sizes: {small: {n_epochs: 7}}}", encoding="utf-8")
+    base, own = (load_settings("mappo", ENV, config=config).as_dict() for config in (None, tmp_path / "own.yml"))
+    assert own["hyperparams"].pop("n_epochs") == 7 and base["hyperparams"].pop("n_epochs") == 4
+    assert own == base
+
+
+def test_names_of_rl_zoo3_in_files(tmp_path: Path) -> None:
+    text = "default: {n_timesteps: 1e5, policy: SAFPolicy, n_envs: 2, n_steps: 10, batch_size: 20}"
+    (tmp_path / "own.yml").write_text(text, encoding="utf-8")
+    assert load_settings("saf", ENV, config=tmp_path / "own.yml").game_steps == 100_000
+    with pytest.raises(ValueError, match="--algo, which names the policy"):
+        load_settings("mappo", ENV, config=tmp_path / "own.yml")
 
 
 def test_equal_keys_may_be_in_different_mappings() -> None:

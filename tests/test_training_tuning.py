@@ -8,21 +8,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import optuna
 import pytest
 import yaml
-
-pytest.importorskip("rl_zoo3.train")
-
-import optuna
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from sb3_saf import LightEncoder
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.callbacks import TrialCallback
-from sb3_saf.training.sampling import sample_overrides, to_overrides
 from sb3_saf.training.settings import load_settings
+from sb3_saf.training.tune import TrialCallback, sample_overrides, to_overrides
 
 ENV = "TeamTogether-v0"
 SMOKE = ("--algo", "saf", "--env", ENV, "--size", "smoke", "--seed", "3", "--eval-episodes", "4")
@@ -114,7 +110,6 @@ def test_a_failed_trial_is_never_complete(
 
 
 def test_trial_zero_is_a_trial(tmp_path: Path) -> None:
-    """RL-Zoo3 takes 0 for "none"."""
     study = tune(tmp_path)
     options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
     for number, trial in enumerate(("0", "best"), start=1):

@@ -112,8 +112,6 @@ def test_it_trains_outside_the_checkout(installed: Path, tmp_path: Path) -> None
 
 
 def test_its_commands_run_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
-    for package in ("rl_zoo3", "pandas", "requests"):
-        pytest.importorskip(package, reason="needs the extra 'zoo'")
     table = call(["-m", "sb3_saf.parameters"], tmp_path, PYTHONPATH=str(installed))
     assert "1,740,016" in table
     options = ["--algo", "saf", "--env", "TeamSupport-v0", "--size", "smoke", "-f", "logs", "--eval-freq", "-1"]

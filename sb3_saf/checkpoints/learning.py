@@ -172,7 +172,7 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
             checkpoints.write_last()
             newest = checkpoints.store.checkpoints()
             if newest:
-                print(f"\nStopped. {newest[0]} is saved; {again}.", flush=True)
+                print(f"\nStopped. {newest[0]} is saved; {again}", flush=True)
             raise
         except ValueError as error:
             if not isinstance(error, NonFiniteError) and not _OF_TORCH.match(str(error)):

@@ -1,13 +1,14 @@
-"""Evaluation, checkpoints and tuning while training: all in game steps, none touching the generators of training."""
+"""Callbacks of a run: all count game steps, and none touches the generators of training."""
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-import optuna
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from tqdm import TqdmExperimentalWarning
 from tqdm.rich import tqdm
@@ -15,14 +16,23 @@ from tqdm.rich import tqdm
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.envs.teams import require_n_agents
-from sb3_saf.evaluation import EvaluationResult
 from sb3_saf.randomness import own_randomness
 from sb3_saf.training.seeds import evaluation_seed
+
+#: The rate of training is measured from the end of the first rollout on, for at least so many seconds.
+_MEASURED_SECONDS: Final = 20.0
+_MEASURED_ROLLOUTS: Final = 2
+
+
+def _game_steps(model: Any) -> int:
+    steps = game_steps(model)
+    assert steps is not None, "settings make environments of teams only"
+    return steps
 
 
 class SeededEvalCallback(TeamEvalCallback):
     """
-    ``TeamEvalCallback`` that leaves training as it would be without it, and evaluates the final policy too.
+    ``TeamEvalCallback`` that leaves training as it would be without it, and evaluates the final policy, too.
 
     :param args: as ``TeamEvalCallback``
     :param seed: the run's seed
@@ -34,11 +44,6 @@ class SeededEvalCallback(TeamEvalCallback):
         self._seed = evaluation_seed(seed)
         self._n_evaluations = 0
         self._evaluated_at = -1
-        self._has_started = False
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        self._has_started = True
 
     def _evaluate(self) -> bool:
         self._n_evaluations += 1
@@ -47,46 +52,20 @@ class SeededEvalCallback(TeamEvalCallback):
             return super()._evaluate()
 
     def checkpoint_state(self) -> dict[str, int]:
-        """Counters, for exact resume."""
+        """Return the counters, for exact resume."""
         return {"n_evaluations": self._n_evaluations, "evaluated_at": self._evaluated_at}
 
     def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
         """
         Go on from there.
 
-        :param state: what :meth:`checkpoint_state` gave
+        :param state: from :meth:`checkpoint_state`
         """
         self._n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
 
     def _on_training_end(self) -> None:
-        # RL-Zoo3 ends its first callback once more, and ends it even if training never began.
-        if self._has_started and self.eval_freq > 0 and self._evaluated_at != self._game_steps():
+        if self.eval_freq > 0 and self._evaluated_at != self._game_steps():
             self._evaluate()
-
-
-class TrialCallback(SeededEvalCallback):
-    """
-    Evaluation of an Optuna trial: reports every evaluation, and stops what the pruner gives up.
-
-    :param args: as ``SeededEvalCallback``
-    :param trial: the trial
-    :param kwargs: as ``SeededEvalCallback``
-    """
-
-    def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.trial = trial
-        self.is_pruned = False
-
-    def _react(self, result: EvaluationResult) -> bool:
-        go_on = super()._react(result)
-        self.trial.report(result.mean, self._n_evaluations)
-        self.is_pruned = self.trial.should_prune()
-        return go_on and not self.is_pruned
-
-    def _on_training_end(self) -> None:
-        if not self.is_pruned:
-            super()._on_training_end()
 
 
 class GameStepsProgressBar(ProgressBarCallback):
@@ -107,18 +86,51 @@ class GameStepsProgressBar(ProgressBarCallback):
         self.close()
 
     def close(self) -> None:
-        """Leave the bar as it is; also if training never began, or has ended by an error."""
+        """Leave the bar as it is; also if training never began, or ended by an error."""
         if hasattr(self, "pbar"):
             self.pbar.close()
+
+
+class RemainingTime(BaseCallback):
+    """
+    Print, once, how long the rest of the training will take, as soon as the first rollouts tell.
+
+    :param verbose: 0 for silence
+    """
+
+    def __init__(self, verbose: int = 1) -> None:
+        super().__init__(verbose)
+        self._n_rollouts = 0
+        self._started: tuple[float, int] | None = None
+        self._told = False
+
+    def _on_rollout_start(self) -> None:
+        self._n_rollouts += 1
+        now, steps = time.perf_counter(), _game_steps(self.model)
+        if self._started is None:
+            if self._n_rollouts > 1:  # the first one compiles and fills caches
+                self._started = now, steps
+            return
+        seconds = now - self._started[0]
+        if self._told or self.verbose == 0 or self._n_rollouts < 2 + _MEASURED_ROLLOUTS or seconds < _MEASURED_SECONDS:
+            return
+        self._told = True
+        rate = (steps - self._started[1]) / seconds
+        total = self.locals["total_timesteps"] // require_n_agents(self.training_env)
+        left = timedelta(seconds=round(max(0, total - steps) / rate))
+        print(f"{rate:,.0f} game steps per second: about {left} (h:mm:ss) to go", flush=True)
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class CheckpointInGameSteps(BaseCallback):
     """
     Save the model every so many game steps, as ``rl_model_<game steps>_steps.zip``.
 
-    :param save_freq: game steps between checkpoints, summed over all parallel games
+    :param save_freq: game steps between saved models, summed over all parallel games
     :param folder: where to
-    :param verbose: 1 to say so
+    :param verbose: 1 to print each file's name
     """
 
     def __init__(self, save_freq: int, folder: str | Path, verbose: int = 0) -> None:
@@ -127,16 +139,11 @@ class CheckpointInGameSteps(BaseCallback):
         self.folder = Path(folder)
         self._next = 0
 
-    def _game_steps(self) -> int:
-        steps = game_steps(self.model)
-        assert steps is not None, "the zoo trains on teams only"
-        return steps
-
     def _on_training_start(self) -> None:
-        self._next = (self._game_steps() // self.save_freq + 1) * self.save_freq
+        self._next = (_game_steps(self.model) // self.save_freq + 1) * self.save_freq
 
     def _on_step(self) -> bool:
-        steps = self._game_steps()
+        steps = _game_steps(self.model)
         if steps >= self._next:
             self._next = (steps // self.save_freq + 1) * self.save_freq
             path = self.folder / f"rl_model_{steps}_steps.zip"

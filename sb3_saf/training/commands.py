@@ -1,17 +1,18 @@
-"""What the zoo's commands share: options as ``key:value``, and errors of one line that say what to do."""
+"""What the commands share: options as ``key:value``, and errors of one line that say what to do."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import ModuleType
 from typing import Any, NoReturn
 
+from sb3_saf.training.environments import HOW_TO_NAME
 from sb3_saf.training.yaml_files import parse_value
 
 USAGE_ERROR = 2
@@ -24,11 +25,11 @@ class CommandError(Exception):
 @contextmanager
 def user_errors(*kinds: type[Exception]) -> Iterator[None]:
     """
-    What is raised in here is for the user, not a bug: no traceback.
+    Turn errors that the user can put right into :class:`CommandError`: no traceback.
 
-    :param kinds: errors of these kinds, and ValueError
+    :param kinds: of errors; ValueError by default
     """
-    caught: tuple[type[Exception], ...] = (ValueError, *kinds)
+    caught = kinds or (ValueError,)
     try:
         yield
     except caught as error:
@@ -77,7 +78,7 @@ class KeyValues(argparse.Action):
 
 def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
     """
-    The words that give pairs to an option of :class:`KeyValues`.
+    Return the words that give pairs to an option of :class:`KeyValues`.
 
     :param option: such as ``"--env-kwargs"``
     :param pairs: plain data
@@ -107,32 +108,43 @@ def run_command(program: str, command: Callable[[], None]) -> None:
         raise SystemExit(128 + signal.SIGINT) from None
 
 
-@contextmanager
-def replaced(module: ModuleType, name: str, value: object) -> Iterator[None]:
+def require(*modules: str) -> None:
     """
-    Put something else into a module for a while: the doors that RL-Zoo3 leaves open are names in its modules.
-
-    :param module: the module
-    :param name: what to replace
-    :param value: by what
-    """
-    kept = getattr(module, name)
-    setattr(module, name, value)
-    try:
-        yield
-    finally:
-        setattr(module, name, kept)
-
-
-def require_zoo() -> None:
-    """
-    Check that RL-Zoo3 and what it needs are installed.
+    Check that optional packages are installed.
 
     :raises CommandError: with the command that installs them
     """
-    try:
-        import rl_zoo3.train  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise CommandError(
-            f"this command needs {error.name}, which is not installed: pip install 'sb3-saf[zoo]'"
-        ) from None
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise CommandError(
+                f"this command needs {error.name}, which is not installed: pip install '.[render,zoo]' in the clone"
+            ) from None
+
+
+def import_packages(packages: Sequence[str]) -> None:
+    """
+    Import the packages of ``--gym-packages``, which register environments.
+
+    :raises CommandError: if one cannot be imported
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise CommandError(f"--gym-packages: cannot import {package!r}: {error}") from error
+
+
+def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -> None:
+    """
+    Add ``--env``, ``--env-kwargs`` and ``--gym-packages``.
+
+    :param parser: a parser or a group of it
+    :param of_level: help of ``--env-kwargs``
+    """
+    parser.add_argument("--env", default="TeamTogether-v0", help=HOW_TO_NAME)
+    parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help=of_level)
+    parser.add_argument(
+        "--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import, which register environments"
+    )

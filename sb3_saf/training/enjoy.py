@@ -4,72 +4,79 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
-from sb3_saf.export.errors import ExportError
 from sb3_saf.export.weights import load_weights
 from sb3_saf.training.algorithms import ALGOS, find_algorithm
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
-    KeyValues,
     OneLineParser,
-    require_zoo,
+    add_environment_options,
+    import_packages,
     run_command,
     user_errors,
 )
-from sb3_saf.training.names import unknown_name
+from sb3_saf.training.environments import find_environment
+from sb3_saf.training.folders import find_model, read_run
 from sb3_saf.training.seeds import check_seed
-from sb3_saf.training.settings import ENV_IDS, Settings, saved_settings
+from sb3_saf.training.settings import Settings, saved_settings
+from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.enjoy"
 
 
-class TrainedTeam(NamedTuple):
+@dataclass(frozen=True)
+class TrainedTeam:
     """
     A policy with the games that it plays.
 
     :param settings: of the run, with the level to play
     :param policy: with the weights of the run
-    :param model_path: where they came from
+    :param path: of the model
     """
 
     settings: Settings
     policy: BasePolicy
-    model_path: Path
+    path: Path
+
+    def measure(self, n_episodes: int, seed: int, deterministic: bool) -> EvaluationResult:
+        """
+        Measure team returns over games that no run was trained on.
+
+        :param n_episodes: team episodes, each in a game of its own
+        :param seed: of games and actions
+        :param deterministic: whether to take the most likely actions
+        """
+        set_random_seed(seed)
+        with closing(self.settings.make_env(seed, evaluation=True, n_envs=n_episodes)) as games:
+            load_normalization(games, self.path.parent)
+            return evaluate_team(self.policy, games, n_episodes, deterministic=deterministic)
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The options."""
+    """Make the parser."""
     parser = OneLineParser(
-        prog=PROGRAM,
-        description="Measure and watch a trained team.",
-        formatter_class=DefaultsFormatter,
+        prog=PROGRAM, description="Measure and watch a trained team.", formatter_class=DefaultsFormatter
     )
     parser.add_argument("--algo", default="saf", help=", ".join(ALGOS))
-    parser.add_argument("--env", default="TeamTogether-v0", help=", ".join(ENV_IDS))
-    parser.add_argument("-f", "--log-folder", default="logs", help="the folder of the training")
+    add_environment_options(parser, "another level than was trained on, such as coordination:3")
+    parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="the folder of the training")
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run, 0 for the latest")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="the model with the best evaluation")
-    which.add_argument("--load-checkpoint", metavar="STEPS", help="the checkpoint after these game steps")
-    which.add_argument("--load-last-checkpoint", action="store_true", help="the last checkpoint")
+    which.add_argument("--load-checkpoint", metavar="STEPS", type=int, help="the model saved after these game steps")
+    which.add_argument("--load-last-checkpoint", action="store_true", help="the model that was saved last on the way")
     parser.add_argument("--episodes", type=int, default=32, help="team episodes to measure")
     parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
     parser.add_argument("--seed", type=int, default=0, help="of the games, none of which was trained on")
-    parser.add_argument(
-        "--env-kwargs",
-        nargs="+",
-        action=KeyValues,
-        default={},
-        metavar="KEY:VALUE",
-        help="another level: coordination:3",
-    )
     shown = parser.add_mutually_exclusive_group()
     shown.add_argument("--gif", type=Path, metavar="FILE", help="record a game")
     shown.add_argument("--mp4", type=Path, metavar="FILE", help="record a game")
@@ -87,69 +94,52 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
     :raises CommandError: for what the user can put right
     """
     options = make_parser().parse_args(arguments)
-    with user_errors():
-        find_algorithm(options.algo)
-        check_seed(options.seed)
-        if options.env not in ENV_IDS:
-            raise unknown_name("environment", options.env, ENV_IDS)
+    import_packages(options.gym_packages)
     if options.episodes < 1:
         raise CommandError(f"--episodes must be at least 1, got {options.episodes}")
-    team = load_team(options)
+    with user_errors():
+        check_seed(options.seed)
+        team = load_team(options)
     from sb3_saf.training import watching
 
-    # Before the measurement, which nobody should wait for in vain.
-    with user_errors(RuntimeError, ImportError), watching.open_screen(team.settings, options) as screen:
-        result = measure(team, options.episodes, options.seed, options.deterministic)
-        print(f"{options.algo} on {options.env}, {team.model_path}")
+    # The screen is opened before the measurement, which nobody should wait for in vain.
+    with user_errors(ValueError, RuntimeError, ImportError), watching.open_screen(team, options) as screen:
+        result = team.measure(options.episodes, options.seed, options.deterministic)
+        print(f"{options.algo} on {options.env}, weights of {team.path}")
         print(f"team return {result}")
-        watching.show_game(screen, team.policy, options.seed, options.deterministic)
+        watching.show_game(screen, team, options.seed, options.deterministic)
     return result
 
 
 def load_team(options: argparse.Namespace) -> TrainedTeam:
     """
-    Find a run with RL-Zoo3's helpers, and make its policy.
-
-    Weights are read as numbers: a model's zip can hold code, which SB3's own loading would run.
+    Find a run, and make its policy. Weights are read as numbers: no code of a model's file is run.
 
     :param options: of the command line
+    :raises ValueError: if there is no such run, or it does not fit
     """
-    require_zoo()
-    from rl_zoo3.utils import EnvironmentName, get_model_path  # type: ignore[attr-defined]  # its own import
-
-    from sb3_saf.training.runs import Run
-
-    env_name = EnvironmentName(options.env)
-    if not Path(options.log_folder, options.algo).is_dir():
-        raise CommandError(
-            f"there is no folder {Path(options.log_folder, options.algo)}; train first: python -m sb3_saf.train "
-            f"--algo {options.algo} --env {options.env} -f {options.log_folder}"
+    find_algorithm(options.algo)
+    environment = find_environment(options.env)
+    which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
+    folder, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
+    config = read_run(folder, environment.folder_name)
+    if (config.get("algo"), config.get("env")) != (options.algo, environment.id):
+        raise ValueError(f"{folder} is a run of {config.get('algo')} on {config.get('env')}; give its --algo and --env")
+    trained, settings = saved_settings(config), saved_settings(config, options.env_kwargs)
+    if settings.n_agents != trained.n_agents:
+        raise ValueError(
+            f"the team was trained with {trained.n_agents} agents, got n_agents={settings.n_agents}; leave "
+            "n_agents out of --env-kwargs"
         )
-    with user_errors(AssertionError, ExportError):
-        _, path, folder = get_model_path(
-            options.exp_id,
-            options.log_folder,
-            options.algo,
-            env_name,
-            options.load_best,
-            options.load_checkpoint,
-            options.load_last_checkpoint,
+    return TrainedTeam(settings, _policy(settings, path), path)
+
+
+def _policy(settings: Settings, path: Path) -> BasePolicy:
+    with closing(settings.make_env(0, n_envs=1)) as games:
+        kwargs = settings.hyperparams.get("policy_kwargs", {})
+        policy = settings.spec.policy_class(
+            games.observation_space, games.action_space, lr_schedule=_no_learning, **kwargs
         )
-        run = Run(Path(folder), options.env, options.exp_id)
-        settings = saved_settings(run.config, options.env_kwargs)
-        if settings.n_agents != run.settings.n_agents:
-            raise ValueError(
-                f"the team was trained with {run.settings.n_agents} agents, got n_agents={settings.n_agents}; leave "
-                "n_agents out of --env-kwargs"
-            )
-        return TrainedTeam(settings, _policy(settings, path), Path(path))
-
-
-def _policy(settings: Settings, path: str) -> BasePolicy:
-    env = settings.make_env(0, n_envs=1)
-    kwargs = settings.hyperparams.get("policy_kwargs", {})
-    policy = settings.spec.policy_class(env.observation_space, env.action_space, lr_schedule=_no_learning, **kwargs)
-    env.close()
     load_weights(policy, path)
     policy.set_training_mode(False)
     return policy
@@ -157,22 +147,6 @@ def _policy(settings: Settings, path: str) -> BasePolicy:
 
 def _no_learning(progress_remaining: float) -> float:
     return 0.0
-
-
-def measure(team: TrainedTeam, n_episodes: int, seed: int, deterministic: bool) -> EvaluationResult:
-    """
-    Team returns over games that no run was trained on.
-
-    :param team: who plays
-    :param n_episodes: team episodes, each in a game of its own
-    :param seed: of games and actions
-    :param deterministic: whether to take the most likely actions
-    """
-    set_random_seed(seed)
-    env = team.settings.make_env(seed, evaluation=True, n_envs=n_episodes)
-    result = evaluate_team(team.policy, env, n_episodes, deterministic=deterministic)
-    env.close()
-    return result
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

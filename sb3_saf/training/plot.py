@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hecogrid_envs.params import HECOGridParams
 from sb3_saf.training.commands import CommandError, OneLineParser, run_command, user_errors
 from sb3_saf.training.names import unknown_name
 
@@ -16,6 +15,8 @@ if TYPE_CHECKING:
 
 PROGRAM: Final = "python -m sb3_saf.plot"
 FORMATS: Final = (".png", ".pdf", ".svg")
+#: Columns of :func:`describe` that are no parameters of the game.
+_NO_LEVELS: Final = ("env", "size", "seed", "run", "changes", "method")
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -23,12 +24,12 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OneLineParser(prog=PROGRAM, description="Draw the runs in a log folder.")
     commands = parser.add_subparsers(dest="kind", required=True, parser_class=OneLineParser)
     kinds = {
-        "curves": "learning curves: mean and 95 % interval over seeds, in game steps",
-        "levels": "bars of the return against a parameter of the level, mean and 95 % interval over seeds",
+        "curves": "learning curves: mean and 95 %% interval over seeds, in game steps",
+        "levels": "bars of the return against a parameter of the level, mean and 95 %% interval over seeds",
         "aggregate": "interquartile means and performance profiles with stratified bootstrap intervals (rliable)",
     }
     for kind, text in kinds.items():
-        command = commands.add_parser(kind, help=text, description=text)
+        command = commands.add_parser(kind, help=text, description=text.replace("%%", "%"))
         command.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="where the runs are")
         command.add_argument("--algos", nargs="+", default=[], help="only these")
         command.add_argument("--env", nargs="+", default=[], help="only these environments")
@@ -55,14 +56,11 @@ def plot(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     if options.output.suffix not in FORMATS:
         raise CommandError(f"--output must end with {', '.join(FORMATS)}, got {str(options.output)!r}")
-    levels = HECOGridParams.__dataclass_fields__
-    if options.kind == "levels" and options.level not in levels:
-        raise CommandError(str(unknown_name("parameter", options.level, levels)))
     try:
         with user_errors():
             figure = _draw(options)
     except ModuleNotFoundError as error:
-        raise CommandError(f"figures need {error.name}: pip install 'sb3-saf[render,zoo]'") from None
+        raise CommandError(f"figures need {error.name}: pip install '.[render,zoo]' in the clone") from None
     options.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.output)
     print(options.output)
@@ -76,6 +74,8 @@ def _draw(options: argparse.Namespace) -> Figure:
     from sb3_saf.training.statistics import score_matrices
 
     table = describe(find_runs(options.log_folder, options.algos, options.env))
+    if options.kind == "levels" and options.level not in table:
+        raise unknown_name("parameter", options.level, (column for column in table if column not in _NO_LEVELS))
     without = [options.level] if options.kind == "levels" else []
     table["setting"] = setting_names(table, without)
     for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
@@ -90,8 +90,10 @@ def _draw(options: argparse.Namespace) -> Figure:
     table["score"] = [run.final_score(options.source) for run in table["run"]]
     if options.kind == "levels":
         return draw_levels(table, options.level, options.title, panel="setting")
-    normalised = table.assign(score=table["score"] / table["n_treasures"])
-    return draw_aggregates(score_matrices(normalised, "setting"), options.title, "treasures collected / on the map")
+    label = "team return"
+    if "n_treasures" in table and table["n_treasures"].notna().all():
+        table["score"], label = table["score"] / table["n_treasures"], "treasures collected / on the map"
+    return draw_aggregates(score_matrices(table, "setting"), options.title, label)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

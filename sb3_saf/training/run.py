@@ -23,15 +23,19 @@ from sb3_saf.callbacks.finite import FiniteCallback
 from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback
-from sb3_saf.training.inspection import inspection
+from sb3_saf.training.seeds import evaluation_seed
 from sb3_saf.training.settings import Settings
+from sb3_saf.training.wrappers import load_normalization, make_callbacks, save_normalization
 
 CHECKPOINTS: Final = "checkpoints"
 #: Evaluations, inspections and checkpoints of a run, unless a frequency is given.
 EVALUATIONS_PER_RUN: Final = 20
 INSPECTIONS_PER_RUN: Final = 10
 CHECKPOINTS_PER_RUN: Final = 10
+#: Team episodes of an inspection, each in a game of its own.
+INSPECTED_EPISODES: Final = 16
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class RunOptions:
     :param initial_model: a saved model whose weights and optimiser the run begins with; None for fresh ones
     :param log_interval: rollouts between log entries; None for SB3's default, 0 for no log
     :param device: as SB3 takes it
+    :param n_cpus: processes that step the training games; HECOGrid's compiled games need one
     :param num_threads: of torch; None for its own choice
     :param progress: whether to draw a progress bar in game steps
     :param verbose: 0 or 1, as SB3 takes it
@@ -77,6 +82,7 @@ class RunOptions:
     initial_model: Path | None = None
     log_interval: int | None = None
     device: str = "auto"
+    n_cpus: int = 1
     num_threads: int | None = None
     progress: bool = False
     verbose: int = 0
@@ -133,7 +139,8 @@ class Training:
         if self.options.num_threads is not None:
             th.set_num_threads(self.options.num_threads)
         with ExitStack() as self._open:  # which closes what is open already if the rest cannot be made
-            self.model = self._make_model(self._games(settings))
+            self.games = self._games(settings, monitor_dir=folder, n_cpus=self.options.n_cpus)
+            self.model = self._make_model()
             self.callbacks = [*callbacks, *self._make_callbacks()]
             self._open = self._open.pop_all()
 
@@ -181,6 +188,7 @@ class Training:
             self.callbacks,
             every_game_steps=checkpoint_freq,
             keep=2,
+            exact=self.settings.is_exactly_resumable,
             again=options.resume_hint,
             **arguments,
         )
@@ -188,26 +196,30 @@ class Training:
     def _save(self) -> None:
         if self.folder is not None:
             self.model.save(self.folder / f"{self.options.model_name}.zip")
+            save_normalization(self.games, self.folder)
 
     def _games(self, settings: Settings, **kwargs: Any) -> CentralizedValueWrapper:
         """Games that are closed with the training."""
-        games = settings.make_env(self.seed, monitor_dir=None if kwargs else self.folder, **kwargs)
+        games = settings.make_env(self.seed, **kwargs)
         self._open.callback(games.close)
         return games
 
-    def _make_model(self, games: CentralizedValueWrapper) -> BaseAlgorithm:
+    def _make_model(self) -> BaseAlgorithm:
         options = self.options
+        if options.tensorboard_log is not None:
+            options.tensorboard_log.mkdir(parents=True, exist_ok=True)
         log = None if options.tensorboard_log is None else str(options.tensorboard_log)
         model = self.settings.make_model(
-            games, self.seed, device=options.device, tensorboard_log=log, verbose=options.verbose
+            self.games, self.seed, device=options.device, tensorboard_log=log, verbose=options.verbose
         )
         if options.initial_model is not None:
             load_parameters(model, options.initial_model)
+            load_normalization(self.games, options.initial_model.parent)
         return model
 
     def _make_callbacks(self) -> list[BaseCallback]:
         options = self.options
-        callbacks: list[BaseCallback] = []
+        callbacks = make_callbacks(self.settings.wrapping)
         if options.progress:
             bar = GameStepsProgressBar()
             self._open.callback(bar.close)
@@ -217,10 +229,8 @@ class Training:
         if eval_freq := self._every(options.eval_freq, EVALUATIONS_PER_RUN):
             callbacks.append(self._evaluation(eval_freq))
         inspect_freq = self._every(options.inspect_freq, INSPECTIONS_PER_RUN)
-        if options.tensorboard_log is not None and inspect_freq:
-            look = inspection(self.settings, self.seed, inspect_freq)
-            self._open.callback(look.eval_env.close)
-            callbacks.append(look)
+        if options.tensorboard_log is not None and inspect_freq and "normalize" not in self.settings.wrapping:
+            callbacks.append(self._inspection(inspect_freq))
         return callbacks
 
     def _evaluation(self, eval_freq: int) -> SeededEvalCallback:
@@ -241,6 +251,20 @@ class Training:
             eval_freq=eval_freq,
             deterministic=options.deterministic_eval or not settings.spec.draws_actions,
             verbose=options.verbose,
+        )
+
+    def _inspection(self, every_game_steps: int) -> InspectionCallback:
+        """Draw the inside of the policy for TensorBoard, on games that no run trains on."""
+        settings = self.settings
+        games = self._games(
+            settings, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode=settings.environment.picture_mode
+        )
+        return InspectionCallback(
+            games,
+            every_game_steps,
+            INSPECTED_EPISODES,
+            seed=evaluation_seed(self.seed),
+            hparams={"algo": settings.algo, "task": settings.task, "size": settings.size, **settings.env_kwargs},
         )
 
     def _every(self, frequency: int | None, times_per_run: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +12,10 @@ from typing import Any, Final, Literal
 import numpy as np
 import pandas as pd
 
+from sb3_saf.training.environments import folder_name
+from sb3_saf.training.folders import read_run, run_number
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.settings import Settings, load_settings, saved_settings
-from sb3_saf.training.yaml_files import load_yaml
 
 #: Where scores come from: evaluation games, or the games that were trained on.
 Source = Literal["evaluation", "training"]
@@ -32,24 +34,18 @@ class Run:
     A folder that ``sb3_saf.train`` has left.
 
     :param folder: the folder
-    :param env_id: the environment
+    :param name: of the environment, as it is in folders
     :param number: of the run, counted for each algorithm and environment
     """
 
     folder: Path
-    env_id: str
+    name: str
     number: int
 
     @cached_property
     def config(self) -> Mapping[str, Any]:
         """``config.yml``."""
-        path = self.folder / self.env_id / "config.yml"
-        if not path.is_file():
-            raise ValueError(f"{self.folder} is no run of sb3_saf.train: there is no {path}")
-        config = load_yaml(path.read_text(encoding="utf-8"), str(path))
-        if not isinstance(config, dict) or "seed" not in config:
-            raise ValueError(f"{path} does not hold the settings of a run of sb3_saf.train")
-        return config
+        return read_run(self.folder, self.name)
 
     @cached_property
     def settings(self) -> Settings:
@@ -82,8 +78,11 @@ class Run:
         path = self.folder / "evaluations.npz"
         if not path.is_file():
             raise ValueError(f"{self.folder} has no evaluations; train with --eval-freq, or plot --source training")
-        with np.load(path) as arrays:
-            return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
+        except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is not what sb3_saf.train writes: {error}") from error
 
     def _training(self) -> pd.DataFrame:
         path = self.folder / "monitor.csv"
@@ -104,7 +103,10 @@ def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFra
     path = Path(monitor)
     if path.is_dir():
         path /= "monitor.csv"
-    episodes = pd.read_csv(path, comment="#")
+    try:
+        episodes = pd.read_csv(path, comment="#")[["r", "l"]].astype(float)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is not what sb3_saf.train writes: {error}") from error
     if episodes.empty:
         raise ValueError(f"no episode has ended in {path.parent}; train longer")
     steps = episodes["l"].cumsum()
@@ -115,7 +117,7 @@ def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFra
 
 def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
     """
-    Runs in a log folder.
+    Find the runs in a log folder.
 
     :param folder: the log folder
     :param algos: only these; all if empty
@@ -124,12 +126,14 @@ def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str
     """
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; give the -f that sb3_saf.train was given")
+    names = {folder_name(env_id) for env_id in env_ids}
     found: dict[str, list[Run]] = {}
-    for config in sorted(folder.glob("*/*_*/*/config.yml")):
-        run_folder, env_id = config.parent.parent, config.parent.name
-        number = run_folder.name.removeprefix(f"{env_id}_")
-        if number.isdigit() and (not env_ids or env_id in env_ids):
-            found.setdefault(run_folder.parent.name, []).append(Run(run_folder, env_id, int(number)))
+    for algo_folder in sorted(path for path in folder.iterdir() if path.is_dir()):
+        for run_folder in sorted(path for path in algo_folder.iterdir() if path.is_dir()):
+            for name in (config.parent.name for config in run_folder.glob("*/config.yml")):
+                number = run_number(run_folder, name)
+                if number is not None and (not names or name in names):
+                    found.setdefault(algo_folder.name, []).append(Run(run_folder, name, number))
     if not found:
         of = f" of {', '.join(env_ids)}" if env_ids else ""
         raise ValueError(f"there are no runs{of} in {folder}; train some: python -m sb3_saf.train -f {folder}")
@@ -142,11 +146,11 @@ def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str
 
 def describe(runs: Sequence[Run]) -> pd.DataFrame:
     """
-    What tells runs apart.
+    Tell runs apart.
 
     :param runs: the runs
-    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size``, ``n_treasures`` and the parameters
-        of the level; a method's name says in what it differs from the zoo's settings and from other runs, or, where
+    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game; a
+        method's name says in what it differs from the zoo's settings and from other runs, or, where
         that is much, has a number, and ``changes`` says it. Of runs that are alike but for their number only the latest
         is there.
     """
@@ -165,12 +169,10 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
 def _changes(runs: Sequence[Run]) -> list[str]:
     """What differs from the zoo's settings, and not in all runs of the algorithm at that size alike."""
     own = [_different_from_the_zoo(run.settings) for run in runs]
-    peers: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for run, different in zip(runs, own, strict=True):
-        peers.setdefault((run.settings.algo, run.settings.size), []).append(different)
+    kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
     texts = []
-    for run, different in zip(runs, own, strict=True):
-        others = peers[run.settings.algo, run.settings.size]
+    for kind, different in zip(kinds, own, strict=True):
+        others = [other for of, other in zip(kinds, own, strict=True) if of == kind]
         named = [key for key, value in different.items() if any(other.get(key) != value for other in others)]
         texts.append(" ".join(f"{key}={different[key]}" for key in sorted(named)))
     return texts
@@ -185,7 +187,7 @@ def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
 
 
 def _flat(settings: Settings) -> dict[str, Any]:
-    own = {"n_envs": settings.n_envs, "game_steps": settings.game_steps, **settings.plain}
+    own = {"n_envs": settings.n_envs, "game_steps": settings.game_steps, **settings.plain, **settings.wrapping}
     of_policy = own.pop("policy_kwargs", {})
     return {**own, **of_policy}
 
@@ -217,6 +219,6 @@ def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[st
     named = {"method", "changes", "seed", "env", "run", *without}
     varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
     return [
-        ", ".join([row["env"].removesuffix("-v0"), *(f"{column} {row[column]}" for column in varying)])
+        ", ".join([row["env"].removesuffix("-v0"), *(f"{c} {row[c]}" for c in varying if not pd.isna(row[c]))])
         for _, row in table.iterrows()
     ]

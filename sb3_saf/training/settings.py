@@ -1,6 +1,6 @@
 """
 Settings of a run, by name: ``load_settings("saf", "TeamTogether-v0", "small")`` says everything that decides a result
-but the seed, and makes the environments and the model.
+but the seed, and makes the games and the model.
 
 They come from ``zoo_configs``: ``levels.yml`` has the games of each size, the algorithm's file its hyperparameters.
 Only what differs from the constructors is written there. E games, N agents.
@@ -9,28 +9,24 @@ Only what differs from the constructors is written there. E games, N agents.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, get_args
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from hecogrid_envs import TASK_NAMES
-from hecogrid_envs.constants import RenderMode
-from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.task import TaskName
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.make import make_team_env
 from sb3_saf.training.algorithms import ALGOS, AlgorithmSpec, find_algorithm
+from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.seeds import check_seed, evaluation_seed
 from sb3_saf.training.values import algorithm_arguments, policy_arguments, resolve
+from sb3_saf.training.wrappers import WRAPPER_KEYS, wrap_game, wrap_rows, wraps_games
 from sb3_saf.training.yaml_files import DEFAULT, MERGED, SIZES, Size, entry_of, merge, read_config, read_file
-
-#: Environment ids, as RL-Zoo3 and Gymnasium write them.
-TASK_OF_ENV: Final[dict[str, TaskName]] = {f"{task}-v0": task for task in TASK_NAMES}
-ENV_IDS: Final = tuple(TASK_OF_ENV)
 
 #: Types of the keys that are ours, beside the arguments of the algorithm's constructor.
 _OWN_KEYS: Final[dict[str, Any]] = {
@@ -40,15 +36,15 @@ _OWN_KEYS: Final[dict[str, Any]] = {
     "time_limit": TimeLimit,
     "env_kwargs": dict[str, Any],
     "policy_kwargs": dict[str, Any],
+    "env_wrapper": str | list[Any] | dict[str, Any] | None,
+    "vec_env_wrapper": str | list[Any] | dict[str, Any] | None,
+    "callback": str | list[Any] | dict[str, Any] | None,
+    "normalize": bool | dict[str, Any],
+    "frame_stack": int,
 }
-#: What RL-Zoo3's files have that counts in other units here.
-_RENAMED: Final = {
-    "n_timesteps": "game_steps (steps of the game; timesteps are those of every agent)",
-    "policy": "--algo, which names the policy",
-}
+#: RL-Zoo3's name for game steps.
+_N_TIMESTEPS: Final = "n_timesteps"
 _SAVED_KEYS: Final = ("algo", "env", "size", "n_envs", "game_steps", "time_limit", "env_kwargs", "hyperparams")
-#: The games' default here: the same views as the paper's pictures in 49 bytes.
-_ENV_DEFAULTS: Final = {"observation": "tiles"}
 
 
 @dataclass(frozen=True)
@@ -57,25 +53,29 @@ class Settings:
     Everything that decides a run but its seed.
 
     :param algo: name in ``ALGOS``
-    :param env_id: such as ``"TeamTogether-v0"``
+    :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
     :param size: one of ``SIZES``
-    :param env_kwargs: every parameter of the game
+    :param n_agents: N
+    :param env_kwargs: parameters of the game; of HECOGrid all of them
     :param time_limit: whether a time limit counts as an end (see ``CentralizedValueWrapper``)
     :param n_envs: E, games that are trained on in parallel
     :param game_steps: steps of the game to train for, summed over all games
     :param hyperparams: arguments of the algorithm's constructor, as objects
     :param plain: the same as plain data, for files
+    :param wrapping: those of RL-Zoo3's keys ``WRAPPER_KEYS`` that are given
     """
 
     algo: str
     env_id: str
     size: Size
+    n_agents: int
     env_kwargs: Mapping[str, Any]
     time_limit: TimeLimit
     n_envs: int
     game_steps: int
     hyperparams: Mapping[str, Any]
     plain: Mapping[str, Any]
+    wrapping: Mapping[str, Any]
 
     @property
     def spec(self) -> AlgorithmSpec:
@@ -83,14 +83,20 @@ class Settings:
         return ALGOS[self.algo]
 
     @property
-    def task(self) -> TaskName:
-        """The task's name in HECOGrid."""
-        return TASK_OF_ENV[self.env_id]
+    def task(self) -> str:
+        """The HECOGrid task's name, or the environment's."""
+        return self.environment.task or self.env_id
 
     @property
-    def n_agents(self) -> int:
-        """N."""
-        return int(self.env_kwargs["n_agents"])
+    def environment(self) -> TeamEnvironment:
+        """How games are made."""
+        return find_environment(self.env_id)
+
+    @property
+    def is_exactly_resumable(self) -> bool:
+        """Whether checkpoints hold the state of the games; others begin new episodes on resuming."""
+        wrapped = wraps_games(self.wrapping) or "vec_env_wrapper" in self.wrapping
+        return self.environment.task is not None and not wrapped
 
     @property
     def total_timesteps(self) -> int:
@@ -104,7 +110,8 @@ class Settings:
         evaluation: bool = False,
         monitor_dir: str | Path | None = None,
         n_envs: int | None = None,
-        render_mode: RenderMode | None = None,
+        n_cpus: int = 1,
+        render_mode: str | None = None,
     ) -> CentralizedValueWrapper:
         """
         Make the games.
@@ -113,17 +120,33 @@ class Settings:
         :param evaluation: games for evaluation, whose seeds no training game of any run has
         :param monitor_dir: folder for a ``monitor.csv``; None for none
         :param n_envs: E; None for the settings'
+        :param n_cpus: processes among which games are divided; HECOGrid's compiled games need one
         :param render_mode: how games can be drawn; None for not at all
         """
-        return make_team_env(
-            self.task,
+        task, params = self.environment.task, dict(self.env_kwargs)
+        source: Any = task
+        if task is None or wraps_games(self.wrapping):
+            source, params = partial(self.make_game, render_mode), {}
+        elif render_mode is not None:
+            params["render_mode"] = render_mode
+        env = make_team_env(
+            source,
             n_envs=self.n_envs if n_envs is None else n_envs,
             seed=evaluation_seed(seed) if evaluation else check_seed(seed),
             time_limit=self.time_limit,
             monitor_dir=None if monitor_dir is None else str(monitor_dir),
-            render_mode=render_mode,
-            **self.env_kwargs,
+            n_cpus=n_cpus,
+            **params,
         )
+        return wrap_rows(env, self.wrapping, float(self.plain.get("gamma", 0.99)), is_training=not evaluation)
+
+    def make_game(self, render_mode: str | None = None) -> Any:
+        """
+        Make one game, a PettingZoo ParallelEnv with the wrappers of the settings.
+
+        :param render_mode: how it can be drawn; None for not at all
+        """
+        return wrap_game(self.environment.make_game(self.env_kwargs, render_mode), self.wrapping)
 
     def make_model(
         self,
@@ -168,7 +191,9 @@ class Settings:
             "n_envs": self.n_envs,
             "game_steps": self.game_steps,
             "time_limit": self.time_limit,
+            "n_agents": self.n_agents,
             "env_kwargs": dict(self.env_kwargs),
+            **self.wrapping,
             "hyperparams": dict(self.plain),
         }
 
@@ -176,65 +201,86 @@ class Settings:
 def load_settings(
     algo: str,
     env_id: str,
-    size: Size = "paper",
+    size: Size = "small",
     env_kwargs: Mapping[str, Any] | None = None,
     overrides: Mapping[str, Any] | None = None,
     config: Path | None = None,
 ) -> Settings:
     """
-    Settings by name; whatever is given here wins over the files.
+    Load settings by name; whatever is given here wins over the files.
 
     :param algo: name in ``ALGOS``
-    :param env_id: such as ``"TeamTogether-v0"``
+    :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
     :param size: ``"paper"``, ``"small"`` or ``"smoke"``
     :param env_kwargs: parameters of the game
     :param overrides: keys as in the algorithm's file, such as ``{"n_envs": 8, "policy_kwargs": {"n_slots": 8}}``
     :param config: a file to read in place of the algorithm's
-    :raises ValueError: for a name that does not exist, a value of the wrong type, a level that cannot be built
+    :raises ValueError: for a name that does not exist, a value of the wrong type, games that cannot be made
     """
     spec = find_algorithm(algo)
-    if env_id not in TASK_OF_ENV:
-        raise unknown_name("environment", env_id, ENV_IDS)
+    environment = find_environment(env_id)
     if size not in SIZES:
         raise unknown_name("size", size, SIZES)
-    name = f"zoo_configs/{spec.config}.yml" if config is None else str(config)
+    source = f"zoo_configs/{spec.config}.yml" if config is None else str(config)
     content = read_config(spec.config) if config is None else read_file(config)
-    for key in content:
-        if key not in (DEFAULT, *ENV_IDS):
-            raise ValueError(f"{name}: {unknown_name('environment', key, (DEFAULT, *ENV_IDS))}")
-    own = entry_of(content, env_id, size)
-    _check_keys(own, spec, name)
-    given = dict(overrides or {})
-    _check_keys(given, spec, "the given settings")
-    layers = (entry_of(read_config("levels"), env_id, size), own, _exclusive(given), {"env_kwargs": env_kwargs or {}})
-    return _build(algo, env_id, size, merge(*layers, {"policy_kwargs": dict(spec.policy_kwargs)}))
+    _check_environments(content, environment, source)
+    own = _checked_keys(entry_of(content, environment.yaml_keys, size), spec, source)
+    given = _exclusive(_checked_keys(overrides or {}, spec, "the given settings"))
+    level = entry_of(read_config("levels"), environment.yaml_keys, size)
+    layers = (level, own, given, {"env_kwargs": env_kwargs or {}}, {"policy_kwargs": dict(spec.policy_kwargs)})
+    return _build(algo, environment, size, merge(*layers))
 
 
 def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | None = None) -> Settings:
     """
-    Settings that :meth:`Settings.as_dict` has written; files that have changed since do not matter.
+    Read settings that :meth:`Settings.as_dict` has written; files that have changed since do not matter.
 
     :param saved: plain data
     :param env_kwargs: parameters of the game that shall be others now
-    :raises ValueError: if it is something else, or the level cannot be built
+    :raises ValueError: if it is something else, or the games cannot be made
     """
     missing = [key for key in _SAVED_KEYS if key not in saved]
     if missing:
-        raise ValueError(f"expected settings that the zoo has saved; {', '.join(missing)} is missing")
-    find_algorithm(saved["algo"])
-    if saved["env"] not in TASK_OF_ENV:
-        raise unknown_name("environment", saved["env"], ENV_IDS)
-    own = {key: saved[key] for key in ("n_envs", "game_steps", "time_limit", "env_kwargs")}
-    entry = merge(own, saved["hyperparams"], {"env_kwargs": env_kwargs or {}})
-    return _build(saved["algo"], saved["env"], saved["size"], entry)
+        raise ValueError(f"expected settings that sb3_saf.train has saved; {', '.join(missing)} is missing")
+    if not isinstance(saved["hyperparams"], Mapping):
+        raise ValueError(f"expected saved hyperparams to map names to values, got {saved['hyperparams']!r}")
+    spec = find_algorithm(saved["algo"])
+    own = {key: saved[key] for key in _OWN_KEYS if key in saved}
+    entry = merge(_checked_keys({**own, **saved["hyperparams"]}, spec, "the saved settings"))
+    # Whoever only draws results needs no package of the games.
+    n_agents = None if env_kwargs else saved.get("n_agents")
+    return _build(
+        saved["algo"],
+        find_environment(saved["env"]),
+        saved["size"],
+        merge(entry, {"env_kwargs": env_kwargs or {}}),
+        None if n_agents is None else resolve("n_agents", n_agents, int),
+    )
 
 
-def _check_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> None:
-    """Refuse names that nothing would read, and what would take an ablation back."""
+def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment, source: str) -> None:
+    """Refuse entries that no environment would read."""
+    known = (DEFAULT, HECOGRID, *ENV_IDS, environment.id)
+    for key in content:
+        if key not in known and not {".", ":"} & set(str(key)):
+            raise ValueError(f"{source}: {unknown_name('environment', key, known)}")
+
+
+def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> dict[str, Any]:
+    """Refuse names that nothing would read, and what would contradict the algorithm; give RL-Zoo3's names our own."""
+    entry = dict(entry)
     known = [*_OWN_KEYS, *algorithm_arguments(spec.algorithm)]
+    if _N_TIMESTEPS in entry:
+        if "game_steps" in entry:
+            raise ValueError(f"{source}: game_steps and {_N_TIMESTEPS} say the same thing; give one of them")
+        entry["game_steps"] = entry.pop(_N_TIMESTEPS)
+    if entry.get("policy") == spec.policy:
+        del entry["policy"]
     for key in entry:
-        if key in _RENAMED and key not in known:
-            raise ValueError(f"{source}: {key!r} is not a setting here; use {_RENAMED[key]}")
+        if key == "policy":
+            raise ValueError(
+                f"{source}: {key!r} is not a setting here; use --algo, which names the policy ({spec.policy})"
+            )
         if key not in known:
             raise ValueError(f"{source}: {unknown_name('setting', key, known)}")
     for key in MERGED:
@@ -245,6 +291,7 @@ def _check_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> N
                 f"{source}: {key}={value!r} takes back what this algorithm is, {spec.policy} with "
                 f"{key}={spec.policy_kwargs[key]!r}; choose another algorithm, or leave {key!r} out"
             )
+    return entry
 
 
 def _exclusive(given: dict[str, Any]) -> dict[str, Any]:
@@ -256,39 +303,55 @@ def _exclusive(given: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _build(algo: str, env_id: str, size: Size, entry: dict[str, Any]) -> Settings:
+def _build(
+    algo: str, environment: TeamEnvironment, size: Size, entry: dict[str, Any], n_agents: int | None = None
+) -> Settings:
     spec = ALGOS[algo]
     own = {key: entry.pop(key, None) for key in _OWN_KEYS}
-    n_envs = _count("n_envs", 1 if own["n_envs"] is None else own["n_envs"])
-    game_steps = _count("game_steps", own["game_steps"])
-    env_kwargs = _checked_level(TASK_OF_ENV[env_id], own["env_kwargs"])
-    time_limit = own["time_limit"] or get_args(TimeLimit)[0]
-    resolve("time_limit", time_limit, TimeLimit)
+    n_envs = resolve("n_envs", 1 if own["n_envs"] is None else own["n_envs"], int)
+    game_steps = resolve("game_steps", own["game_steps"], int)
+    env_kwargs = environment.complete(own["env_kwargs"] or {})
+    time_limit = resolve("time_limit", own["time_limit"] or get_args(TimeLimit)[0], TimeLimit)
+    wrapping = {
+        key: resolve(key, own[key], _OWN_KEYS[key])
+        for key in WRAPPER_KEYS
+        if own[key] is not None and own[key] is not False
+    }
+    _check_wrapping(wrapping, environment, env_kwargs, spec)
+    if n_agents is None:
+        n_agents = environment.count_agents(env_kwargs)
     plain = dict(entry)
     if own["n_minibatches"] is not None:
-        n_minibatches = _count("n_minibatches", own["n_minibatches"])
-        plain["batch_size"] = _teams(spec, plain, n_minibatches, n_envs) * int(env_kwargs["n_agents"])
-    _check_batch_size(plain.get("batch_size"), int(env_kwargs["n_agents"]), plain.get("rollout_buffer_class"))
+        n_minibatches = resolve("n_minibatches", own["n_minibatches"], int)
+        plain["batch_size"] = _teams(spec, plain, n_minibatches, n_envs) * n_agents
+    _check_batch_size(plain.get("batch_size"), n_agents, plain.get("rollout_buffer_class"))
     hints = algorithm_arguments(spec.algorithm)
     hyperparams = {key: resolve(key, value, hints[key]) for key, value in plain.items()}
     if own["policy_kwargs"]:
         plain["policy_kwargs"] = own["policy_kwargs"]
         hyperparams["policy_kwargs"] = _resolved_policy_kwargs(spec, own["policy_kwargs"])
-    return Settings(algo, env_id, size, env_kwargs, time_limit, n_envs, game_steps, hyperparams, plain)
+    return Settings(
+        algo,
+        environment.id,
+        size,
+        n_agents,
+        env_kwargs,
+        time_limit,
+        n_envs,
+        game_steps,
+        hyperparams,
+        plain,
+        wrapping,
+    )
 
 
-def _count(name: str, value: object) -> int:
-    number = resolve(name, value, int)
-    if number < 1:
-        raise ValueError(f"{name} must be at least 1, got {value!r}")
-    return int(number)
-
-
-def _checked_level(task: TaskName, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Every parameter of a level that can be built."""
-    params = HECOGridParams.from_kwargs({**_ENV_DEFAULTS, **env_kwargs})
-    params.check_fits(task)
-    return asdict(params)
+def _check_wrapping(
+    wrapping: Mapping[str, Any], environment: TeamEnvironment, env_kwargs: Mapping[str, Any], spec: AlgorithmSpec
+) -> None:
+    if wrapping.get("normalize") and issubclass(spec.algorithm, OffPolicyAlgorithm):
+        raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {environment.id}")
+    if "frame_stack" in wrapping and env_kwargs.get("observation") == "tiles":
+        raise ValueError("frame_stack stacks pictures, not tile codes; give the game observation: rgb in env_kwargs")
 
 
 def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_envs: int) -> int:
@@ -296,12 +359,14 @@ def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_
     n_steps = plain.get("n_steps")
     if n_steps is None:
         raise ValueError(f"n_minibatches divides a rollout, which needs n_steps; {spec.algorithm.__name__} has none")
-    return -(-_count("n_steps", n_steps) * n_envs // n_minibatches)
+    return -(-int(resolve("n_steps", n_steps, int)) * n_envs // n_minibatches)
 
 
 def _check_batch_size(batch_size: object, n_agents: int, buffer: object) -> None:
     """Minibatches of the team buffer are whole teams, which it would say only after the first rollout."""
-    if buffer == TeamRolloutBuffer.__name__ and batch_size is not None and _count("batch_size", batch_size) % n_agents:
+    if buffer != TeamRolloutBuffer.__name__ or batch_size is None:
+        return
+    if resolve("batch_size", batch_size, int) % n_agents:
         raise ValueError(
             f"batch_size counts rows and must be a multiple of n_agents={n_agents}, got {batch_size}; n_minibatches "
             "says how many parts a rollout is divided into instead"
@@ -316,4 +381,4 @@ def _resolved_policy_kwargs(spec: AlgorithmSpec, given: Mapping[str, Any]) -> di
     return {key: resolve(key, value, hints[key]) for key, value in given.items()}
 
 
-__all__ = ["ALGOS", "ENV_IDS", "SIZES", "TASK_OF_ENV", "Settings", "Size", "load_settings", "saved_settings"]
+__all__ = ["ALGOS", "ENV_IDS", "SIZES", "Settings", "Size", "load_settings", "saved_settings"]

@@ -1,90 +1,76 @@
-"""``python -m sb3_saf.train``: RL-Zoo3's ``train()`` with a manager for teams, and options in game steps."""
+"""``python -m sb3_saf.train``: train or tune by name, with RL-Zoo3's options, in game steps."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import os
 import secrets
 import shlex
+import shutil
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import yaml
+
+from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.errors import NonFiniteError
 from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.callbacks import RemainingTime
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
     KeyValues,
     OneLineParser,
-    replaced,
-    require_zoo,
+    add_environment_options,
+    import_packages,
+    require,
     run_command,
     user_errors,
 )
 from sb3_saf.training.devices import check_device
-from sb3_saf.training.request import Request
+from sb3_saf.training.folders import find_unfinished, make_run_folder, write_run
+from sb3_saf.training.run import RunOptions, Training
 from sb3_saf.training.seeds import MAX_SEED, check_seed
-from sb3_saf.training.settings import ENV_IDS
+from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
 
 PROGRAM: Final = "python -m sb3_saf.train"
 
-#: Options that RL-Zoo3 takes as they are.
-_PASSED_ON: Final = (
-    "tensorboard_log",
-    "trained_agent",
-    "num_threads",
-    "log_interval",
-    "eval_episodes",
-    "n_eval_envs",
-    "log_folder",
-    "device",
-    "verbose",
-    "n_trials",
-    "max_total_trials",
-    "n_jobs",
-    "sampler",
-    "pruner",
-    "n_startup_trials",
-    "n_evaluations",
-    "optimization_log_path",
-    "storage",
-    "study_name",
-)
-
 
 def make_parser() -> argparse.ArgumentParser:
-    """Options as RL-Zoo3 has them, with game steps for timesteps."""
+    """Make the parser: RL-Zoo3's options, where steps are game steps."""
     parser = OneLineParser(
         prog=PROGRAM,
-        description="Train or tune a team by name, on RL-Zoo3. Steps are steps of the game, summed over all games.",
+        description="Train or tune a team by name. All steps are game steps, summed over all parallel games; agent "
+        "steps, which SB3 counts as timesteps, are game steps x agents.",
         formatter_class=DefaultsFormatter,
         allow_abbrev=False,
     )
-    _add_what(parser)
-    _add_run(parser)
-    _add_tuning(parser)
+    _add_what(parser.add_argument_group("what to train"))
+    _add_run(parser.add_argument_group("the run"))
+    _add_evaluation(parser.add_argument_group("evaluation, saved models, logs"))
+    _add_tuning(parser.add_argument_group("tuning with Optuna"))
     return parser
 
 
-def _add_what(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("what to train")
+def _add_what(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--algo", default="saf", help=", ".join(ALGOS))
-    group.add_argument("--env", default="TeamTogether-v0", help=", ".join(ENV_IDS))
-    group.add_argument("--size", default="paper", help=f"{', '.join(SIZES)}: games and hyperparameters of a size")
-    group.add_argument("-n", "--game-steps", type=int, help="steps of the game; the size's by default")
+    add_environment_options(group, "parameters of the game, such as coordination:2")
+    group.add_argument("--size", default="small", help=f"{', '.join(SIZES)}: games and hyperparameters of a size")
     group.add_argument(
-        "--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help="the level: coordination:2"
-    )
-    group.add_argument(
-        "--eval-env-kwargs",
-        nargs="+",
-        action=KeyValues,
-        default={},
-        metavar="KEY:VALUE",
-        help="what evaluation changes",
+        "-n",
+        "--n-timesteps",
+        "--game-steps",
+        dest="game_steps",
+        type=int,
+        help="game steps to train for (SB3's total_timesteps, in agent steps, are game steps x agents); by default the "
+        "size's",
     )
     group.add_argument(
         "-params",
@@ -96,24 +82,15 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
         help="settings that win over the file's: learning_rate:lin_7e-4 policy_kwargs:'{n_slots: 8}'",
     )
     group.add_argument("-conf", "--conf-file", type=Path, help="a YAML file in place of zoo_configs/ALGO.yml")
-    group.add_argument("-i", "--trained-agent", default="", help="a model (.zip) to train on")
-
-
-def _add_run(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("the run")
-    group.add_argument("--seed", type=int, default=-1, help="0 or larger; -1 draws one")
-    group.add_argument("-f", "--log-folder", default="logs", help="runs are in FOLDER/ALGO/ENV_NUMBER")
-    group.add_argument("-tb", "--tensorboard-log", default="", help="folder for TensorBoard; none by default")
-    group.add_argument("--eval-freq", type=int, help="game steps between evaluations, -1 for none; by default 20 a run")
-    group.add_argument("--eval-episodes", type=int, default=32, help="team episodes of an evaluation")
-    group.add_argument("--n-eval-envs", type=int, default=32, help="games of an evaluation")
-    group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
-    group.add_argument("--save-freq", type=int, default=-1, help="game steps between saved models, -1 for none")
     group.add_argument(
-        "--inspect-freq",
-        type=int,
-        help="game steps between looks into the policy for TensorBoard, -1 for none; by default 10 a run",
+        "-i", "--trained-agent", type=Path, help="a model (.zip) to train on: its weights and optimiser, no code"
     )
+
+
+def _add_run(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--seed", type=int, default=-1, help="0 or larger; -1 draws one")
+    group.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="runs are in FOLDER/ALGO/ENV_NUMBER")
+    group.add_argument("-uuid", "--uuid", action="store_true", help="add a unique id to the name of the run's folder")
     group.add_argument(
         "--checkpoint-freq", type=int, help="game steps between checkpoints for --resume, -1 for none; 10 a run"
     )
@@ -122,17 +99,52 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="go on, exactly, with the latest run of this command that did not reach its end; without one, begin",
     )
-    group.add_argument("--log-interval", type=int, default=-1, help="rollouts between logs, -1 for SB3's")
-    group.add_argument("--num-threads", type=int, default=-1, help="threads of torch, -1 for its own choice")
     group.add_argument("--device", default="auto", help="cpu, cuda, ...")
+    group.add_argument("--num-threads", type=int, default=-1, help="threads of torch, -1 for its own choice")
+    group.add_argument(
+        "--vec-env",
+        choices=["dummy", "subproc"],
+        default="dummy",
+        help="subproc steps the games in one process per core; for environments other than HECOGrid, which is compiled",
+    )
     group.add_argument("--verbose", type=int, help="0 or 1; by default 0 with a progress bar, else 1")
     group.add_argument(
-        "-P", "--progress", action=argparse.BooleanOptionalAction, help="a progress bar; by default on a terminal"
+        "-P",
+        "--progress",
+        action=argparse.BooleanOptionalAction,
+        help="a progress bar in game steps; by default on a terminal",
     )
 
 
-def _add_tuning(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("tuning with Optuna")
+def _add_evaluation(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--eval-freq", type=int, help="game steps between evaluations, -1 for none; by default 20 a run")
+    group.add_argument("--eval-episodes", type=int, default=32, help="team episodes of an evaluation")
+    group.add_argument("--n-eval-envs", type=int, default=32, help="parallel games of an evaluation")
+    group.add_argument(
+        "--eval-env-kwargs",
+        nargs="+",
+        action=KeyValues,
+        default={},
+        metavar="KEY:VALUE",
+        help="parameters of the game that evaluation changes",
+    )
+    group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
+    group.add_argument("--save-freq", type=int, default=-1, help="game steps between saved models, -1 for none")
+    group.add_argument("-tb", "--tensorboard-log", type=Path, help="folder for TensorBoard; none by default")
+    group.add_argument(
+        "--inspect-freq",
+        type=int,
+        help="game steps between looks into the policy for TensorBoard, -1 for none; by default 10 a run",
+    )
+    group.add_argument("--log-interval", type=int, default=-1, help="rollouts between logs, -1 for SB3's, -2 for none")
+    group.add_argument("--track", action="store_true", help="log to Weights and Biases, which needs wandb")
+    group.add_argument("--wandb-project-name", default="sb3", help="of --track")
+    group.add_argument("--wandb-entity", help="of --track")
+    group.add_argument("--wandb-group", help="of --track")
+    group.add_argument("-tags", "--wandb-tags", nargs="+", default=[], help="of --track")
+
+
+def _add_tuning(group: argparse._ArgumentGroup) -> None:
     group.add_argument("-optimize", "--optimize-hyperparameters", action="store_true", help="tune instead of training")
     group.add_argument("--storage", help="sqlite:///FILE.db or journal FILE.log that several processes may share")
     group.add_argument("--study-name", help="of the study in the storage")
@@ -144,7 +156,9 @@ def _add_tuning(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--n-jobs", type=int, default=1, help="trials at once in threads; processes scale better")
     group.add_argument("--sampler", choices=["random", "tpe", "auto"], default="tpe", help="Optuna's sampler")
     group.add_argument("--pruner", choices=["halving", "median", "none"], default="median", help="Optuna's pruner")
-    group.add_argument("--optimization-log-path", help="folder for the evaluations of every trial")
+    group.add_argument(
+        "--optimization-log-path", type=Path, help="folder for evaluations and best model of every trial"
+    )
 
 
 def train(arguments: Sequence[str] | None = None) -> None:
@@ -157,124 +171,225 @@ def train(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = make_parser().parse_args(given)
     _check(options)
-    _complete(options)
-    overrides = options.hyperparams
-    if options.game_steps is not None:
-        overrides = merge(overrides, {"game_steps": options.game_steps})
-    require_zoo()
-    from sb3_saf.training.carriers import register_carriers
-    from sb3_saf.training.manager import install_algorithm
-
-    request = Request(
-        algo=options.algo,
-        env_id=options.env,
-        size=options.size,
-        env_kwargs=options.env_kwargs,
-        eval_env_kwargs=options.eval_env_kwargs,
-        overrides=overrides,
-        config=options.conf_file,
-        eval_freq=options.eval_freq,
-        save_freq=options.save_freq,
-        inspect_freq=options.inspect_freq,
-        checkpoint_freq=options.checkpoint_freq,
-        seed=options.seed,
-        deterministic_eval=options.deterministic_eval,
-        trial=options.trial_id,
-        options={key: str(value) if isinstance(value, Path) else value for key, value in vars(options).items()},
-        command=shlex.join([*PROGRAM.split(), *given]),
-    )
-    with user_errors():
-        request.settings()
-        request.settings(evaluation=True)
-    register_carriers()
-    install_algorithm(options.algo)
-    request = _continued(request, options) if options.resume else request
-    if options.seed is None:
-        options.seed = secrets.randbelow(MAX_SEED)
-    request = replace(request, options={**request.options, "seed": options.seed})
-    _run_rl_zoo(request, _zoo_arguments(options))
+    import_packages(options.gym_packages)
+    command = shlex.join([*PROGRAM.split(), *given])
+    if options.optimize_hyperparameters:
+        _tune(options, command)
+    else:
+        _train(options, command)
 
 
-def _continued(request: Request, options: argparse.Namespace) -> Request:
-    """The request, with the run to go on with if there is one."""
-    from sb3_saf.training.resuming import find_unfinished
+# --- options ----------------------------------------------------------------------------------------------------------
 
-    found = find_unfinished(request, options.log_folder)
-    if found is None:
-        print(f"No run of this command in {options.log_folder} is unfinished: a new one begins")
-        return request
-    folder, options.seed = found
-    print(f"Going on with {folder}")
-    return replace(request, resume=folder)
+#: The lowest value of options that count, beside the -1 for "none" or "by default" that some take.
+_LOWEST: Final = {
+    **dict.fromkeys(("eval_episodes", "n_eval_envs", "n_trials", "n_evaluations"), 1),
+    **dict.fromkeys(("max_total_trials", "game_steps"), 1),
+    **dict.fromkeys(("n_startup_trials", "verbose"), 0),
+}
 
 
 def _check(options: argparse.Namespace) -> None:
-    """What can be said before anything is made."""
-    if options.seed == -1:
-        options.seed = None
-    else:
-        with user_errors():
+    """Say what can be said before anything is made, and fill in the defaults that depend on where we are."""
+    with user_errors():
+        if options.seed != -1:
             check_seed(options.seed)
+        check_device(options.device)
+    for name, lowest in _LOWEST.items():
+        value = getattr(options, name)
+        if value is not None and value < lowest:
+            raise CommandError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
+    for name in ("num_threads", "n_jobs"):
+        if getattr(options, name) != -1 and getattr(options, name) < 1:
+            raise CommandError(f"--{name.replace('_', '-')} must be at least 1, or -1, got {getattr(options, name)}")
     if options.resume and (options.optimize_hyperparameters or options.trial_id is not None):
         raise CommandError(
             "--resume is for training with settings, without -optimize and --trial-id; a study goes on by itself when "
             "it is called again, and a trial's settings can be given with -params"
         )
-    with user_errors():
-        check_device(options.device)
-    for name in ("eval_episodes", "n_eval_envs", "n_trials", "n_evaluations"):
-        if getattr(options, name) < 1:
-            raise CommandError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
-    if options.trained_agent and not (options.trained_agent.endswith(".zip") and Path(options.trained_agent).is_file()):
-        raise CommandError(f"--trained-agent must be a .zip that is there, got {options.trained_agent!r}")
-    if options.trained_agent:
-        print(
-            f"{options.trained_agent} is unpickled, which can run code from it; from a file that you do not trust take "
-            "the weights alone: sb3_saf.load_weights",
-            file=sys.stderr,
-        )
-    if options.trial_id is None:
-        return
-    if options.storage is None or options.study_name is None:
-        raise CommandError("--trial-id needs the --storage and --study-name of the tuning")
-    if options.trial_id != "best":
-        if not options.trial_id.isdigit():
-            raise CommandError(f"--trial-id must be a trial's number or 'best', got {options.trial_id!r}")
-        options.trial_id = int(options.trial_id)
-
-
-def _complete(options: argparse.Namespace) -> None:
-    """Defaults that depend on where we are."""
+    model = options.trained_agent
+    if model is not None and not (model.suffix == ".zip" and model.is_file()):
+        raise CommandError(f"--trained-agent must be a .zip that is there, got {str(model)!r}")
+    _check_trial(options)
     if options.progress is None:
         options.progress = sys.stdout.isatty()
     if options.verbose is None:
         options.verbose = int(not options.progress)
-    options.n_eval_envs = min(options.n_eval_envs, options.eval_episodes)
 
 
-def _zoo_arguments(options: argparse.Namespace) -> list[str]:
-    """RL-Zoo3's command line. What it would evaluate as Python is not on it: that goes by the request."""
-    arguments = ["--algo", options.algo, "--env", options.env, "--seed", str(options.seed), "--no-optim-plots"]
-    for name in _PASSED_ON:
-        value = getattr(options, name)
-        if value is not None and value != "":
-            arguments.append(f"--{name.replace('_', '-')}={value}")
-    if options.optimize_hyperparameters:
-        arguments.append("--optimize-hyperparameters")
-    if options.progress:
-        arguments.append("--progress")
-    return arguments
+def _check_trial(options: argparse.Namespace) -> None:
+    if options.trial_id is None:
+        return
+    if options.storage is None or options.study_name is None:
+        raise CommandError("--trial-id needs the --storage and --study-name of the tuning")
+    if options.trial_id != "best" and not options.trial_id.isdecimal():
+        raise CommandError(f"--trial-id must be a trial's number or 'best', got {options.trial_id!r}")
 
 
-def _run_rl_zoo(request: Request, arguments: list[str]) -> None:
-    """RL-Zoo3's ``train``, which reads the process's arguments and takes its manager from its module."""
-    import rl_zoo3.train
+def _settings(
+    options: argparse.Namespace, sampled: Mapping[str, Any] | None = None, *, evaluation: bool = False
+) -> Settings:
+    """The settings asked for; what the user gave wins over those of a trial."""
+    env_kwargs = {**options.env_kwargs, **(options.eval_env_kwargs if evaluation else {})}
+    overrides = merge(sampled or {}, _fixed(options))
+    return load_settings(options.algo, options.env, options.size, env_kwargs, overrides, options.conf_file)
 
-    from sb3_saf.training.manager import TeamExperimentManager
 
-    manager = partial(TeamExperimentManager, request=request)
-    with replaced(sys, "argv", [PROGRAM, *arguments]), replaced(rl_zoo3.train, "ExperimentManager", manager):
-        rl_zoo3.train.train()
+def _fixed(options: argparse.Namespace) -> dict[str, Any]:
+    if options.game_steps is None:
+        return dict(options.hyperparams)
+    return {**options.hyperparams, "game_steps": options.game_steps}
+
+
+def _run_options(options: argparse.Namespace, settings: Settings, **more: Any) -> RunOptions:
+    log = options.tensorboard_log
+    return RunOptions(
+        eval_freq=options.eval_freq,
+        eval_episodes=options.eval_episodes,
+        n_eval_envs=options.n_eval_envs,
+        deterministic_eval=options.deterministic_eval,
+        save_freq=options.save_freq,
+        inspect_freq=options.inspect_freq,
+        checkpoint_freq=options.checkpoint_freq,
+        tensorboard_log=None if log is None else log / settings.environment.folder_name,
+        model_name=settings.environment.folder_name,
+        initial_model=options.trained_agent,
+        log_interval=None if options.log_interval == -1 else max(0, options.log_interval),
+        device=options.device,
+        n_cpus=min(os.cpu_count() or 1, settings.n_envs) if options.vec_env == "subproc" else 1,
+        num_threads=None if options.num_threads == -1 else options.num_threads,
+        progress=options.progress,
+        verbose=min(1, options.verbose),
+        **more,
+    )
+
+
+# --- one run ----------------------------------------------------------------------------------------------------------
+
+
+def _train(options: argparse.Namespace, command: str) -> None:
+    with user_errors():
+        sampled = None if options.trial_id is None else _trial(options)
+        settings, eval_settings = _settings(options, sampled), None
+        if options.eval_env_kwargs:
+            eval_settings = _settings(options, sampled, evaluation=True)
+    if options.verbose > 0:
+        print(yaml.safe_dump(settings.as_dict(), sort_keys=False), end="")
+    seed = None if options.seed == -1 else options.seed
+    unfinished = _find_unfinished(options, settings, seed) if options.resume else None
+    folder, seed = unfinished or (None, secrets.randbelow(MAX_SEED) if seed is None else seed)
+    again = command if options.resume else f"{command} --resume"
+    with ExitStack() as stack:
+        with user_errors(ValueError, OSError):
+            if folder is None:
+                folder = make_run_folder(
+                    options.log_folder, settings.algo, settings.environment.folder_name, unique=options.uuid
+                )
+                stack.callback(_remove_unbegun, folder)
+                write_run(folder, settings, seed, vars(options), command)
+            if options.track:
+                _track(options, settings, seed)
+            run_options = _run_options(
+                options, settings, eval_settings=eval_settings, resume_hint=f"go on from there with: {again}"
+            )
+            remaining = RemainingTime(verbose=int(not options.progress))
+            training = stack.enter_context(Training(settings, seed, folder, run_options, [remaining]))
+        _announce(training, folder)
+        with user_errors(CheckpointError, NonFiniteError):
+            training.learn()
+    print(f"Saved to {folder}")
+
+
+def _trial(options: argparse.Namespace) -> dict[str, Any]:
+    require("optuna")
+    from sb3_saf.training.tune import trial_overrides
+
+    number = None if options.trial_id == "best" else int(options.trial_id)
+    return trial_overrides(options.storage, options.study_name, number)
+
+
+def _find_unfinished(options: argparse.Namespace, settings: Settings, seed: int | None) -> tuple[Path, int] | None:
+    found = find_unfinished(settings, seed, vars(options), options.log_folder)
+    if found is None:
+        print(f"No run of this command in {options.log_folder} is unfinished: a new one begins")
+    else:
+        print(f"Going on with {found[0]}")
+    return found
+
+
+def _remove_unbegun(folder: Path) -> None:
+    """Remove the folder of a run that has not begun to play: it would pass for the latest run."""
+    if not (folder / "monitor.csv").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _announce(training: Training, folder: Path) -> None:
+    settings = training.settings
+    print(
+        f"{settings.algo} on {settings.env_id}, size {settings.size}, seed {training.seed}: "
+        f"{settings.game_steps:,} game steps in {settings.n_envs} games of {settings.n_agents} agents on "
+        f"{training.model.device.type}; {folder}",
+        flush=True,
+    )
+    if training.options.initial_model is not None:
+        print(f"It begins with the weights and the optimiser of {training.options.initial_model}; no code is loaded")
+
+
+def _track(options: argparse.Namespace, settings: Settings, seed: int) -> None:
+    """Let Weights and Biases follow the run's TensorBoard logs."""
+    try:
+        wandb = importlib.import_module("wandb")
+    except ImportError:
+        raise CommandError("--track needs Weights and Biases, which is not installed: pip install wandb") from None
+    name = f"{settings.environment.folder_name}__{settings.algo}__{seed}__{int(time.time())}"
+    options.tensorboard_log = Path("runs") / name
+    wandb.init(
+        name=name,
+        project=options.wandb_project_name,
+        entity=options.wandb_entity,
+        group=options.wandb_group,
+        tags=options.wandb_tags,
+        config={**settings.as_dict(), "seed": seed},
+        sync_tensorboard=True,
+    )
+
+
+# --- tuning -----------------------------------------------------------------------------------------------------------
+
+
+def _tune(options: argparse.Namespace, command: str) -> None:
+    """Run trials, print the best, and write ``report_*.csv`` of all of them."""
+    require("optuna", "pandas")
+    from sb3_saf.training.tune import Tuning, optimize, sample_overrides
+
+    with user_errors():
+        settings, eval_settings = _settings(options), None
+        if options.eval_env_kwargs:
+            eval_settings = _settings(options, evaluation=True)
+        run_options = _run_options(options, settings, eval_settings=eval_settings)
+    quiet = replace(run_options, eval_freq=0, tensorboard_log=None, progress=False, verbose=0)
+    keys = ("storage", "study_name", "n_trials", "max_total_trials", "n_jobs", "sampler", "pruner")
+    tuning = Tuning(
+        seed=secrets.randbelow(MAX_SEED) if options.seed == -1 else options.seed,
+        options=quiet,
+        log_path=options.optimization_log_path,
+        n_startup_trials=options.n_startup_trials,
+        n_evaluations=options.n_evaluations,
+        **{key: getattr(options, key) for key in keys},
+    )
+    print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
+    with user_errors():
+        study = optimize(
+            lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options))), tuning, command
+        )
+        folder = options.log_folder / settings.algo
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"report_{settings.environment.folder_name}_{int(time.time())}.csv"
+        study.trials_dataframe().to_csv(path)
+        best = study.best_trial
+    print(f"{len(study.trials)} trials, in {path}\nBest: trial {best.number} with a team return of {best.value:.2f}")
+    for key, value in best.params.items():
+        print(f"    {key}: {value}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

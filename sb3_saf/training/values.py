@@ -1,4 +1,4 @@
-"""From the plain values of YAML to what constructors take: numbers, schedules, and classes by registered names."""
+"""From the plain values of YAML to constructor arguments: numbers, schedules, and classes by registered names."""
 
 from __future__ import annotations
 
@@ -52,12 +52,48 @@ _RUN_ARGUMENTS: Final = {
 _POLICY_RUN_ARGUMENTS: Final = {"self", "observation_space", "action_space", "lr_schedule", "args", "kwargs"}
 
 
+class Range(NamedTuple):
+    """
+    Values that an argument may have.
+
+    :param low: the lowest
+    :param high: the highest; None for no limit
+    :param above: whether the value must be larger than ``low``
+    """
+
+    low: float
+    high: float | None = None
+    above: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        assert isinstance(value, (int, float))
+        return (value > self.low if self.above else value >= self.low) and (self.high is None or value <= self.high)
+
+    def __str__(self) -> str:
+        if self.high is not None:
+            return f"from {self.low} to {self.high}"
+        return f"larger than {self.low}" if self.above else f"at least {self.low}"
+
+
+#: Ranges that the algorithms would not check, or only after the first rollout.
+RANGES: Final[dict[str, Range]] = {
+    **dict.fromkeys(("gamma", "gae_lambda", "tau"), Range(0, 1)),
+    **dict.fromkeys(("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), Range(0, 1)),
+    **dict.fromkeys(("learning_rate", "ent_coef", "vf_coef", "learning_starts"), Range(0)),
+    **dict.fromkeys(("clip_range", "max_grad_norm", "target_kl"), Range(0, above=True)),
+    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "n_minibatches", "game_steps"), Range(1)),
+    **dict.fromkeys(("buffer_size", "train_freq", "target_update_interval", "stats_window_size"), Range(1)),
+    "n_envs": Range(1, 100_000),
+    "frame_stack": Range(1, 1_000),
+}
+
+
 class Kind(NamedTuple):
     """
-    One kind of value that an argument may be.
+    A kind of value that an argument may have.
 
     :param accepts: whether a type hint asks for it
-    :param convert: gives the value, or ``_NO`` if it is none of this kind
+    :param convert: returns the value, or ``_NO`` if it is not of this kind
     :param words: for the error
     """
 
@@ -75,7 +111,7 @@ def _number(value: object) -> Any:
         return _NO
     try:
         number = float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         return _NO
     return number if math.isfinite(number) else _NO
 
@@ -116,13 +152,21 @@ _KINDS: Final = (
 
 def resolve(name: str, value: object, hint: object) -> Any:
     """
-    What a constructor takes for a plain value.
+    Convert a plain value to what a constructor takes.
 
     :param name: the argument, which decides what a class may be called
     :param value: from YAML or a command line; objects that are no plain data stay as they are
     :param hint: the argument's type
-    :raises ValueError: for a value of the wrong type
+    :raises ValueError: for a value of the wrong type or out of range
     """
+    resolved = _resolve_type(name, value, hint)
+    number = resolved.start if isinstance(resolved, LinearSchedule) else resolved
+    if name in RANGES and isinstance(number, (int, float)) and number not in RANGES[name]:
+        raise ValueError(f"{name} must be {RANGES[name]}, got {value!r}")
+    return resolved
+
+
+def _resolve_type(name: str, value: object, hint: object) -> Any:
     if name in CLASSES and isinstance(value, str):
         if value not in CLASSES[name]:
             raise unknown_name(name, value, CLASSES[name])
@@ -144,7 +188,7 @@ def resolve(name: str, value: object, hint: object) -> Any:
 
 def algorithm_arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
     """
-    What an algorithm's settings may name, with types: its constructor's arguments without those of a run.
+    Return what an algorithm's settings may name, with types: its constructor's arguments without those of a run.
 
     :param algorithm: such as PPO
     """
@@ -153,8 +197,8 @@ def algorithm_arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
 
 def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
     """
-    What ``policy_kwargs`` may name, with types: the arguments of the policy's constructor, of those that it passes
-    further arguments to, and the fields of its parts.
+    Return what ``policy_kwargs`` may name, with types: the arguments of the policy's constructor, of those that it
+    passes further arguments to, and the fields of its parts.
 
     :param policy: a policy's class
     """

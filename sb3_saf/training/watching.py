@@ -5,21 +5,22 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TextIO
 
 import numpy as np
 import numpy.typing as npt
-from stable_baselines3.common.policies import BasePolicy
+from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-import hecogrid_envs
-from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.seeding import game_seeds
+from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, OBS_KEY, TeamSpaces
+from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.seeds import evaluation_seed
-from sb3_saf.training.settings import Settings
+from sb3_saf.training.wrappers import load_normalization
 
 Mode = Literal["human", "rgb_array", "ansi"]
 Frame = npt.NDArray[np.uint8]
@@ -38,16 +39,16 @@ class Screen(NamedTuple):
     :param file: GIF or MP4 to write; None for window or text
     """
 
-    env: HECOGridEnv | None
+    env: Any
     file: Path | None
 
 
 @contextmanager
-def open_screen(settings: Settings, options: argparse.Namespace) -> Iterator[Screen]:
+def open_screen(team: TrainedTeam, options: argparse.Namespace) -> Iterator[Screen]:
     """
     Open what the options ask for, the window included: it fails at once where there is no display.
 
-    :param settings: of the game
+    :param team: whose game is shown
     :param options: with ``gif``, ``mp4``, ``text``, ``no_render``
     :raises RuntimeError: if there is no display
     :raises ValueError: if the file has another ending
@@ -57,7 +58,7 @@ def open_screen(settings: Settings, options: argparse.Namespace) -> Iterator[Scr
         return
     file = _checked_file(options)
     mode: Mode = "rgb_array" if file is not None else "ansi" if options.text else "human"
-    env = hecogrid_envs.parallel_env(settings.task, render_mode=mode, **settings.env_kwargs)
+    env = team.settings.make_game(mode)
     try:
         if mode == "human":
             _open_window(env)
@@ -76,7 +77,7 @@ def _checked_file(options: argparse.Namespace) -> Path | None:
     return None
 
 
-def _open_window(env: HECOGridEnv) -> None:
+def _open_window(env: Any) -> None:
     try:
         # Asked, SDL would print complaints of its own.
         if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in _DISPLAYS):
@@ -87,20 +88,20 @@ def _open_window(env: HECOGridEnv) -> None:
         raise RuntimeError(f"{reason}; use --gif FILE, --mp4 FILE, --text, or --no-render") from None
 
 
-def show_game(screen: Screen, policy: BasePolicy, seed: int, deterministic: bool) -> None:
+def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool) -> None:
     """
     Play the first of the measured games.
 
     :param screen: where
-    :param policy: who; each agent is given its own observation only
+    :param team: who; each agent is given its own observation only
     :param seed: of game and actions
     :param deterministic: whether to take the most likely actions
     """
     if screen.env is None:
         return
-    frames = play(screen.env, policy, seed, deterministic)
+    frames = play(screen.env, team, seed, deterministic)
     if screen.file is not None:
-        write_video(screen.file, list(frames))
+        write_video(screen.file, list(frames), _frames_per_second(screen.env))
         print(screen.file)
     elif screen.env.render_mode == "ansi":
         print_frames(frames, sys.stdout)
@@ -109,44 +110,103 @@ def show_game(screen: Screen, policy: BasePolicy, seed: int, deterministic: bool
             pass  # the environment draws
 
 
-def play(env: HECOGridEnv, policy: BasePolicy, seed: int, deterministic: bool) -> Iterator[Any]:
+def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterator[Any]:
     """
     Play a game.
 
-    :param env: the game
-    :param policy: the team, with memory or without
+    :param env: the game, a ParallelEnv
+    :param team: with memory or without
     :param seed: of game and actions
     :param deterministic: whether to take the most likely actions
     :return: what ``env.render()`` gives, at the start and after every step
     """
     set_random_seed(seed)
-    observations, _ = env.reset(seed=game_seeds(evaluation_seed(seed), 1)[0])
-    state, starts = None, np.ones(len(env.agents), dtype=bool)
+    read = _Reader(team)
+    observations, infos = env.reset(seed=game_seeds(evaluation_seed(seed), 1)[0])
+    state, starts = None, np.ones(len(env.possible_agents), dtype=bool)
     yield env.render()
     while env.agents:
-        own = np.stack([observations[agent] for agent in env.agents])
-        actions, state = policy.predict(own, state, starts, deterministic)
+        rows = read.rows(env.possible_agents, observations, infos)
+        actions, state = team.policy.predict(rows, state, starts, deterministic)
         starts[:] = False
-        observations, *_ = env.step(dict(zip(env.agents, actions.tolist(), strict=True)))
+        plain = actions.tolist() if actions.ndim == 1 else actions
+        taken = dict(zip(env.possible_agents, plain, strict=True))
+        observations, _, _, _, infos = env.step({agent: taken[agent] for agent in env.agents})
         yield env.render()
 
 
-def write_video(path: Path, frames: list[Frame]) -> None:
+class _Reader:
+    """
+    Makes rows for the policy of what a ParallelEnv gives its agents: one row for each agent, absent ones included.
+
+    :param team: for its policy and its settings
+    """
+
+    def __init__(self, team: TrainedTeam) -> None:
+        self._spaces = TeamSpaces.from_observation_space(team.policy.observation_space)
+        self._games = team.settings.make_env(0, evaluation=True, n_envs=1)
+        load_normalization(self._games, team.path.parent)
+        self._normalization = unwrap_vec_normalize(self._games)
+        self._games.close()
+
+    def rows(self, agents: Sequence[Any], observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> dict[str, Any]:
+        """
+        Stack the agents' own observations, and their masks where there are any.
+
+        :param agents: all of the team, in order
+        :param observations: of those that take part
+        :param infos: of those that take part
+        """
+        space, n_actions = self._spaces.own, self._spaces.action_mask
+        own = np.zeros((len(agents), *(space.shape or ())), dtype=space.dtype)
+        masks = np.ones((len(agents), *(() if n_actions is None else n_actions.shape)), dtype=np.int8)
+        for index, agent in enumerate(agents):
+            if agent not in observations:
+                continue
+            seen = observations[agent]
+            told = seen if isinstance(seen, Mapping) else infos.get(agent, {})
+            if n_actions is not None and ACTION_MASK_KEY in told:
+                masks[index] = told[ACTION_MASK_KEY]
+            seen = np.asarray(seen["observation"] if isinstance(seen, Mapping) else seen)
+            own[index] = seen if seen.shape == own.shape[1:] else np.moveaxis(seen, -1, 0)
+        rows = {OBS_KEY: self._normalized(own), AGENT_KEY: np.arange(len(agents))}
+        return rows if n_actions is None else {**rows, ACTION_MASK_KEY: masks}
+
+    def _normalized(self, own: npt.NDArray[Any]) -> Any:
+        layer = self._normalization
+        if layer is None or not layer.norm_obs:
+            return own
+        if isinstance(layer.observation_space, spaces.Dict):
+            normal = layer.normalize_obs({OBS_KEY: own})
+            assert isinstance(normal, dict)
+            return normal[OBS_KEY]
+        return layer.normalize_obs(own)
+
+
+def _frames_per_second(env: Any) -> int:
+    return int((env.metadata or {}).get("render_fps", FPS)) if hasattr(env, "metadata") else FPS
+
+
+def write_video(path: Path, frames: list[Frame], fps: int = FPS) -> None:
     """
     Write a GIF or MP4.
 
     :param path: by its ending
     :param frames: (height, width, 3) each
+    :param fps: game steps per second
+    :raises ValueError: if the game gave no pictures
     """
     import imageio.v3 as imageio
 
+    if not isinstance(frames[0], np.ndarray):
+        raise ValueError(f"expected pictures from render() with render_mode='rgb_array', got {frames[0]!r}")
     pictures = np.stack(frames)
     if path.suffix.lower() == ".gif":
-        imageio.imwrite(path, pictures, duration=1000 // FPS, loop=0)
+        imageio.imwrite(path, pictures, duration=1000 // fps, loop=0)
         return
     height, width = pictures.shape[1:3]
     even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)))  # H.264 halves the colours' resolution
-    imageio.imwrite(path, even, plugin="FFMPEG", fps=FPS, macro_block_size=1)
+    imageio.imwrite(path, even, plugin="FFMPEG", fps=fps, macro_block_size=1)
 
 
 def print_frames(frames: Iterator[str], stdout: TextIO) -> None:

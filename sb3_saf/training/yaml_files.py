@@ -1,8 +1,8 @@
-"""Settings as YAML: safe loading, and how ``default``, an environment's entry and their sizes become one mapping."""
+"""Settings as YAML: safe loading, and how a file, the file it refines, environments and sizes become one mapping."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -15,42 +15,48 @@ from sb3_saf.training.names import unknown_name
 Size = Literal["paper", "small", "smoke"]
 SIZES: Final[tuple[Size, ...]] = get_args(Size)
 
+#: The entry for all environments, and the key that names the file to refine.
 DEFAULT: Final = "default"
+BASE: Final = "base"
 SIZES_KEY: Final = "sizes"
 #: Keys whose mappings are merged key by key; all other values are replaced.
 MERGED: Final = ("env_kwargs", "policy_kwargs")
-#: What a file may hold: some aliases of aliases unfold to more than a memory.
+#: Limits on files: of bytes, and of values after all aliases are unfolded.
+_MAX_BYTES: Final = 200_000
 _MAX_VALUES: Final = 100_000
+_MERGE_TAG: Final = "tag:yaml.org,2002:merge"
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """PyYAML's safe loader, which alone would take the last of two equal keys without a word."""
+class _StrictLoader(yaml.SafeLoader):
+    """
+    PyYAML's safe loader without merge keys, which may unfold to more than the memory holds, and without equal keys, of
+    which it would silently take the last.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE_TAG]
-        twice = sorted({key for key in keys if keys.count(key) > 1})
-        if twice:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        problems = [f"the key {key!r} is there twice" for key in sorted({key for key in keys if keys.count(key) > 1})]
+        if any(key.tag == _MERGE_TAG for key, _ in node.value):
+            problems = ["merge keys (<<) are not supported; repeat the settings, or refine a file with base"]
+        if problems:
             raise yaml.constructor.ConstructorError(
-                "while reading a mapping", node.start_mark, f"the key {twice[0]!r} is there twice", node.start_mark
+                "while reading a mapping", node.start_mark, problems[0], node.start_mark
             )
         return super().construct_mapping(node, deep)
 
 
-_MERGE_TAG: Final = "tag:yaml.org,2002:merge"
-
-
 def load_yaml(text: str, source: str) -> Any:
     """
-    Plain data from YAML.
+    Read plain data from YAML.
 
     :param text: the YAML
     :param source: where it came from, for errors
-    :raises ValueError: for what is no YAML, needs more than plain data, or unfolds to more than a person would write
+    :raises ValueError: for invalid YAML, and for what is no plain data or unfolds to more than a person would write
     """
     try:
-        content = yaml.load(text, Loader=_UniqueKeyLoader)
+        content = yaml.load(text, Loader=_StrictLoader)
         size = _size(content, {})
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         what = " ".join(str(error).split())
         raise ValueError(f"{source} is not valid YAML: {what}") from None
     except RecursionError:
@@ -64,11 +70,14 @@ def load_yaml(text: str, source: str) -> Any:
 
 def _size(content: object, known: dict[int, int]) -> int:
     """
-    How many values there are when all aliases are unfolded.
+    Count the values when all aliases are unfolded.
 
     :param known: sizes of containers by identity, so that none is counted twice
+    :raises ValueError: for dates, sets and other values that settings do not have
     """
-    if not isinstance(content, (dict, list, set)):
+    if not isinstance(content, (dict, list)):
+        if not isinstance(content, (bool, int, float, str, type(None))):
+            raise ValueError(f"expected numbers, text, lists and mappings, got the {type(content).__name__} {content}")
         return 1
     if id(content) not in known:
         parts = [*content, *content.values()] if isinstance(content, dict) else content
@@ -78,58 +87,87 @@ def _size(content: object, known: dict[int, int]) -> int:
 
 def parse_value(text: str) -> Any:
     """
-    A value typed on a command line: plain YAML, never Python.
+    Read a value typed on a command line: plain YAML, never Python.
 
-    :raises ValueError: for what is no YAML
+    :raises ValueError: for invalid YAML
     """
-    return load_yaml(text, f"the value {text!r}")
+    return load_yaml(text, f"the value {_short(text)}")
+
+
+def read_plain_file(path: Path) -> Any:
+    """
+    Read the plain data in a YAML file.
+
+    :raises ValueError: if it cannot be read or is too large
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_MAX_BYTES + 1)
+        text = data.decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read the settings in {path}: {error}") from None
+    if len(data) > _MAX_BYTES:
+        raise ValueError(f"cannot read the settings in {path}: it has more than {_MAX_BYTES:,} bytes")
+    return load_yaml(text, str(path))
 
 
 def read_file(path: Path) -> dict[str, Any]:
     """
-    Read a file of settings.
+    Read a file of settings, and the files that it refines.
 
     :param path: a YAML file
     :raises ValueError: if it cannot be read or is no mapping of environment ids
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"cannot read the settings in {path}: {error}") from None
-    return _checked_file(load_yaml(text, str(path)), str(path))
+    return _with_base(read_plain_file(path), str(path), ())
 
 
-def read_config(name: str) -> dict[str, Any]:
+def read_config(name: str, refined_by: Sequence[str] = ()) -> dict[str, Any]:
     """
-    Read a file of the package ``zoo_configs``.
+    Read a file of the package ``zoo_configs``, and the files that it refines.
 
     :param name: without ``.yml``
+    :param refined_by: files that have led here
     """
     source = f"zoo_configs/{name}.yml"
     text = files("zoo_configs").joinpath(f"{name}.yml").read_text(encoding="utf-8")
-    return _checked_file(load_yaml(text, source), source)
+    return _with_base(load_yaml(text, source), source, (*refined_by, name))
 
 
-def _checked_file(content: object, source: str) -> dict[str, Any]:
-    """A mapping from environment ids to mappings."""
+def config_names() -> list[str]:
+    """Names of the files of ``zoo_configs``, without ``.yml``."""
+    return sorted(file.name[:-4] for file in files("zoo_configs").iterdir() if file.name.endswith(".yml"))
+
+
+def _with_base(content: object, source: str, refined_by: Sequence[str]) -> dict[str, Any]:
+    """A mapping from environment ids to settings, merged into that of its base."""
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{source} must map 'default' and environment ids to settings, got {_short(content)}")
-    for env_id, entry in content.items():
-        if entry is not None and not isinstance(entry, dict):
-            raise ValueError(f"{source}: the entry {env_id!r} must map names to values, got {_short(entry)}")
-        for size, section in _sizes(entry or {}, f"{source}, {env_id}").items():
-            if size not in SIZES:
-                raise ValueError(f"{source}, {env_id}: {unknown_name('size', size, SIZES)}")
-            if not isinstance(section, dict):
-                raise ValueError(f"{source}, {env_id}: size {size!r} must map names to values, got {_short(section)}")
-    return content
+    base = content.pop(BASE, None)
+    for key, entry in content.items():
+        _check_entry(entry, f"{source}: the entry {key!r}")
+    if base is None:
+        return content
+    if base not in config_names() or base in refined_by:
+        raise ValueError(f"{source}: {unknown_name('base', base, set(config_names()) - set(refined_by))}")
+    result = read_config(base, refined_by)
+    for key, entry in content.items():
+        result[key] = _refined(result.get(key) or {}, entry or {})
+    return result
 
 
-def _sizes(entry: Mapping[str, Any], source: str) -> Mapping[str, Any]:
+def _check_entry(entry: object, what: str) -> None:
+    if entry is None:
+        return
+    if not isinstance(entry, dict):
+        raise ValueError(f"{what} must map names to values, got {_short(entry)}")
     sizes = entry.get(SIZES_KEY, {})
     if not isinstance(sizes, dict):
-        raise ValueError(f"{source}: {SIZES_KEY!r} must map sizes to settings, got {_short(sizes)}")
-    return sizes
+        raise ValueError(f"{what}: {SIZES_KEY!r} must map sizes to settings, got {_short(sizes)}")
+    for size, section in sizes.items():
+        if size not in SIZES:
+            raise ValueError(f"{what}: {unknown_name('size', size, SIZES)}")
+        if not isinstance(section, dict):
+            raise ValueError(f"{what}: size {size!r} must map names to values, got {_short(section)}")
 
 
 def _short(value: object) -> str:
@@ -137,24 +175,33 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def entry_of(content: Mapping[str, Any], env_id: str, size: Size) -> dict[str, Any]:
+def _refined(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry of a base with what a file adds, inside its sizes, too."""
+    result = merge(entry, own)
+    sections = [one.get(SIZES_KEY, {}) for one in (entry, own)]
+    if any(sections):
+        result[SIZES_KEY] = {size: merge(*(section.get(size, {}) for section in sections)) for size in SIZES}
+    return result
+
+
+def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dict[str, Any]:
     """
-    The settings of an environment at a size: ``default``, its entry, then the size's sections of both.
+    Merge entries of a file: the entries in turn, then their sections of the size.
 
     Sections of sizes come last because they are the most specific; ``paper`` is what stands outside of them.
 
-    :param content: what a file holds
-    :param env_id: such as ``"TeamTogether-v0"``
+    :param content: of a file
+    :param keys: names of entries, from the most general to the most specific; those that are not there are left out
     :param size: one of ``SIZES``
     """
-    entries = [dict(content.get(key) or {}) for key in (DEFAULT, env_id)]
+    entries = [dict(content.get(key) or {}) for key in keys]
     sections = [entry.pop(SIZES_KEY, {}).get(size, {}) for entry in entries]
     return merge(*entries, *sections)
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
     """
-    One mapping of several; later values win, and mappings under the keys of ``MERGED`` are merged in turn.
+    Merge mappings; later values win, and mappings under the keys of ``MERGED`` are merged in turn.
 
     :param layers: from the most general to the most specific
     """

@@ -1,0 +1,158 @@
+"""From the name of an environment to its games: HECOGrid tasks, modules, functions, and PettingZoo's registry."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Final
+
+import pettingzoo
+
+import hecogrid_envs
+from hecogrid_envs import TASK_NAMES
+from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.task import TaskName
+from sb3_saf.training.names import unknown_name
+
+#: HECOGrid's environments, as RL-Zoo3 and Gymnasium write names.
+TASK_OF_ENV: Final[dict[str, TaskName]] = {f"{task}-v0": task for task in TASK_NAMES}
+ENV_IDS: Final = tuple(TASK_OF_ENV)
+#: Entries of YAML files for all environments of a kind.
+HECOGRID: Final = "hecogrid"
+#: Here tile codes are the default: the same views as the paper's pictures in 49 bytes.
+_HECOGRID_DEFAULTS: Final = {"observation": "tiles"}
+HOW_TO_NAME: Final = (
+    f"{', '.join(ENV_IDS)}, a module with parallel_env (mpe2.simple_spread_v3), a function that makes a ParallelEnv "
+    "(my_package.my_module:make_env), or an id registered with PettingZoo"
+)
+
+
+@dataclass(frozen=True)
+class TeamEnvironment:
+    """
+    An environment by name.
+
+    :param id: its name
+    :param make: a function that makes a game, with ``render_mode`` and parameters; None for HECOGrid
+    """
+
+    id: str
+    make: Callable[..., Any] | None = None
+
+    @property
+    def task(self) -> TaskName | None:
+        """The HECOGrid task; None for other environments."""
+        return TASK_OF_ENV.get(self.id)
+
+    @property
+    def yaml_keys(self) -> tuple[str, ...]:
+        """Entries of YAML files that are for this environment, from general to specific."""
+        return ("default", HECOGRID, self.id) if self.task else ("default", self.id)
+
+    @property
+    def folder_name(self) -> str:
+        """The id as a part of file names."""
+        return folder_name(self.id)
+
+    @property
+    def picture_mode(self) -> str | None:
+        """The render mode of pictures; None where games of other people may not have it."""
+        return "rgb_array" if self.task else None
+
+    def complete(self, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Check parameters of the game and add the defaults, where they are known.
+
+        :raises ValueError: if the game cannot be made
+        """
+        if self.task is None:
+            return dict(env_kwargs)
+        params = HECOGridParams.from_kwargs({**_HECOGRID_DEFAULTS, **env_kwargs})
+        params.check_fits(self.task)
+        return asdict(params)
+
+    def count_agents(self, env_kwargs: Mapping[str, Any]) -> int:
+        """
+        Count the agents, N, by making a game.
+
+        :raises ValueError: if it cannot be made, or does not say who its agents are
+        """
+        if self.task is not None:
+            return int(env_kwargs["n_agents"])
+        game = self.make_game(env_kwargs)
+        agents = getattr(game, "possible_agents", None)
+        game.close()
+        if not agents:
+            raise ValueError(f"expected {self.id} to list its agents in possible_agents, got {agents!r}")
+        return len(agents)
+
+    def make_game(self, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> Any:
+        """
+        Make one game.
+
+        :raises ValueError: if it refuses its parameters, or is no ParallelEnv
+        """
+        kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+        if self.make is None:
+            assert self.task is not None
+            return hecogrid_envs.parallel_env(self.task, **kwargs)
+        try:
+            game = self.make(**kwargs)
+        except TypeError as error:  # most often an argument that it does not have
+            raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}") from error
+        if not isinstance(game, pettingzoo.ParallelEnv):
+            raise ValueError(f"expected {self.id} to make a PettingZoo ParallelEnv, got a {type(game).__name__}")
+        return game
+
+
+def folder_name(env_id: str) -> str:
+    """Return the name of an environment as a part of file names."""
+    return env_id.removeprefix(f"{HECOGRID}/").replace("/", "-").replace(":", "-")
+
+
+def find_environment(env_id: str) -> TeamEnvironment:
+    """
+    Look up an environment. Modules that it names are imported.
+
+    :param env_id: see ``HOW_TO_NAME``
+    :raises ValueError: if there is none of that name
+    """
+    name = env_id.removeprefix(f"{HECOGRID}/") if isinstance(env_id, str) else str(env_id)
+    if name in TASK_OF_ENV:
+        return TeamEnvironment(name)
+    if name in pettingzoo.parallel_registry:
+        return TeamEnvironment(name, partial(pettingzoo.make, "parallel", name))
+    if ":" in name or "." in name or _is_module(name):
+        module, _, function = name.partition(":")
+        return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"--env {name}"))
+    raise ValueError(f"{unknown_name('environment', env_id, ENV_IDS)}; others are named {HOW_TO_NAME}")
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return name.isidentifier() and importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def import_by_name(module: str, name: str, what: str) -> Any:
+    """
+    Import something callable.
+
+    :param module: dotted name
+    :param name: of what to take from it
+    :param what: who asks, for errors
+    :raises ValueError: if it is not there
+    """
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{what}: cannot import {name} from {module!r} ({error}); install the package, or set PYTHONPATH to "
+            "the folder that has it"
+        ) from error
+    if not callable(found):
+        raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {found!r}")
+    return found

@@ -1,0 +1,323 @@
+"""Tuning with Optuna: what is searched, how a trial is trained, and studies that several processes share."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import optuna
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.study import MaxTrialsCallback
+from optuna.trial import TrialState
+
+from sb3_saf.evaluation import EvaluationResult
+from sb3_saf.training.algorithms import AlgorithmSpec
+from sb3_saf.training.callbacks import SeededEvalCallback
+from sb3_saf.training.run import RunOptions, train
+from sb3_saf.training.seeds import MAX_SEED
+from sb3_saf.training.settings import Settings
+from sb3_saf.training.values import algorithm_arguments, policy_arguments
+
+#: Trials that count for ``max_total_trials``; those at work, too, or workers would exceed it.
+_COUNTED: Final = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
+_SQLITE: Final = "sqlite:///"
+_JOURNAL: Final = ".log"
+_ATTEMPTS: Final = 10
+
+# --- what is searched -------------------------------------------------------------------------------------------------
+
+_Suggest = Callable[[optuna.Trial, str], Any]
+
+
+def _log(low: float, high: float) -> _Suggest:
+    return lambda trial, name: trial.suggest_float(name, low, high, log=True)
+
+
+def _choice(*values: Any) -> _Suggest:
+    return lambda trial, name: trial.suggest_categorical(name, values)
+
+
+def _count(low: int, high: int) -> _Suggest:
+    return lambda trial, name: trial.suggest_int(name, low, high)
+
+
+#: Arguments of algorithms; those that an algorithm does not have are left out.
+_SEARCH: Final[dict[str, _Suggest]] = {
+    "learning_rate": _log(1e-4, 3e-3),
+    "gamma": _choice(0.95, 0.98, 0.99, 0.995),
+    "gae_lambda": _choice(0.9, 0.95, 0.98, 1.0),
+    "ent_coef": _log(1e-4, 0.05),
+    "vf_coef": _log(0.1, 1.0),
+    "clip_range": _choice(0.1, 0.2, 0.3),
+    "max_grad_norm": _log(0.5, 10.0),
+    "n_epochs": _count(2, 10),
+    "n_minibatches": _choice(1, 2, 4, 8),
+}
+#: Arguments of policies.
+_POLICY_SEARCH: Final[dict[str, _Suggest]] = {
+    "n_policies": _count(2, 8),
+    "n_slots": _count(2, 8),
+}
+
+
+def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Ask a trial for settings.
+
+    :param trial: the trial
+    :param spec: the algorithm
+    :param fixed: what the user has given, which is not searched
+    :return: overrides for ``load_settings``
+    """
+    known = set(algorithm_arguments(spec.algorithm))
+    if {"n_steps", "batch_size"} <= known and "batch_size" not in fixed:
+        known.add("n_minibatches")
+    for name in _open(_SEARCH, known, fixed):
+        _SEARCH[name](trial, name)
+    settled = {**spec.policy_kwargs, **fixed.get("policy_kwargs", {})}
+    if settled.get("knowledge_source") is False:
+        settled["n_slots"] = None  # there are none
+    for name in _open(_POLICY_SEARCH, policy_arguments(spec.policy_class), settled):
+        _POLICY_SEARCH[name](trial, name)
+    return to_overrides(trial.params)
+
+
+def _open(search: Mapping[str, _Suggest], known: Collection[str], settled: Mapping[str, Any]) -> list[str]:
+    return [name for name in search if name in known and name not in settled]
+
+
+def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Convert the parameters of a trial to settings.
+
+    :param params: ``trial.params``
+    :return: overrides for ``load_settings``, where those of the policy join the other ``policy_kwargs``
+    """
+    of_policy = {name: value for name, value in params.items() if name in _POLICY_SEARCH}
+    others = {name: value for name, value in params.items() if name not in _POLICY_SEARCH}
+    return {**others, "policy_kwargs": of_policy} if of_policy else others
+
+
+# --- trials -----------------------------------------------------------------------------------------------------------
+
+
+class TrialCallback(SeededEvalCallback):
+    """
+    Evaluation of a trial: reports every evaluation, and stops what the pruner gives up.
+
+    :param args: as ``SeededEvalCallback``
+    :param trial: the trial
+    :param kwargs: as ``SeededEvalCallback``
+    """
+
+    def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.trial = trial
+        self.is_pruned = False
+
+    def _react(self, result: EvaluationResult) -> bool:
+        go_on = super()._react(result)
+        self.trial.report(result.mean, self._n_evaluations)
+        self.is_pruned = self.trial.should_prune()
+        return go_on and not self.is_pruned
+
+    def _on_training_end(self) -> None:
+        if not self.is_pruned:
+            super()._on_training_end()
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """
+    How a study is carried out.
+
+    :param seed: of the trials' games and models, and of the sampler unless the storage is shared
+    :param options: of the trials' runs: device, threads, evaluation
+    :param storage: see :func:`open_storage`; None keeps the study in memory
+    :param study_name: None lets Optuna draw one
+    :param n_trials: trials of this process
+    :param max_total_trials: trials of all processes together, in place of ``n_trials``
+    :param n_jobs: trials at once, in threads
+    :param sampler: "tpe", "random", or "auto" (which needs optunahub)
+    :param pruner: "median", "halving" or "none"
+    :param n_startup_trials: random trials before the sampler learns and the pruner prunes
+    :param n_evaluations: evaluations of a trial
+    :param log_path: folder for the evaluations and the best model of every trial; None for none
+    """
+
+    seed: int
+    options: RunOptions
+    storage: str | None = None
+    study_name: str | None = None
+    n_trials: int = 100
+    max_total_trials: int | None = None
+    n_jobs: int = 1
+    sampler: str = "tpe"
+    pruner: str = "median"
+    n_startup_trials: int = 10
+    n_evaluations: int = 5
+    log_path: Path | None = None
+
+
+def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str) -> optuna.Study:
+    """
+    Run trials.
+
+    :param settings_of: the settings of a trial
+    :param tuning: how
+    :param command: kept with the study
+    :return: the study
+    """
+    study = optuna.create_study(
+        sampler=_make_sampler(tuning),
+        pruner=_make_pruner(tuning),
+        storage=None if tuning.storage is None else open_storage(tuning.storage),
+        study_name=tuning.study_name,
+        load_if_exists=True,
+        direction="maximize",
+    )
+    if "command" not in study.user_attrs:
+        study.set_user_attr("command", command)
+    callbacks: list[MaxTrialsCallback] = []
+    n_trials: int | None = tuning.n_trials
+    if tuning.max_total_trials is not None:
+        if len(study.get_trials(deepcopy=False, states=_COUNTED)) >= tuning.max_total_trials:
+            return study
+        callbacks, n_trials = [MaxTrialsCallback(tuning.max_total_trials, states=_COUNTED)], None
+    study.optimize(
+        lambda trial: run_trial(trial, settings_of(trial), tuning),
+        n_trials=n_trials,
+        n_jobs=tuning.n_jobs,
+        callbacks=callbacks,
+        gc_after_trial=True,
+    )
+    return study
+
+
+def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
+    """
+    Train and evaluate a trial. Trials have seeds of their own, which follow from the tuning's.
+
+    :return: the mean team return of the last evaluation
+    :raises optuna.TrialPruned: if the pruner gives it up, training fails, or there is no finite value, which would pass
+        for a result
+    """
+    seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
+    options = tuning.options
+    folder = None if tuning.log_path is None else str(tuning.log_path / f"trial_{trial.number}")
+    n_envs = min(options.n_eval_envs, options.eval_episodes)
+    games = (options.eval_settings or settings).make_env(seed, evaluation=True, n_envs=n_envs)
+    with closing(games):
+        evaluation = TrialCallback(
+            games,
+            trial=trial,
+            seed=seed,
+            n_eval_episodes=options.eval_episodes,
+            eval_freq=max(1, settings.game_steps // tuning.n_evaluations),
+            deterministic=options.deterministic_eval or not settings.spec.draws_actions,
+            best_model_save_path=folder,
+            log_path=folder,
+            verbose=0,
+        )
+        try:
+            train(settings, seed, None, options, [evaluation])
+        except (AssertionError, ValueError) as error:  # sampled settings may lead to NaN
+            raise optuna.TrialPruned(str(error)) from error
+    if evaluation.is_pruned:
+        raise optuna.TrialPruned
+    value = float(evaluation.last_mean_reward)
+    if not math.isfinite(value):
+        raise optuna.TrialPruned(f"the trial ended without a finite team return: {value}")
+    return value
+
+
+def _make_sampler(tuning: Tuning) -> optuna.samplers.BaseSampler:
+    # Workers of one storage with one seed would all propose the same.
+    seed = tuning.seed if tuning.storage is None else None
+    if tuning.sampler == "random":
+        return optuna.samplers.RandomSampler(seed=seed)
+    if tuning.sampler == "tpe":
+        return optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=seed, multivariate=True)
+    try:
+        optunahub = importlib.import_module("optunahub")
+    except ImportError:
+        raise ValueError("--sampler auto needs optunahub: pip install optunahub") from None
+    sampler: optuna.samplers.BaseSampler = optunahub.load_module("samplers/auto_sampler").AutoSampler(seed=seed)
+    return sampler
+
+
+def _make_pruner(tuning: Tuning) -> optuna.pruners.BasePruner:
+    if tuning.pruner == "halving":
+        return optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
+    if tuning.pruner == "median":
+        return optuna.pruners.MedianPruner(tuning.n_startup_trials, n_warmup_steps=tuning.n_evaluations // 3)
+    return optuna.pruners.NopPruner()
+
+
+# --- storages ---------------------------------------------------------------------------------------------------------
+
+
+def open_storage(storage: str, *, must_exist: bool = False) -> BaseStorage:
+    """
+    Open a storage, which several processes may share.
+
+    :param storage: ``sqlite:///study.db``, a journal file ``study.log``, or a database's URL
+    :param must_exist: whether a file that is not there is an error, rather than made
+    :raises ValueError: if it cannot be opened
+    """
+    path = _file_of(storage)
+    if path is not None:
+        if must_exist and not path.is_file():
+            raise ValueError(f"there is no study file {path}; give the --storage of the tuning")
+        path.parent.mkdir(parents=True, exist_ok=True)
+    elif "://" not in storage:
+        raise ValueError(
+            f"--storage must be sqlite:///FILE.db, a journal FILE.log or a database's URL, got {storage!r}"
+        )
+    if storage.endswith(_JOURNAL):
+        return JournalStorage(JournalFileBackend(storage))
+    for attempt in range(_ATTEMPTS):
+        try:
+            return RDBStorage(storage)
+        except Exception as error:  # SQLAlchemy's, which differ by database
+            # Two processes that make the tables at once: one of them finds them there the next time.
+            if attempt == _ATTEMPTS - 1:
+                raise ValueError(f"cannot open the storage {storage!r}: {error}") from error
+            time.sleep(0.1 * (attempt + 1))
+    raise AssertionError("the last attempt has raised")
+
+
+def _file_of(storage: str) -> Path | None:
+    if storage.startswith(_SQLITE):
+        return Path(storage.removeprefix(_SQLITE))
+    return Path(storage) if storage.endswith(_JOURNAL) else None
+
+
+def trial_overrides(storage: str, study_name: str, number: int | None) -> dict[str, Any]:
+    """
+    Read the settings of a trial.
+
+    :param storage: see :func:`open_storage`
+    :param study_name: of the study
+    :param number: of the trial; None for the best
+    :return: overrides for ``load_settings``
+    :raises ValueError: if there is no such trial
+    """
+    opened = open_storage(storage, must_exist=True)
+    try:
+        study = optuna.load_study(study_name=study_name, storage=opened)
+        return to_overrides((study.best_trial if number is None else study.trials[number]).params)
+    except IndexError:
+        raise ValueError(f"the study {study_name!r} has no trial {number}; take a smaller --trial-id") from None
+    except (KeyError, ValueError):
+        raise ValueError(
+            f"there is no study {study_name!r} in {storage}, or none of its trials is complete; give the "
+            "--study-name and --storage of the tuning"
+        ) from None

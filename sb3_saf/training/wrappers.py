@@ -1,0 +1,185 @@
+"""
+RL-Zoo3's ``env_wrapper``, ``vec_env_wrapper``, ``frame_stack``, ``normalize`` and ``callback``, for teams.
+
+Wrappers are imported by name, so a file of settings that has them can run code: take such files from people whom you
+trust. Wrappers of games are PettingZoo's and SuperSuit's, those of vector environments SB3's; the latter sit between
+the monitor and the joint observation, where each row is one agent's own observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
+
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.teams import OBS_KEY
+from sb3_saf.training.environments import import_by_name
+
+#: Keys of settings that name wrappers; each may be left out.
+WRAPPER_KEYS: Final = ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize", "callback")
+NORMALIZATION_FILE: Final = "vecnormalize.npz"
+
+
+def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
+    """
+    Import what a key names, in RL-Zoo3's format: a dotted name, a mapping from one to its arguments, or a list of them.
+
+    :param value: of the key
+    :param key: for errors
+    :raises ValueError: if it has another form or cannot be imported
+    """
+    for item in value if isinstance(value, list) else [value] if value is not None else []:
+        name, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
+        module, _, function = name.rpartition(".") if isinstance(name, str) else ("", "", "")
+        if not module or not isinstance(arguments or {}, Mapping):
+            raise ValueError(
+                f"{key} must be a dotted name such as package.Class, {{name: {{key: value}}}}, got {item!r}"
+            )
+        yield import_by_name(module, function, key), dict(arguments or {})
+
+
+def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
+    """
+    Wrap one game as ``env_wrapper`` and ``frame_stack`` say.
+
+    :param game: a ParallelEnv
+    :param wrapping: keys of ``WRAPPER_KEYS``
+    :raises ValueError: if the result is no ParallelEnv
+    """
+    for wrapper, arguments in named(wrapping.get("env_wrapper"), "env_wrapper"):
+        try:
+            game = wrapper(game, **arguments)
+        except TypeError as error:
+            raise ValueError(f"env_wrapper: {error}") from error
+        if not isinstance(game, ParallelEnv):
+            raise ValueError(f"env_wrapper must give a PettingZoo ParallelEnv, {wrapper} gave a {type(game).__name__}")
+    if "frame_stack" in wrapping:
+        import supersuit
+
+        game = supersuit.frame_stack_v1(game, wrapping["frame_stack"])
+    return game
+
+
+def wraps_games(wrapping: Mapping[str, Any]) -> bool:
+    """Whether single games are wrapped, which those of HECOGrid's compiled core cannot be."""
+    return "env_wrapper" in wrapping or "frame_stack" in wrapping
+
+
+def wrap_rows(
+    env: CentralizedValueWrapper, wrapping: Mapping[str, Any], gamma: float, is_training: bool
+) -> CentralizedValueWrapper:
+    """
+    Wrap vector environments as ``vec_env_wrapper`` and ``normalize`` say.
+
+    :param env: from ``make_team_env``
+    :param wrapping: keys of ``WRAPPER_KEYS``
+    :param gamma: discount of the algorithm, for the normalisation of rewards
+    :param is_training: whether statistics are learned and rewards normalised
+    :return: ``env`` itself if there is nothing to do
+    """
+    normalize = wrapping.get("normalize") or None
+    if "vec_env_wrapper" not in wrapping and normalize is None:
+        return env
+    rows: VecEnv = env
+    while not isinstance(rows, TeamMonitor):
+        assert isinstance(rows, VecEnvWrapper), "make_team_env monitors its games"
+        rows = rows.venv
+    for wrapper, arguments in named(wrapping.get("vec_env_wrapper"), "vec_env_wrapper"):
+        if not isinstance(wrapper, type) or not issubclass(wrapper, VecEnvWrapper):
+            raise ValueError(f"vec_env_wrapper must be a class of SB3's VecEnvWrapper, got {wrapper}")
+        rows = wrapper(rows, **arguments)
+    if normalize is not None:
+        rows = _normalized(rows, {} if normalize is True else dict(normalize), gamma, is_training)
+    return CentralizedValueWrapper(rows, time_limit=env.time_limit)
+
+
+def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_training: bool) -> VecNormalize:
+    """VecNormalize; pictures and tile codes stay as they are, since encoders scale them."""
+    space = rows.observation_space
+    own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
+    norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
+    arguments = {"gamma": gamma, "norm_obs": norm_obs, **arguments}
+    if own is not space and arguments["norm_obs"]:
+        arguments["norm_obs_keys"] = [OBS_KEY]
+    if not is_training:
+        arguments |= {"training": False, "norm_reward": False}
+    try:
+        return VecNormalize(rows, **arguments)
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ValueError(f"normalize: {error}") from error
+
+
+def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
+    """
+    Make the callbacks that ``callback`` names.
+
+    :raises ValueError: for other classes
+    """
+    callbacks = []
+    for kind, arguments in named(wrapping.get("callback"), "callback"):
+        if not isinstance(kind, type) or not issubclass(kind, BaseCallback):
+            raise ValueError(f"callback must name classes of SB3's BaseCallback, got {kind}")
+        try:
+            callbacks.append(kind(**arguments))
+        except (TypeError, AssertionError) as error:
+            raise ValueError(f"callback: {error}") from error
+    return callbacks
+
+
+# --- statistics of VecNormalize, as numbers instead of SB3's pickle ---------------------------------------------------
+
+
+def save_normalization(env: VecEnv, folder: Path) -> None:
+    """
+    Write the statistics of a VecNormalize, if there is one.
+
+    :param env: any vector environment
+    :param folder: where ``vecnormalize.npz`` is written
+    """
+    layer = unwrap_vec_normalize(env)
+    if layer is not None:
+        arrays: dict[str, Any] = {key: np.array([one.count, *_flat(one)]) for key, one in _statistics(layer).items()}
+        np.savez(folder / NORMALIZATION_FILE, **arrays)
+
+
+def load_normalization(env: VecEnv, folder: Path) -> None:
+    """
+    Read statistics, if the environment has a VecNormalize.
+
+    :param env: made with the settings of the run
+    :param folder: of the run
+    :raises ValueError: if they are not there or do not fit
+    """
+    layer = unwrap_vec_normalize(env)
+    if layer is None:
+        return
+    path = folder / NORMALIZATION_FILE
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            for key, statistics in _statistics(layer).items():
+                values, shape = arrays[key], np.shape(statistics.mean)
+                mean, var = values[1:].reshape(2, *shape)
+                statistics.mean, statistics.var, statistics.count = mean.copy(), var.copy(), float(values[0])
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"cannot read the statistics of normalize in {path}: {error}") from error
+
+
+def _statistics(layer: VecNormalize) -> dict[str, RunningMeanStd]:
+    found = {"returns": layer.ret_rms}
+    if layer.norm_obs:
+        found |= layer.obs_rms if isinstance(layer.obs_rms, dict) else {OBS_KEY: layer.obs_rms}
+    return found
+
+
+def _flat(statistics: RunningMeanStd) -> np.ndarray:
+    return np.concatenate([np.ravel(statistics.mean), np.ravel(statistics.var)])
