@@ -240,3 +240,22 @@ def test_other_experiments_run_and_report(name: str, tmp_path: Path, monkeypatch
         assert f"## Team return by {view.axis}{view.suffix}" in page
     assert "nan" not in page and "inf" not in page
     assert "--hyperparams n_epochs:1" in page and "--game-steps 80" in page
+
+
+def test_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any environment that ``sb3_saf.train`` takes, with a parameter that is varied."""
+    monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
+    monkeypatch.chdir(tmp_path)
+    words = ["--env", "tests.toy_envs:CounterEnv", "--vary", "max_cycles:[3,5]", "--size", "smoke", "-n", "24"]
+    words += ["--methods", "mappo", "ippo", "--seeds", "0", "--episodes", "2"]
+    words += ["--hyperparams", "n_envs:2", "n_steps:3", "n_minibatches:1"]
+    assert cli.main(["run", *words]) == 0
+    assert cli.main(["report", "tests.toy_envs-CounterEnv"]) == 0
+    folder = tmp_path / "runs" / "experiments" / "tests.toy_envs-CounterEnv"
+    page = (folder / folder.name / "report.md").read_text(encoding="utf-8")
+    assert "2 agents, 24 game steps of training. mappo, ippo and a random team" in page
+    assert "| tests.toy_envs:CounterEnv | max_cycles=3 | max_cycles=5 | seeds |" in page
+    assert "--env tests.toy_envs:CounterEnv --size smoke" in page and "--vary 'max_cycles:[3, 5]'" in page
+    table = pd.read_csv(folder / folder.name / "table.csv")
+    assert table["score"].between(0, 1).all() and table["max_return"].isna().all()
+    assert cli.main(["run", *words, "--vary", "max_cycles:[4]"]) == 2

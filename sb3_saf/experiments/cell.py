@@ -256,7 +256,7 @@ def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | Non
     low, high = result.interval()
     return {
         "level": level.env_kwargs,
-        "n_agents": env.n_agents,
+        "n_agents": settings.n_agents,
         "max_return": settings.env_kwargs.get("n_treasures"),
         "evaluation_seed": evaluation_seed(cell.seed),
         "return_mean": result.mean,

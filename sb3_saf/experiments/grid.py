@@ -90,13 +90,20 @@ class RunConfig:
 
         :param cell: for its method and environment
         :param level: where it is tested; None for where it is trained
+        :raises ValueError: for what does not exist, levels that cannot be built, and ``normalize``
         """
         algo = cell.method if cell.is_trained else _ANY_ALGORITHM
         # The environment is all that a random team needs.
         overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key == "env_kwargs"}
         level = cell.level if level is None else level
         overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
-        return load_settings(algo, cell.env, self.size, overrides=overrides)
+        settings = load_settings(algo, cell.env, self.size, overrides=overrides)
+        if settings.as_dict().get("normalize"):
+            raise ValueError(
+                "experiments do not keep the statistics of normalize, which tests would need; leave it out, or train "
+                "with sb3_saf.train"
+            )
+        return settings
 
     def describe(self, cell: Cell) -> dict[str, Any]:
         """Return everything that decides a cell's result, as plain data."""
