@@ -223,9 +223,13 @@ def test_whole_teams_are_judged_without_search_and_as_rows_in_any_order(
     policy, obs = make_policy(policy_class, encode_once=encode_once, **kwargs), team_rows(VECTOR, n_views=50)
     shuffled = th.tensor([2, 0, 1, 3, 5, 4, 6, 7, 8, 9, 10, 11])
     expected = policy.predict_values(take(obs, shuffled))
-    searched: list[int] = []
-    joint_rows = policy.row_encoder.joint_rows
-    monkeypatch.setattr(policy.row_encoder, "joint_rows", lambda *args: searched.append(1) or joint_rows(*args))
+    joint_rows, searched = policy.row_encoder.joint_rows, list[int]()
+
+    def noting(*args: Any) -> Any:
+        searched.append(len(args))
+        return joint_rows(*args)
+
+    monkeypatch.setattr(policy.row_encoder, "joint_rows", noting)
     values = policy.predict_values(obs)
     assert not searched
     th.testing.assert_close(values[shuffled], expected, rtol=0, atol=1e-6)
