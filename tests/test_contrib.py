@@ -236,15 +236,6 @@ def test_trpos_line_search_finds_better_policies_within_its_region(action: str) 
         assert logged["train/policy_objective"] > 0
 
 
-def test_trpo_improves() -> None:
-    # Reward: first number of the view times the action, minus a tenth of the action. Best action by the view's sign.
-    venv = ToyTeams(n_views=6, n_games=8)
-    model = make_model("SAFPolicy", venv, n_steps=10, batch_size=240, gamma=0.0, target_kl=0.1, n_critic_updates=4)
-    best = np.where(venv._views[:, 0] > 0.1, 2, 0)
-    model.learn(14 * 240)
-    np.testing.assert_array_equal(model.predict(venv._views, deterministic=True)[0], best)
-
-
 def test_trpo_refuses_policies_that_are_drawn_anew() -> None:
     for action in ("discrete", "multi-discrete"):
         venv = ToyTeams(action_space=ACTIONS[action])

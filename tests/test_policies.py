@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import warnings
 from pathlib import Path
 from typing import Any, cast
@@ -658,7 +657,7 @@ def test_with_gumbel_it_is_not() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
+@pytest.mark.parametrize("action_space", [ACTIONS["multi-discrete"], ACTIONS["multi-binary"]], ids=str)
 def test_ppo_learns_with_every_policy_and_action_space(name: str, action_space: spaces.Space[Any]) -> None:
     model = make_model(name, ToyTeams(action_space=action_space))
     before = copy.deepcopy(model.policy)
@@ -673,27 +672,11 @@ def test_ppo_learns_from_every_observation_space(own: spaces.Space[Any]) -> None
     make_model(venv=ToyTeams(own), batch_size=120, n_epochs=1).learn(120)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a2c_learns(name: str) -> None:
-    model = A2C(name, ToyTeams(), policy_kwargs=SMALL, device="cpu", seed=0)
-    model.learn(180)
-
-
-@pytest.mark.parametrize("kwargs", [{}, {"selection": "gumbel"}])
-def test_two_runs_of_one_seed_end_alike(kwargs: dict[str, Any]) -> None:
-    one, other, third = (make_model(seed=seed, policy_kwargs=kwargs).learn(240) for seed in (1, 1, 2))
+def test_two_runs_of_one_seed_end_alike_also_where_policies_are_drawn() -> None:
+    kwargs = {"selection": "gumbel"}
+    one, other, third = (make_model(seed=seed, policy_kwargs=kwargs).learn(120) for seed in (1, 1, 2))
     assert equal_weights(one.policy, other.policy)
     assert not equal_weights(one.policy, third.policy)
-
-
-def test_ppo_improves() -> None:
-    # Reward: first number of the view times the action, minus a tenth of the action. Best action by the view's sign.
-    venv = ToyTeams(n_views=6, n_games=8)
-    model = make_model(venv=venv, learning_rate=3e-3, batch_size=240, n_epochs=8, gamma=0.0)
-    views = venv._views
-    best = np.where(views[:, 0] > 0.1, 2, 0)
-    model.learn(20 * 240)
-    np.testing.assert_array_equal(model.predict(views, deterministic=True)[0], best)
 
 
 @pytest.mark.parametrize("name", [*NAMES, "gumbel"])
@@ -743,14 +726,6 @@ def test_policy_saves_and_loads(
     assert (loaded.parts, loaded.encode_once, loaded.chunk_size) == (policy.parts, False, 5)
     obs = team_rows(CodeSpace())
     assert th.equal(loaded.predict_values(obs), policy.predict_values(obs))
-
-
-def test_weights_alone_load_without_unpickling() -> None:
-    policy, other, file = make_policy(SAFPolicy), make_policy(SAFPolicy, seed=1), io.BytesIO()
-    th.save(policy.state_dict(), file)
-    file.seek(0)
-    other.load_state_dict(th.load(file, weights_only=True))
-    assert equal_weights(policy, other)
 
 
 def test_actor_and_encoder_run_without_the_critic() -> None:

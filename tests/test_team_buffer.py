@@ -353,10 +353,6 @@ def test_ppo_trains_saves_loads_and_goes_on(tmp_path: Path) -> None:
     assert weights(loaded) != weights(model)
 
 
-def test_two_runs_with_one_seed_end_with_equal_weights() -> None:
-    assert weights(make_model().learn(120)) == weights(make_model().learn(120))
-
-
 def test_a_whole_rollout_as_one_minibatch_teaches_what_sb3s_buffer_teaches() -> None:
     models = [make_model(buffer=buffer, batch_size=60).learn(60) for buffer in (TeamRolloutBuffer, DictRolloutBuffer)]
     for value, stock in zip(*(model.policy.parameters() for model in models), strict=True):
@@ -373,16 +369,3 @@ def test_observations_normalised_above_the_wrapper_are_refused() -> None:
     with pytest.raises(ValueError, match="change or normalise observations below CentralizedValueWrapper"):
         model.learn(60)
     make_model(env=CentralizedValueWrapper(VecNormalize(make_env().venv))).learn(60)
-
-
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of 5000")
-def test_a_batch_larger_than_the_rollout_is_the_rollout() -> None:
-    with pytest.raises(ValueError, match=r"use batch_size=60, the whole rollout \(n_steps=5 x 4 games x 3\)"):
-        make_model(batch_size=5000).learn(60)
-
-
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of 64")
-def test_default_batch_size_of_ppo_says_what_to_use() -> None:
-    model = make_model(batch_size=64, env=make_env(lengths=(3, 2, 4, 7) * 2))
-    with pytest.raises(ValueError, match="use batch_size=63 or 66"):
-        model.learn(60)

@@ -271,16 +271,6 @@ def test_a_buffer_that_never_updates_the_statistics_fails(load: bool, tmp_path: 
         model.learn(120)
 
 
-def test_sb3s_default_buffer_still_serves_without_normalisation() -> None:
-    make_model(normalize=False, rollout_buffer_class=None).learn(120)
-
-
-def test_gradients_of_a_policy_in_use_need_no_statistics() -> None:
-    policy, obs = make_policy(POLICIES[2], normalize_values=True), team_rows(VECTOR)
-    policy.set_training_mode(False)
-    policy.predict_values(obs).sum().backward()
-
-
 class Frozen(ValueNormalizer):
     """Mean 0 and variance 1 for ever."""
 
