@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_saf.buffers.minibatch import TeamMinibatch
 from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, ALL_KEYS, OBS_KEY, TEAM_KEY, TeamSpaces
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
+from sb3_saf.networks.spaces import pixels_to_codes
 from sb3_saf.policies.parts import check_at_least_one
 
 #: How PettingZoo's environments give masks.
@@ -134,7 +135,7 @@ class TeamRowsPolicy(BasePolicy):
             raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
         arrays = {key: np.asarray(value) for key, value in entries.items()}
         if OBS_KEY in arrays:
-            arrays[OBS_KEY] = codes_of_pixels(arrays[OBS_KEY], self.team_spaces.own)
+            arrays[OBS_KEY] = _codes(arrays[OBS_KEY], self.team_spaces.own)
         if AGENT_KEY in arrays:
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
         tensors, is_batch = super().obs_to_tensor(arrays)
@@ -267,31 +268,15 @@ def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:
         )
 
 
-def codes_of_pixels(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
-    """
-    Return tile codes of pixels, for models that were trained on codes.
-
-    :param observation: (..., width t, height t, C) pixels of tiles of t x t; anything else is returned as it is
-    :param space: of codes, (width, height), with the tiles' pixels as ``atlas``, (n_codes, t, t, C)
-    :raises ValueError: for pixels of which no code is made
-    """
+def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
+    """Tile codes of pixels, where a model was trained on codes; anything else is returned as it is."""
     atlas = getattr(space, "atlas", None)
     if atlas is None or space.shape is None or len(space.shape) != 2:
         return observation
-    (width, height), (_, tile, _, channels) = space.shape, atlas.shape
-    if observation.dtype != np.uint8 or observation.shape[-3:] != (width * tile, height * tile, channels):
+    height, width = (cells * atlas.shape[1] for cells in space.shape)
+    if observation.shape[-3:] not in ((height, width, atlas.shape[3]), (atlas.shape[3], height, width)):
         return observation
-    batch = observation.shape[:-3]
-    tiles = observation.reshape(-1, width, tile, height, tile, channels).swapaxes(2, 3)
-    codes = {pixels.tobytes(): code for code, pixels in reversed(list(enumerate(np.ascontiguousarray(atlas))))}
-    try:
-        found = [codes[pixels.tobytes()] for pixels in tiles.reshape(-1, tile, tile, channels)]
-    except KeyError:
-        raise ValueError(
-            f"expected codes {space}, or pixels made of its {len(atlas)} tiles, got pixels of other tiles; make the "
-            "game with the parameters that the model was trained with"
-        ) from None
-    return np.array(found, dtype=space.dtype).reshape(*batch, width, height)
+    return pixels_to_codes(observation, atlas).astype(space.dtype)
 
 
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
