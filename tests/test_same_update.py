@@ -81,7 +81,7 @@ def test_buffers_and_encodings_give_the_same_loss_and_gradients(
     for model in others:
         # The same rollout: rewards are made of views and actions. (SB3's buffer reorders the other arrays.)
         rewards, same = model.rollout_buffer.rewards, reference.rollout_buffer.rewards
-        np.testing.assert_allclose(rewards, same, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(rewards, same, rtol=1e-5, atol=5e-6)  # of bootstrapped values, in float32
         for tag in ("train/loss", "train/value_loss", "train/policy_gradient_loss", "train/entropy_loss"):
             logged, right = (m.logger.name_to_value[tag] for m in (model, reference))
             assert logged == pytest.approx(right, rel=1e-5, abs=1e-6), tag
