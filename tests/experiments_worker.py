@@ -15,6 +15,11 @@ def save(*_: object) -> None:
     sys.exit(143)
 
 
+def note_control_c(*_: object) -> None:
+    """Remember what was not meant for a worker."""
+    (folder / "interrupted").touch()
+
+
 folder = Path(sys.argv[-1])
 verb, _, argument = (folder / "order.txt").read_text().partition(" ")
 if verb == "fail":
@@ -25,6 +30,7 @@ if verb == "exit":
     os._exit(3)
 if verb == "sleep":
     signal.signal(signal.SIGTERM, save)
+    signal.signal(signal.SIGINT, note_control_c)
     (folder / "pid").write_text(str(os.getpid()))
     time.sleep(600)
 if verb == "variable":

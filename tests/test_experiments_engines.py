@@ -75,7 +75,7 @@ def test_control_c_is_for_the_driver_alone(tmp_path: Path) -> None:
     out, err = process.communicate(timeout=120)
     assert (out, err, process.returncode) == ("interrupted\n", "", 0)
     assert not is_running(int(pid.read_text()))
-    assert (tmp_path / "a" / "checkpoint").exists()
+    assert (tmp_path / "a" / "checkpoint").exists() and not (tmp_path / "a" / "interrupted").exists()
 
 
 def test_a_cell_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
