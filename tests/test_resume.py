@@ -350,16 +350,37 @@ def test_ctrl_c_stops_qplex_at_the_next_step_and_the_second_one_at_once(
         assert f"checkpoint-{saved_at * N_GAMES:012d}.ckpt is saved" in capsys.readouterr().out
 
 
-def test_foreign_games_are_refused_or_begin_anew(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", [3, None])
+def test_foreign_games_begin_new_episodes_and_say_so_at_the_start(seed: int | None, tmp_path: Path) -> None:
     def supersuit() -> Any:
-        return make(env=sb3_saf.make_team_env("TeamTogether", N_GAMES, backend="supersuit", **TASK))
+        env = sb3_saf.make_team_env("TeamTogether", N_GAMES, backend="supersuit", **TASK)
+        return make(tmp_path, env=env, seed=seed)
 
     with pytest.raises(CheckpointError, match=r"SuperSuitVecEnv cannot give the state.*exact=False"):
-        resumable_learn(supersuit(), ROLLOUT, tmp_path / "exact")
-    with pytest.raises(RuntimeError):
-        resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(20), every_game_steps=1, exact=False)
-    model = resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(-1), exact=False)
+        resumable_learn(supersuit(), ROLLOUT, tmp_path / "exact", exact=True)
+    told = r"SuperSuitVecEnv cannot give the state of its games.*begins new episodes"
+    with pytest.warns(UserWarning, match=told), pytest.raises(RuntimeError):
+        resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(20), every_game_steps=1)
+    with pytest.warns(UserWarning, match=told):
+        model = resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(-1))
     assert model.num_timesteps == 4 * ROLLOUT
+
+
+def test_lines_of_a_monitor_file_are_kept(tmp_path: Path) -> None:
+    """By a run that is refused, by a reset before resuming, and by another run in the same folder."""
+    resumable_learn(make(tmp_path), 4 * ROLLOUT, tmp_path / "ck", every_game_steps=1)
+    before = (tmp_path / "monitor.csv").read_bytes()
+    with pytest.raises(CheckpointError, match="of another run"):
+        make(tmp_path).learn(ROLLOUT, TeamCheckpointCallback(tmp_path / "ck"))
+    assert (tmp_path / "monitor.csv").read_bytes() == before
+    model = make(tmp_path)
+    model.env.reset()
+    resumable_learn(model, 5 * ROLLOUT, tmp_path / "ck")
+    longer = (tmp_path / "monitor.csv").read_bytes()
+    assert longer.startswith(before) and len(longer) > len(before)
+    make(tmp_path).learn(2 * ROLLOUT)
+    assert (tmp_path / "monitor.csv.1").read_bytes() == longer
+    assert (tmp_path / "monitor.csv").read_bytes() not in (b"", longer)
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import uuid
+import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from typing import BinaryIO, Final, NamedTuple, NoReturn
@@ -83,8 +84,9 @@ class TeamCheckpointCallback(BaseCallback):
         first start of a rollout after that many
     :param keep: newest checkpoints to keep
     :param others: all other callbacks of the run, whose state goes along
-    :param exact: False makes checkpoints of environments that cannot give their state, too: on resuming, they begin
-        new episodes, and the weights will not be those of the undisturbed run
+    :param exact: None resumes exactly where the environment can give its state, and warns at the start where it cannot:
+        a resumed run then begins new episodes, and its weights are not those of the undisturbed run. True refuses such
+        environments, False never asks for their state
     :param verbose: 1 to print the files' names
     :raises ValueError: if a number is not at least 1
     """
@@ -97,7 +99,7 @@ class TeamCheckpointCallback(BaseCallback):
         every_game_steps: int = 100_000,
         keep: int = 3,
         others: BaseCallback | Sequence[BaseCallback] | None = None,
-        exact: bool = True,
+        exact: bool | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -120,11 +122,29 @@ class TeamCheckpointCallback(BaseCallback):
         self._run = _RUNS[self.model]
         newest = newest_checkpoint(self.store)
         if newest is not None and newest.tree["run"] != self._run.name:
+            self.store.release()
             raise CheckpointError(
                 f"{self.store.path} has checkpoints of another run ({newest.path.name}): go on with it by "
                 "sb3_saf.resume(folder, model, callbacks), or give this run a folder of its own"
             )
         self._written = None if newest is None else newest.tree["game_steps"]
+        if self.exact is None:
+            self.exact = self._can_be_exact()
+
+    def _can_be_exact(self) -> bool:
+        """Return whether all environments give their state; warn if not."""
+        try:
+            environment_state(self.training_env)
+            callback_states(self.others)
+        except CheckpointError as error:
+            warnings.warn(
+                f"{str(error).partition(';')[0]}. If this run is interrupted, it goes on with the weights, optimiser "
+                "and counters of its last checkpoint and begins new episodes",
+                UserWarning,
+                stacklevel=2,
+            )
+            return False
+        return True
 
     def _on_rollout_start(self) -> None:
         self._between_rollouts = True  # until the first step

@@ -113,8 +113,8 @@ def _layer_state(layer: VecEnv) -> Tree:
     if isinstance(layer, VecTransposeImage):
         return {}
     raise CheckpointError(
-        f"{type(layer).__name__} cannot give the state of its games, so a run on it cannot be resumed exactly. "
-        "HECOGrid with backend='native' can; a VecEnv or wrapper of your own can with the methods "
+        f"{type(layer).__name__} cannot give the state of its games, so a run on it cannot be resumed exactly; "
+        "HECOGrid with backend='native' can, and a VecEnv or wrapper of your own with the methods "
         "checkpoint_state() and load_checkpoint_state(state). "
         "TeamCheckpointCallback(..., exact=False) begins new episodes on resuming instead"
     )

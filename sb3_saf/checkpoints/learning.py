@@ -111,7 +111,7 @@ def resumable_learn(
     *,
     every_game_steps: int = 100_000,
     keep: int = 3,
-    exact: bool = True,
+    exact: bool | None = None,
     finite: bool = True,
     again: str = "start the same command again to go on from there",
     **learn_arguments: Any,

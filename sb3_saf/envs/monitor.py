@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import IO, Any
 
 import numpy as np
-from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -30,7 +30,8 @@ class TeamMonitor(TeamVecEnvWrapper):
     use ``sb3_saf.evaluate_policy``, which counts teams.
 
     :param venv: rows of flattened teams, game-major, then agent
-    :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none
+    :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none. It
+        begins with the first step. The file of another run is kept as ``monitor.csv.1``, ``monitor.csv.2`` ...
     :param info_keywords: entries of agent 0's last info to add to the episode's
     :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
     :raises ValueError: if N is unknown or does not divide the rows
@@ -57,12 +58,8 @@ class TeamMonitor(TeamVecEnvWrapper):
         """
         Start new episodes in all games; unfinished ones are not counted.
 
-        The first reset begins the file. A resumed run has none, so it finds the file of before.
-
         :return: observations as ``venv`` gives them
         """
-        if self._writer is None:
-            self._writer = self._open(override_existing=True)
         self._returns[:] = 0
         self._lengths[:] = 0
         return self.venv.reset()
@@ -75,6 +72,8 @@ class TeamMonitor(TeamVecEnvWrapper):
         :raises ValueError: for NaN or infinity in the rewards, or dones that differ inside a team
         """
         obs, rewards, dones, infos = self.venv.step_wait()
+        if self._writer is None:
+            self._writer = self._begin_file()
         self._n_steps += 1
         check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
@@ -108,6 +107,23 @@ class TeamMonitor(TeamVecEnvWrapper):
             self._writer.write_row(episode)
         return episode
 
+    def _begin_file(self) -> ResultsWriter | None:
+        """Begin a file at the first step, so that a run that is refused before it touches none."""
+        path = self._path()
+        if path is None:
+            return None
+        if os.path.isfile(path):
+            _set_aside(path)
+        return self._open(override_existing=True)
+
+    def _path(self) -> str | None:
+        """Return where SB3's ResultsWriter puts the file."""
+        if self._filename is None or self._filename.endswith(Monitor.EXT):
+            return self._filename
+        if os.path.isdir(self._filename):
+            return os.path.join(self._filename, Monitor.EXT)
+        return f"{self._filename}.{Monitor.EXT}"
+
     def _open(self, override_existing: bool) -> ResultsWriter | None:
         if self._filename is None:
             return None
@@ -126,7 +142,7 @@ class TeamMonitor(TeamVecEnvWrapper):
             "episode_count": self.episode_count,
             "t_start": self.t_start,
             "n_steps": self._n_steps,
-            "file_size": None if self._writer is None else _synced_size(self._writer.file_handler),
+            "file_size": 0 if self._writer is None else _synced_size(self._writer.file_handler),
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
@@ -142,12 +158,24 @@ class TeamMonitor(TeamVecEnvWrapper):
                 raise ValueError(f"expected {name!r} of {self.n_games} games, got {found!r:.80}")
         for name in ("episode_count", "n_steps", "file_size"):
             count = state[name]
-            if name == "file_size" and count is None:
-                continue
             if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count < 2**63:
                 raise ValueError(f"expected {name!r} to be a whole number, got {count!r}")
         if isinstance(state["t_start"], bool) or not isinstance(state["t_start"], float):
             raise ValueError(f"expected 't_start' to be a time, got {state['t_start']!r}")
+        self._check_file(state["file_size"], state["episode_count"])
+
+    def _check_file(self, size: int, episode_count: int) -> None:
+        """Check that the lines that are kept are those of the run's episodes."""
+        path = self._path()
+        if not size or path is None or not os.path.isfile(path) or os.path.getsize(path) < size:
+            return
+        with open(path, "rb") as file:
+            kept = file.read(size)
+        if kept.count(b"\n") != episode_count + 2 or not kept.endswith(b"\n"):
+            raise ValueError(
+                f"expected the first {size} bytes of {path} to be two lines and {episode_count} episodes, got "
+                f"{kept.count(bytes([10]))} lines; the file is that of another run"
+            )
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
@@ -160,8 +188,8 @@ class TeamMonitor(TeamVecEnvWrapper):
         self.episode_count = state["episode_count"]
         self.t_start = state["t_start"]
         self._n_steps = state["n_steps"]
-        if self._filename is None or state["file_size"] is None:
-            return
+        if self._filename is None or not state["file_size"]:
+            return  # the file begins with the next step
         if self._writer is not None:
             self._writer.close()
         self._writer = self._open(override_existing=False)
@@ -173,6 +201,14 @@ class TeamMonitor(TeamVecEnvWrapper):
         if self._writer is not None:
             self._writer.close()
         super().close()
+
+
+def _set_aside(path: str) -> None:
+    """Rename the file of another run, whose lines are kept: monitor.csv.1, monitor.csv.2 ..."""
+    number = 1
+    while os.path.exists(f"{path}.{number}"):
+        number += 1
+    os.rename(path, f"{path}.{number}")
 
 
 def _synced_size(file: IO[Any]) -> int:

@@ -131,12 +131,11 @@ class SuperSuitVecEnv(VecEnv):
         :return: for each row, the seed of its game
         """
         check_seed(seed)
-        if seed is None:
-            seed = cast(int, np.random.SeedSequence().entropy)
-        #: Seeds of the games as they were last chosen, by which evaluation is told from training.
-        self.seeded_with = tuple(game_seeds(int(seed), self.n_games))
-        self._next_seeds: list[int | None] = list(self.seeded_with)
-        return [game_seed for game_seed in self.seeded_with for _ in range(self.n_agents)]
+        chosen = game_seeds(int(cast(int, np.random.SeedSequence().entropy) if seed is None else seed), self.n_games)
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training; None for fresh ones.
+        self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
+        self._next_seeds: list[int | None] = list(chosen)
+        return [game_seed for game_seed in chosen for _ in range(self.n_agents)]
 
     def set_options(self, options: list[Info] | Info | None = None) -> None:
         """
