@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from inspect import cleandoc
 from typing import Any, ClassVar, NamedTuple, get_args
 
@@ -13,7 +14,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.constants import N_ACTIONS, Colour, RenderMode, zone_colour
+from hecogrid_envs.constants import N_ACTIONS, Colour, Command, RenderMode, TreasureState, zone_colour
 from hecogrid_envs.page import COMMON_PAGE
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import STATE_PLANES, StateMapping, central_view, state_option
@@ -201,6 +202,39 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         """Colour of each zone in pictures, from 0 to 255."""
         n_zones = int(self.params.zone_of_column()[-1]) + 1
         return tuple(zone_colour(zone) for zone in range(n_zones))
+
+    @property
+    def action_names(self) -> list[str]:
+        """What each action integer does; integers alone where zones change it."""
+        if self.params.heterogeneity > 1:
+            return [str(action) for action in range(N_ACTIONS)]
+        return [command.name.lower() for command in Command]
+
+    def replica(self) -> HECOGridEnv:
+        """Return a game of its own with the same parameters: from the same seed it plays the same episode."""
+        return type(self)(**asdict(self.params))
+
+    def grid_scene(self) -> dict[str, Any]:
+        """
+        Return what a drawing of the game needs, as plain lists.
+
+        :return: ``width``, ``height``, ``walls`` and ``keys`` [x, y], ``zones`` by column, ``treasures``
+            [x, y, whether it is collected], ``agents`` [x, y, direction, whether it has a key]
+        """
+        state, size = self.get_state(), self.params.grid_size
+        treasures = np.argwhere(state["treasures"] != TreasureState.NONE)
+        agents = [state["agent_pos"], state["agent_dir"], state["agent_has_key"]]
+        return {
+            "width": size,
+            "height": size,
+            "walls": np.argwhere(state["walls"]).tolist(),
+            "keys": np.argwhere(state["keys"]).tolist(),
+            "zones": self.params.zone_of_column().tolist(),
+            "treasures": [
+                [x, y, bool(state["treasures"][x, y] == TreasureState.COLLECTED)] for x, y in treasures.tolist()
+            ],
+            "agents": np.column_stack(agents).tolist(),
+        }
 
     @property
     def best_return(self) -> int:

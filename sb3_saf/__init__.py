@@ -46,6 +46,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.export.writer import export_actors
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
+    from sb3_saf.inspection.replay import replay
     from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
     from sb3_saf.policies.ippo import IPPOLstmPolicy, IPPOMaskablePolicy, IPPOPolicy
     from sb3_saf.policies.mappo import MAPPOLstmPolicy, MAPPOMaskablePolicy, MAPPOPolicy
@@ -113,6 +114,7 @@ __all__ = [
     "load_weights",
     "make_team_env",
     "ppo_settings",
+    "replay",
     "resumable_learn",
     "resume",
 ]

@@ -61,6 +61,15 @@ def gif(pictures: Sequence[Picture]) -> bytes:
     return file.getvalue()
 
 
+def png(picture: Picture) -> bytes:
+    """Encode a picture, (height, width, 3), as PNG."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
 def _scaled(picture: Picture) -> Picture:
     """Scale a picture down to ``_HEIGHT``."""
     from PIL import Image

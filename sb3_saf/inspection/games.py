@@ -8,10 +8,14 @@ attribute        form                    meaning
 ``zone_colours`` Z times (r, g, b)       colour of each zone, 0 to 255
 ``return_unit``  str                     what the team return counts, such as ``"treasures"``
 ``best_return``  number                  the largest possible team return
+``action_names`` A times str             name of each action
 ``render_mode``  ``"rgb_array"``         its method ``render`` then gives a picture, (height, width, 3) uint8
 ================ ======================= ==============================================================================
 
-Letters: E games, N agents, B rows.
+A game on a grid may have two methods for :func:`~sb3_saf.replay`: ``grid_scene()`` gives what a drawing needs (see
+``HECOGridEnv``), ``replica()`` another game that plays the same episode from the same seed.
+
+Letters: E games, N agents, B rows, A actions.
 """
 
 from __future__ import annotations

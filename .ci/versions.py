@@ -1,0 +1,87 @@
+"""
+Run the tests with the oldest or the newest releases that setup.cfg allows.
+
+``python .ci/versions.py oldest`` and ``python .ci/versions.py newest`` make a virtual environment of their own under
+``build/`` and install the package there with the six libraries that it extends at one end of their ranges; everything
+else, torch included, is as in constraints.txt where that fits. They print the versions and run the tests. Further
+arguments go to pytest: ``python .ci/versions.py oldest -x -k policies``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import configparser
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+#: The libraries whose releases differ between the two ends.
+LIBRARIES: Final = ("gymnasium", "numba", "pettingzoo", "sb3-contrib", "stable-baselines3", "supersuit")
+#: What follows from that choice, and so is not pinned.
+FOLLOWING: Final = ("llvmlite", "numpy", "rl-zoo3")
+EXTRAS: Final = "export,render,zoo,dev"
+
+
+def lower_bounds() -> dict[str, str]:
+    """Return the oldest release of each library that setup.cfg allows."""
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg", encoding="utf-8")
+    bounds = {}
+    for line in config["options"]["install_requires"].splitlines():
+        name, separator, rest = line.partition(">=")
+        if separator and name.strip() in LIBRARIES:
+            bounds[name.strip()] = rest.split(",")[0].strip()
+    missing = set(LIBRARIES) - set(bounds)
+    if missing:
+        raise SystemExit(f"setup.cfg has no lower bound of the form name>=version for {', '.join(sorted(missing))}")
+    return bounds
+
+
+def constraints() -> str:
+    """Return the lines of constraints.txt, less those that the choice of releases decides."""
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    free = {*LIBRARIES, *FOLLOWING}
+    kept = [line for line in lines if line.partition("==")[0].strip().lower().replace("_", "-") not in free]
+    return "\n".join(kept) + "\n"
+
+
+def install(end: str, folder: Path) -> Path:
+    """
+    Install into a virtual environment.
+
+    :param end: ``"oldest"`` or ``"newest"``
+    :param folder: of the environment
+    :return: its Python
+    """
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    python = folder / "bin" / "python"
+    pins = folder / "constraints.txt"
+    pins.write_text(constraints(), encoding="utf-8")
+    wanted = [f"{name}=={bound}" for name, bound in lower_bounds().items()] if end == "oldest" else list(LIBRARIES)
+    upgrade = [] if end == "oldest" else ["--upgrade"]
+    command = [python, "-m", "pip", "install", "--quiet", *upgrade, "-c", pins, "-e", f".[{EXTRAS}]", *wanted]
+    subprocess.run(command, cwd=ROOT, check=True)
+    return python
+
+
+def main() -> None:
+    """Install, print versions, test."""
+    parser = argparse.ArgumentParser(prog="python .ci/versions.py", description=__doc__)
+    parser.add_argument("end", choices=["oldest", "newest"])
+    options, pytest_arguments = parser.parse_known_args()
+    folder = ROOT / "build" / f"venv-{options.end}"
+    python = install(options.end, folder)
+    listing = [python, "-m", "pip", "list", "--format=freeze"]
+    listed = subprocess.run(listing, capture_output=True, text=True, check=True)
+    names = {*LIBRARIES, *FOLLOWING, "torch"}
+    print(*(line for line in listed.stdout.splitlines() if line.partition("==")[0].lower() in names), sep="\n")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba")}
+    tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope", *pytest_arguments]
+    sys.exit(subprocess.run(tests, cwd=ROOT, env=environment, check=False).returncode)
+
+
+if __name__ == "__main__":
+    main()

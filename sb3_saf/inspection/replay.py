@@ -1,0 +1,300 @@
+"""
+One self-contained web page that plays episodes and shows what each agent sees and its policy computes.
+
+Letters: T game steps, N agents, A actions, U policies, L slots.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_saf.envs.teams import OBS_KEY, TeamSpaces, check_count, require_n_agents
+from sb3_saf.export.actor import Actor
+from sb3_saf.inspection.film import png
+from sb3_saf.inspection.games import draws_pictures, picture
+from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
+from sb3_saf.randomness import own_randomness
+
+#: Longer episodes are cut, and the page says so.
+MAX_STEPS: Final = 2000
+#: Shares between 0 and 1 travel as 16-bit numbers.
+_SHARE: Final = 65535
+_KINDS: Final = {"u1": np.uint8, "u2": np.uint16, "i2": np.int16, "f4": np.float32}
+
+Player: TypeAlias = "BaseAlgorithm | Actor"
+Packed = dict[str, Any]
+
+
+class _Episode(NamedTuple):
+    """
+    One episode of one game.
+
+    :param actions: (T, N) as the game took them
+    :param rewards: (T,) of the team
+    :param arrays: packed arrays by name
+    :param frames: data URLs of pictures, where there is no grid
+    """
+
+    actions: npt.NDArray[Any]
+    rewards: npt.NDArray[np.float64]
+    arrays: dict[str, Packed | None]
+    frames: list[str]
+
+
+def replay(
+    model: Player | Mapping[str, Player],
+    env: VecEnv,
+    path: str | Path = "replay.html",
+    episodes: int = 1,
+    seed: int = 20_000,
+    deterministic: bool = False,
+) -> Path:
+    """
+    Play episodes and write a page on which they can be watched, agent by agent, offline and without a server.
+
+    Models of SAF, MAPPO, IPPO and QPLEX are shown with what they have: action probabilities, pool, knowledge source,
+    values. Exported actors are shown with their own observations and actions. HECOGrid is drawn from its state, other
+    games from the pictures that they render.
+
+    :param model: a trained model, an exported :class:`~sb3_saf.Actor`, or several by name to compare side by side
+    :param env: from ``make_team_env``, with at least ``episodes`` games; HECOGrid needs no render mode, others
+        ``render_mode="rgb_array"``
+    :param path: of the page
+    :param episodes: games to show, each from its start; a page shows the first 2,000 game steps
+    :param seed: of games and actions; all models play the same games
+    :param deterministic: whether to take the most likely actions
+    :return: the path
+    :raises ValueError: if a model was trained on other spaces, the games are too few, or they cannot be shown
+    """
+    n_agents = require_n_agents(env)
+    check_count("episodes", episodes)
+    if episodes > env.num_envs // n_agents:
+        raise ValueError(
+            f"expected an environment of at least episodes={episodes} games, got {env.num_envs // n_agents}; make it "
+            f"with make_team_env(..., n_envs={episodes})"
+        )
+    has_grid = env.has_attr("grid_scene") and env.has_attr("replica")
+    if not has_grid and not draws_pictures(env):
+        raise ValueError(
+            "expected an environment that can be shown, got one with neither a grid nor render_mode='rgb_array'; make "
+            "it with make_team_env(..., render_mode='rgb_array')"
+        )
+    if not has_grid and episodes > 1:
+        raise ValueError("expected episodes=1: pictures are recorded of the first game only, as HECOGrid's are not")
+    players = model if isinstance(model, Mapping) else {"team": model}
+    runs: list[Packed] = []
+    grid: Packed | None = None
+    for name, player in players.items():
+        _check_spaces(name, player, env)
+        for game, episode in enumerate(_play(player, env, episodes, seed, deterministic)):
+            title = name if episodes == 1 else f"{name}, game {game + 1}"
+            run, grid = _run(title, episode, env, game, seed) if has_grid else (_run_of_frames(title, episode), None)
+            run["of_team"] = episode.arrays.pop("of_team", None) is not None
+            runs.append({**run, **{key: value for key, value in episode.arrays.items() if value is not None}})
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(_page(_title(env, players), _data(env, runs, grid)), encoding="utf-8")
+    return target
+
+
+def _check_spaces(name: str, player: Player, env: VecEnv) -> None:
+    own = TeamSpaces.from_observation_space(env.observation_space).own
+    expected = own.shape
+    if isinstance(player, Actor):
+        return  # it checks every observation
+    found = TeamSpaces.from_observation_space(player.observation_space).own.shape
+    if found != expected or player.action_space != env.action_space:
+        raise ValueError(
+            f"expected {name} to be trained on observations of shape {expected} and {env.action_space}, got shape "
+            f"{found} and {player.action_space}; replay it on the environment that it was trained on"
+        )
+
+
+# --- playing ----------------------------------------------------------------------------------------------------------
+
+
+def _play(player: Player, env: VecEnv, episodes: int, seed: int, deterministic: bool) -> list[_Episode]:
+    """Return one episode of each of the first games."""
+    if isinstance(player, Actor):
+        return [_play_actor(player, env, game, seed, deterministic) for game in range(episodes)]
+    recording = record_episodes(
+        player.policy,
+        env,
+        env.num_envs // require_n_agents(env),
+        seed,
+        deterministic,
+        gamma=getattr(player, "gamma", 1),
+    )
+    return [_episode_of(recording, game, _atlas(env) is not None) for game in range(episodes)]
+
+
+def _episode_of(recording: EpisodeRecording, game: int, has_codes: bool) -> _Episode:
+    """Return the first episode of a game, at most ``MAX_STEPS`` long."""
+    n = recording.n_agents
+    rows = slice(game * n, (game + 1) * n)
+    ended = recording.ends[:, rows].all(axis=1)
+    steps = slice(0, min(int(np.flatnonzero(ended)[0]) + 1, MAX_STEPS))
+    zero = recording.values_without.get("zero")
+    rewards = recording.rewards[steps, rows]
+    arrays: dict[str, Packed | None] = {
+        "of_team": {} if recording.of_team else None,
+        "actions": _packed(recording.actions[steps, rows], "u1") if recording.actions.ndim == 2 else None,
+        "probabilities": _share(recording.action_probabilities, steps, rows),
+        "weights": _share(recording.pool_weights, steps, rows),
+        "read": _share(recording.read_attention, steps, game),
+        "write": _share(recording.write_attention, steps, game),
+        "values": _packed(recording.values[steps, rows], "f4"),
+        "returns": _packed(recording.returns[steps, rows], "f4"),
+        "message": None if zero is None else _packed((zero - recording.values)[steps, rows], "f4"),
+    }
+    if has_codes and recording.observations is not None:
+        arrays["views"] = _packed(recording.observations[steps, rows], "u1")
+    team = rewards[:, 0] if recording.of_team else rewards.sum(axis=1)
+    frames = [_data_url(frame) for frame in recording.pictures[steps]] if game == 0 else []
+    return _Episode(recording.actions[steps, rows], team.astype(np.float64), arrays, frames)
+
+
+def _share(shares: npt.NDArray[Any] | None, steps: slice, rows: slice | int) -> Packed | None:
+    return None if shares is None else _packed(shares[steps, rows] * _SHARE, "u2", 1 / _SHARE)
+
+
+def _play_actor(actor: Actor, env: VecEnv, game: int, seed: int, deterministic: bool) -> _Episode:
+    """Play one episode with an exported actor, which sees its own observation and its index."""
+    n = require_n_agents(env)
+    rows = slice(game * n, (game + 1) * n)
+    if actor.has_memory or actor.manifest.reads_agent:
+        raise ValueError(
+            "expected an exported actor without memory and heads per agent to replay; replay the model that it "
+            "was exported from"
+        )
+    actions: list[npt.NDArray[Any]] = []
+    rewards: list[float] = []
+    views: list[npt.NDArray[Any]] = []
+    frames: list[str] = []
+    done = False
+    with own_randomness(seed, th.device("cpu")):
+        env.seed(seed)
+        obs: Any = env.reset()
+        while not done and len(actions) < MAX_STEPS:
+            frame = picture(env) if draws_pictures(env) and game == 0 else None
+            frames += [] if frame is None else [_data_url(frame)]
+            views.append(np.array(obs[OBS_KEY][rows]))
+            taken = np.asarray(actor.act(obs[OBS_KEY], deterministic=deterministic))
+            obs, reward, dones, _ = env.step(taken)
+            actions.append(taken[rows])
+            rewards.append(float(reward[rows].sum()))
+            done = bool(dones[rows].all())
+    arrays: dict[str, Packed | None] = {"actions": _packed(np.stack(actions), "u1")}
+    if _atlas(env) is not None:
+        arrays["views"] = _packed(np.stack(views), "u1")
+    return _Episode(np.stack(actions), np.array(rewards), arrays, frames)
+
+
+# --- the data of the page ---------------------------------------------------------------------------------------------
+
+
+def _run(name: str, episode: _Episode, env: VecEnv, game: int, seed: int) -> tuple[Packed, Packed]:
+    """Return what the page needs of a game with a grid, played again from its seed, and the grid itself."""
+    env.seed(seed)
+    replica: Any = env.env_method("replica", indices=[game * require_n_agents(env)])[0]
+    replica.reset(seed=_seeds(env)[game])
+    agents = list(replica.possible_agents)
+    scenes = [replica.grid_scene()]
+    for actions in episode.actions:
+        replica.step(dict(zip(agents, actions.tolist(), strict=True)))
+        scenes.append(replica.grid_scene())
+    taken = np.array([[treasure[2] for treasure in scene["treasures"]] for scene in scenes], dtype=bool)
+    first = np.where(taken.any(axis=0), taken.argmax(axis=0), -1) if taken.size else np.empty(0, dtype=int)
+    run = {
+        **_run_of_frames(name, episode),
+        "frames": None,
+        "pose": _packed(np.array([scene["agents"] for scene in scenes]), "i2"),
+        "treasures": [treasure[:2] for treasure in scenes[0]["treasures"]],
+        "collected": first.tolist(),
+        "keys": [scene["keys"] for scene in scenes] if any(scene["keys"] for scene in scenes) else None,
+    }
+    return run, {key: scenes[0][key] for key in ("width", "height", "walls", "zones")}
+
+
+def _run_of_frames(name: str, episode: _Episode) -> Packed:
+    return {
+        "name": name,
+        "steps": len(episode.actions),
+        "rewards": _packed(episode.rewards, "f4"),
+        "frames": episode.frames,
+    }
+
+
+def _seeds(env: VecEnv) -> list[int]:
+    """Return the seeds that the games will start from."""
+    layer: Any = env
+    while not hasattr(layer, "seeded_with"):
+        layer = layer.venv
+    return [int(seed) for seed in layer.seeded_with]
+
+
+def _atlas(env: VecEnv) -> npt.NDArray[np.uint8] | None:
+    """Return (codes, t, t, 3) pixels of tile codes, None if observations are no codes."""
+    own = TeamSpaces.from_observation_space(env.observation_space).own
+    atlas = getattr(own, "atlas", None)
+    return None if atlas is None else np.asarray(atlas)
+
+
+def _data(env: VecEnv, runs: list[Packed], grid: Packed | None) -> Packed:
+    atlas, space = _atlas(env), env.action_space
+    n_actions = int(space.n) if isinstance(space, spaces.Discrete) else 0
+    names = env.get_attr("action_names", indices=[0])[0] if env.has_attr("action_names") else range(n_actions)
+    cut = any(run["steps"] == MAX_STEPS for run in runs)
+    return {
+        "n_agents": require_n_agents(env),
+        "grid": grid,
+        "tiles": None if atlas is None else _packed(atlas, "u1"),
+        "actions": [str(name) for name in names],
+        "runs": runs,
+        "note": f"Cut after {MAX_STEPS:,} game steps." if cut else "Point at an agent, or choose its number.",
+    }
+
+
+def _packed(array: npt.ArrayLike, kind: str, scale: float = 1) -> Packed:
+    """Return an array as base64 of little-endian numbers, which the page multiplies by ``scale``."""
+    numbers = np.asarray(array)
+    if kind != "f4":
+        numbers = np.rint(numbers)
+    data = np.ascontiguousarray(numbers.astype(np.dtype(_KINDS[kind]).newbyteorder("<"))).tobytes()
+    return {"type": kind, "shape": list(numbers.shape), "scale": scale, "data": base64.b64encode(data).decode()}
+
+
+def _data_url(frame: npt.NDArray[np.uint8]) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png(frame)).decode()}"
+
+
+def _title(env: VecEnv, players: Mapping[str, Player]) -> str:
+    kinds = {
+        "exported actor" if isinstance(player, Actor) else type(player.policy).__name__.removesuffix("Policy")
+        for player in players.values()
+    }
+    return f"Replay: {', '.join(sorted(kinds))}, {require_n_agents(env)} agents"
+
+
+def _page(title: str, data: Packed) -> str:
+    folder = files("sb3_saf.inspection")
+    template = folder.joinpath("replay.html").read_text(encoding="utf-8")
+    script = folder.joinpath("replay.js").read_text(encoding="utf-8")
+    # "<" inside of strings only: no name can end the element that holds the data.
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    for mark, content in (("{{title}}", escape(title)), ("{{script}}", script), ("{{data}}", text)):
+        template = template.replace(mark, content)
+    return template

@@ -1,0 +1,203 @@
+"""The replay page: its numbers are those of the recording, its controls work, and bad input is refused."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+import sb3_saf
+from sb3_saf.inspection import replay as replay_module
+from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
+from sb3_saf.inspection.replay import replay
+from tests.toy_envs import CounterEnv
+
+LEVEL: dict[str, Any] = {"n_agents": 3, "grid_size": 9, "n_treasures": 12, "max_cycles": 12, "heterogeneity": 2}
+SEED = 7
+KINDS = {"u1": np.uint8, "u2": np.uint16, "i2": np.int16, "f4": np.float32}
+
+
+def make_env(task: str = "TeamSupport", n_envs: int = 2, **params: Any) -> Any:
+    return sb3_saf.make_team_env(task, n_envs=n_envs, seed=0, **{**LEVEL, **params})
+
+
+@pytest.fixture(scope="module")
+def model() -> PPO:
+    env = make_env()
+    return PPO("SAFPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env)).learn(2_000)
+
+
+def data_of(page: Path) -> Any:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text(), re.DOTALL)
+    assert found
+    return json.loads(found[1])
+
+
+def unpacked(packed: Any) -> Any:
+    numbers = np.frombuffer(base64.b64decode(packed["data"]), dtype=KINDS[packed["type"]])
+    return numbers.reshape(packed["shape"]) * packed["scale"]
+
+
+def test_numbers_are_those_of_the_recording(model: PPO, tmp_path: Path) -> None:
+    data = data_of(replay(model, make_env(), tmp_path / "page.html", seed=SEED))
+    recording = record_episodes(model.policy, make_env(), 2, SEED, gamma=model.gamma)
+    (run,) = data["runs"]
+    assert run["steps"] == LEVEL["max_cycles"] and data["n_agents"] == 3
+    rows = slice(0, 3)
+    for name, expected in (
+        ("actions", recording.actions[:, rows]),
+        ("views", of(recording.observations)[:, rows]),
+        ("probabilities", of(recording.action_probabilities)[:, rows]),
+        ("weights", of(recording.pool_weights)[:, rows]),
+        ("read", of(recording.read_attention)[:, 0]),
+        ("write", of(recording.write_attention)[:, 0]),
+        ("values", recording.values[:, rows]),
+        ("returns", recording.returns[:, rows]),
+        ("message", (recording.values_without["zero"] - recording.values)[:, rows]),
+        ("rewards", recording.rewards[:, rows].sum(axis=1)),
+    ):
+        np.testing.assert_allclose(unpacked(run[name]), expected, atol=1e-5, err_msg=name)
+    assert sum(step >= 0 for step in run["collected"]) == pytest.approx(recording.episode_returns[0])
+
+
+def of(array: Any) -> Any:
+    assert array is not None
+    return array
+
+
+def test_it_acts_as_predict_does(model: PPO, tmp_path: Path) -> None:
+    data = data_of(replay(model, make_env(), tmp_path / "page.html", seed=SEED, deterministic=True))
+    env = make_env()
+    env.seed(SEED)
+    obs = env.reset()
+    for actions in unpacked(data["runs"][0]["actions"]):
+        predicted = model.predict(obs, deterministic=True)[0]
+        assert predicted[:3].tolist() == actions.tolist()
+        obs = env.step(predicted)[0]
+
+
+def test_the_grid_is_that_of_the_game(model: PPO, tmp_path: Path) -> None:
+    data = data_of(replay(model, make_env("KeyForTreasure", n_keys=3), tmp_path / "page.html", seed=SEED))
+    env = make_env("KeyForTreasure", n_keys=3)
+    env.seed(SEED)
+    obs = env.reset()
+    run, pose = data["runs"][0], unpacked(data["runs"][0]["pose"])
+    for step, actions in enumerate(unpacked(run["actions"])):
+        state = env.env_method("get_state", indices=[0])[0]
+        assert pose[step, :, :2].tolist() == state["agent_pos"].tolist()
+        assert len(run["keys"][step]) == state["keys"].sum()
+        obs, *_ = env.step(np.concatenate([actions, np.zeros(3, dtype=int)]).astype(int))
+    assert obs is not None and len(pose) == run["steps"] + 1
+    assert data["grid"]["zones"] == [0, 0, 0, 0, 0, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("policy", ["MAPPOPolicy", "IPPOPolicy", "QPLEXPoolPolicy"])
+def test_methods_without_parts(policy: str, tmp_path: Path) -> None:
+    env = make_env()
+    algorithm: Any = sb3_saf.QPLEX if policy.startswith("QPLEX") else PPO
+    other = algorithm(policy, env, seed=0, device="cpu")
+    (run,) = data_of(replay(other, make_env(), tmp_path / "page.html"))["runs"]
+    assert ("weights" in run) == ("Pool" in policy) and "read" not in run
+    assert run["of_team"] == policy.startswith("QPLEX") and "values" in run
+
+
+def test_exported_actors_and_models_side_by_side(model: PPO, tmp_path: Path) -> None:
+    sb3_saf.export_actors(model, tmp_path / "actor", onnx=False)
+    players: dict[str, Any] = {"model": model, "<b>actor</b>": sb3_saf.Actor.load(tmp_path / "actor")}
+    page = replay(players, make_env(), tmp_path / "page.html", deterministic=True)
+    first, second = data_of(page)["runs"]
+    assert second["actions"] == first["actions"] and second["pose"] == first["pose"] and "values" not in second
+    assert "<b>actor" not in page.read_text()
+
+
+def test_other_games_are_shown_by_their_pictures(tmp_path: Path) -> None:
+    env = sb3_saf.make_team_env(CounterEnv, n_envs=1, seed=0, render_mode="rgb_array")
+    other = PPO("MAPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
+    (run,) = data_of(replay(other, env, tmp_path / "page.html"))["runs"]
+    assert len(run["frames"]) == run["steps"] and run["frames"][0].startswith("data:image/png;base64,")
+
+
+def test_ten_agents_take_at_most_300_kilobytes(tmp_path: Path) -> None:
+    env = sb3_saf.make_team_env("TeamSupport", n_envs=1, seed=0)
+    page = replay(PPO("SAFPolicy", env, device="cpu", **sb3_saf.ppo_settings(env)), env, tmp_path / "page.html")
+    assert page.stat().st_size <= 300_000
+
+
+def test_long_episodes_are_cut(model: PPO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_module, "MAX_STEPS", 5)
+    data = data_of(replay(model, make_env(), tmp_path / "page.html"))
+    assert data["runs"][0]["steps"] == 5 and data["note"] == "Cut after 5 game steps."
+
+
+def test_bad_input(model: PPO, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"at least episodes=3 games, got 2; make it with make_team_env"):
+        replay(model, make_env(), tmp_path / "page.html", episodes=3)
+    with pytest.raises(ValueError, match=r"team to be trained on observations of shape \(5, 5\).*got shape \(7, 7\)"):
+        replay(model, make_env(view_size=5), tmp_path / "page.html")
+    env = sb3_saf.make_team_env(CounterEnv, n_envs=1)
+    other = PPO("MAPPOPolicy", env, **sb3_saf.ppo_settings(env))
+    with pytest.raises(ValueError, match="neither a grid nor render_mode='rgb_array'"):
+        replay(other, env, tmp_path / "page.html")
+    assert not list(tmp_path.iterdir())
+
+
+# --- in a browser -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium drives the browser")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("chromium and chromedriver are not installed (Debian: chromium, chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1200,900"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    started = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    yield started
+    started.quit()
+
+
+def numbers_in(browser: Any, table: str) -> list[float]:
+    cells = browser.find_elements("css selector", f"#{table} td[data-number]")
+    return [float(cell.get_attribute("data-number")) for cell in cells]
+
+
+def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None:
+    recording: EpisodeRecording = record_episodes(model.policy, make_env(), 2, SEED, gamma=model.gamma)
+    browser.get(replay({"a": model, "b": model}, make_env(), tmp_path / "page.html", seed=SEED).as_uri())
+    body = browser.find_element("tag name", "body")
+    for _ in range(4):
+        body.send_keys("\ue014")  # right arrow
+    browser.find_element("css selector", "button[data-agent='2']").click()
+    assert browser.find_element("id", "clock").text == f"step 4 of {LEVEL['max_cycles']}"
+    row = 2
+    for table, expected in (
+        ("actions", of(recording.action_probabilities)[4, row]),
+        ("weights", of(recording.pool_weights)[4, row]),
+        ("slots", of(recording.read_attention)[4, 0, row]),
+    ):
+        np.testing.assert_allclose(numbers_in(browser, table), expected, atol=1e-4, err_msg=table)
+    shown = {name: browser.find_element("id", name) for name in ("value-number", "return-number", "strength")}
+    value, zeroed = recording.values[4, row], recording.values_without["zero"][4, row]
+    for name, number in (
+        ("value-number", value),
+        ("return-number", recording.returns[4, row]),
+        ("strength", zeroed - value),
+    ):
+        assert float(shown[name].get_attribute("data-number")) == pytest.approx(number, abs=1e-5)
+    score = recording.rewards[:4, :3].sum()
+    assert browser.find_element("id", "score-1").text.startswith(f"b: return {score:.2f}, {round(score)} of 12")
+    browser.find_element("id", "play").click()
+    assert browser.find_element("id", "play").text == "Pause"
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
