@@ -62,7 +62,19 @@ def install(end: str, folder: Path) -> Path:
     pins.write_text(constraints(), encoding="utf-8")
     wanted = [f"{name}=={bound}" for name, bound in lower_bounds().items()] if end == "oldest" else list(LIBRARIES)
     upgrade = [] if end == "oldest" else ["--upgrade"]
-    command = [python, "-m", "pip", "install", "--quiet", *upgrade, "-c", pins, "-e", f".[{EXTRAS}]", *wanted]
+    command: list[str | Path] = [
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        *upgrade,
+        "-c",
+        pins,
+        "-e",
+        f".[{EXTRAS}]",
+        *wanted,
+    ]
     subprocess.run(command, cwd=ROOT, check=True)
     return python
 
@@ -74,12 +86,12 @@ def main() -> None:
     options, pytest_arguments = parser.parse_known_args()
     folder = ROOT / "build" / f"venv-{options.end}"
     python = install(options.end, folder)
-    listing = [python, "-m", "pip", "list", "--format=freeze"]
+    listing: list[str | Path] = [python, "-m", "pip", "list", "--format=freeze"]
     listed = subprocess.run(listing, capture_output=True, text=True, check=True)
     names = {*LIBRARIES, *FOLLOWING, "torch"}
     print(*(line for line in listed.stdout.splitlines() if line.partition("==")[0].lower() in names), sep="\n")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba")}
-    tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope", *pytest_arguments]
+    tests: list[str | Path] = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope", *pytest_arguments]
     sys.exit(subprocess.run(tests, cwd=ROOT, env=environment, check=False).returncode)
 
 

@@ -1,5 +1,6 @@
 """
-``make train``: SAF on a HECOGrid task, from nothing to a model, a learning curve and a GIF in minutes on a laptop.
+``make train``: SAF on a HECOGrid task, from nothing to a model, a learning curve, a GIF and a replay in minutes on a
+laptop.
 
 The settings are those of ``python -m sb3_saf.train --size small``; ``sb3_saf.training.run.train`` does the work.
 """
@@ -7,6 +8,8 @@ The settings are those of ``python -m sb3_saf.train --size small``; ``sb3_saf.tr
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +18,11 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from hecogrid_envs import TASK_NAMES
-from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team
+from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
 from sb3_saf.training.enjoy import TrainedTeam
+from sb3_saf.training.folders import write_run
 from sb3_saf.training.run import RunOptions, train
+from sb3_saf.training.seeds import evaluation_seed
 from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.watching import play, write_video
 
@@ -116,11 +121,21 @@ def record_episode(options: Options, model: BaseAlgorithm) -> Path:
     return path
 
 
+def write_replay(options: Options, model: BaseAlgorithm) -> Path:
+    """Write a page on which the first of the evaluation games can be watched, agent by agent."""
+    seed = evaluation_seed(options.seed)
+    with closing(options.settings.make_env(options.seed, evaluation=True, n_envs=1)) as games:
+        return replay({"SAF": model}, games, options.output / "replay.html", seed=seed)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Train, compare with a random team, and say where everything is."""
     options = parse(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     settings = options.settings
+    given = sys.argv[1:] if arguments is None else arguments
+    command = shlex.join(["python", "-m", "sb3_saf.quickstart", *given])
+    write_run(options.output, settings, options.seed, {}, command)
     print(
         f"Training SAF on {describe(settings)}: {settings.game_steps:,} game steps with {settings.n_agents} agents in "
         f"{settings.n_envs} games, in a few minutes"
@@ -128,13 +143,14 @@ def main(arguments: list[str] | None = None) -> None:
     model = train_team(options)
     trained = evaluate(options, model)
     random = evaluate(options, RandomPolicy(model.action_space, seed=options.seed))
-    curve, gif = draw_curve(options, random), record_episode(options, model)
+    curve, gif, page = draw_curve(options, random), record_episode(options, model), write_replay(options, model)
     print(f"\nTeam return (treasures collected), {N_EPISODES} fresh games, mean and 95 % interval")
     print(f"  SAF     {trained}")
     print(f"  random  {random}")
     print(f"\nmodel           {options.output / 'model.zip'}")
     print(f"learning curve  {curve}")
     print(f"episode         {gif}")
+    print(f"replay          {page} (open it in a browser)")
     print(f"TensorBoard     tensorboard --logdir {options.output / 'tb'}")
 
 

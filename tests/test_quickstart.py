@@ -22,7 +22,8 @@ def test_it_leaves_model_curve_video_and_logs(tmp_path: Path, capsys: pytest.Cap
     assert imageio.imread(output / "learning_curve.png").shape == (480, 840, 4)
     assert len(imageio.imread(output / "episode.gif")) == 51
     assert list((output / "tb" / "saf_1").glob("events.out.tfevents.*"))
-    for name in ("model.zip", "learning_curve.png", "episode.gif", "tb"):
+    assert "</html>" in (output / "replay.html").read_text()
+    for name in ("model.zip", "learning_curve.png", "episode.gif", "replay.html", "tb"):
         assert str(output / name) in printed
 
 

@@ -15,9 +15,11 @@ import pytest
 from stable_baselines3 import PPO
 
 import sb3_saf
+from sb3_saf import quickstart
 from sb3_saf.inspection import replay as replay_module
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.inspection.replay import replay
+from sb3_saf.training import replay as command
 from tests.toy_envs import CounterEnv
 
 LEVEL: dict[str, Any] = {"n_agents": 3, "grid_size": 9, "n_treasures": 12, "max_cycles": 12, "heterogeneity": 2}
@@ -201,3 +203,29 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
     browser.find_element("id", "play").click()
     assert browser.find_element("id", "play").text == "Pause"
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quickstart.main(["--game-steps", "1600", "--output", str(tmp_path / "run"), "--no-progress-bar"])
+    capsys.readouterr()
+    page = tmp_path / "page.html"
+    model_file = str(tmp_path / "run" / "model.zip")
+    command.main(["--model", model_file, model_file, "-o", str(page), "--env-kwargs", "max_cycles:9"])
+    assert capsys.readouterr().out.strip() == str(page)
+    assert [run["steps"] for run in data_of(page)["runs"]] == [9, 9]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--model", "nowhere.zip"], "--model nowhere.zip is not there"),
+        (["--model", "nowhere.zip", "--env", "Nothing-v0"], "--model nowhere.zip is not there"),
+        (["--model", __file__, "--size", "huge"], "unknown size 'huge'"),
+        (["--model", __file__, "--episodes", "0"], "n_envs must be an integer of at least 1, got 0"),
+    ],
+)
+def test_wrong_commands(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        command.main(given)
+    error = capsys.readouterr().err.strip()
+    assert message in error and "Traceback" not in error

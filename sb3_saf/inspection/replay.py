@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.teams import OBS_KEY, TeamSpaces, check_count, require_n_agents
@@ -34,7 +35,7 @@ MAX_STEPS: Final = 2000
 _SHARE: Final = 65535
 _KINDS: Final = {"u1": np.uint8, "u2": np.uint16, "i2": np.int16, "f4": np.float32}
 
-Player: TypeAlias = "BaseAlgorithm | Actor"
+Player: TypeAlias = "BaseAlgorithm | BasePolicy | Actor"
 Packed = dict[str, Any]
 
 
@@ -61,6 +62,7 @@ def replay(
     episodes: int = 1,
     seed: int = 20_000,
     deterministic: bool = False,
+    gamma: float | None = None,
 ) -> Path:
     """
     Play episodes and write a page on which they can be watched, agent by agent, offline and without a server.
@@ -69,13 +71,15 @@ def replay(
     values. Exported actors are shown with their own observations and actions. HECOGrid is drawn from its state, other
     games from the pictures that they render.
 
-    :param model: a trained model, an exported :class:`~sb3_saf.Actor`, or several by name to compare side by side
+    :param model: a trained model, its policy, an exported :class:`~sb3_saf.Actor`, or several by name, which are shown
+        side by side
     :param env: from ``make_team_env``, with at least ``episodes`` games; HECOGrid needs no render mode, others
         ``render_mode="rgb_array"``
     :param path: of the page
     :param episodes: games to show, each from its start; a page shows the first 2,000 game steps
     :param seed: of games and actions; all models play the same games
     :param deterministic: whether to take the most likely actions
+    :param gamma: discount factor of the returns beside values; None for the model's own
     :return: the path
     :raises ValueError: if a model was trained on other spaces, the games are too few, or they cannot be shown
     """
@@ -99,7 +103,7 @@ def replay(
     grid: Packed | None = None
     for name, player in players.items():
         _check_spaces(name, player, env)
-        for game, episode in enumerate(_play(player, env, episodes, seed, deterministic)):
+        for game, episode in enumerate(_play(player, env, episodes, seed, deterministic, gamma)):
             title = name if episodes == 1 else f"{name}, game {game + 1}"
             run, grid = _run(title, episode, env, game, seed) if has_grid else (_run_of_frames(title, episode), None)
             run["of_team"] = episode.arrays.pop("of_team", None) is not None
@@ -126,18 +130,16 @@ def _check_spaces(name: str, player: Player, env: VecEnv) -> None:
 # --- playing ----------------------------------------------------------------------------------------------------------
 
 
-def _play(player: Player, env: VecEnv, episodes: int, seed: int, deterministic: bool) -> list[_Episode]:
+def _play(
+    player: Player, env: VecEnv, episodes: int, seed: int, deterministic: bool, gamma: float | None
+) -> list[_Episode]:
     """Return one episode of each of the first games."""
     if isinstance(player, Actor):
         return [_play_actor(player, env, game, seed, deterministic) for game in range(episodes)]
-    recording = record_episodes(
-        player.policy,
-        env,
-        env.num_envs // require_n_agents(env),
-        seed,
-        deterministic,
-        gamma=getattr(player, "gamma", 1),
-    )
+    policy = player.policy if isinstance(player, BaseAlgorithm) else player
+    discount = float(getattr(player, "gamma", 1.0)) if gamma is None else gamma
+    n_games = env.num_envs // require_n_agents(env)
+    recording = record_episodes(policy, env, n_games, seed, deterministic, gamma=discount)
     return [_episode_of(recording, game, _atlas(env) is not None) for game in range(episodes)]
 
 
@@ -283,7 +285,9 @@ def _data_url(frame: npt.NDArray[np.uint8]) -> str:
 
 def _title(env: VecEnv, players: Mapping[str, Player]) -> str:
     kinds = {
-        "exported actor" if isinstance(player, Actor) else type(player.policy).__name__.removesuffix("Policy")
+        "exported actor"
+        if isinstance(player, Actor)
+        else type(getattr(player, "policy", player)).__name__.removesuffix("Policy")
         for player in players.values()
     }
     return f"Replay: {', '.join(sorted(kinds))}, {require_n_agents(env)} agents"

@@ -53,6 +53,8 @@ DECLARATION: Final = Declaration(
     team_policies(IPPOPolicy, IPPOLstmPolicy, IPPOMaskablePolicy),
     {
         "ippo": AlgorithmSpec(PPO, "IPPOPolicy", "ippo"),
+        # The paper's own form: an actor and a critic for each agent.
+        "ippo-separate": AlgorithmSpec(PPO, "IPPOPolicy", "ippo", {"heads": "per_agent"}),
         "ippo-lstm": AlgorithmSpec(RecurrentPPO, "IPPOLstmPolicy", "ippo-lstm"),
     },
     PaperTable({"heads": "per_agent"}, 1_740_016),

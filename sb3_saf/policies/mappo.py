@@ -183,6 +183,8 @@ DECLARATION: Final = Declaration(
     team_policies(MAPPOPolicy, MAPPOLstmPolicy, MAPPOMaskablePolicy),
     {
         "mappo": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo"),
+        # The paper's own form: an actor and a critic for each agent.
+        "mappo-separate": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo", {"heads": "per_agent"}),
         "mappo-lstm": AlgorithmSpec(RecurrentPPO, "MAPPOLstmPolicy", "mappo-lstm"),
     },
     PaperTable({"heads": "per_agent"}, 2_477_296),

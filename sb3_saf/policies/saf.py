@@ -263,6 +263,8 @@ DECLARATION: Final = Declaration(
         "saf": AlgorithmSpec(PPO, "SAFPolicy", "saf"),
         # Ablations read SAF's file: they differ in one argument and in nothing else.
         "saf-no-pool": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1}),
+        # The paper's ablation goes back to an actor for each agent.
+        "saf-no-pool-separate": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1, "heads": "per_agent"}),
         "saf-no-ks": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"knowledge_source": False}),
         "saf-lstm": AlgorithmSpec(RecurrentPPO, "SAFLstmPolicy", "saf-lstm"),
     },

@@ -131,10 +131,16 @@ def load_team(options: argparse.Namespace) -> TrainedTeam:
             f"the team was trained with {trained.n_agents} agents, got n_agents={settings.n_agents}; leave "
             "n_agents out of --env-kwargs"
         )
-    return TrainedTeam(settings, _policy(settings, path), path)
+    return TrainedTeam(settings, make_policy(settings, path), path)
 
 
-def _policy(settings: Settings, path: Path) -> BasePolicy:
+def make_policy(settings: Settings, path: Path) -> BasePolicy:
+    """
+    Make a policy with the weights of a model's file, which are read as numbers.
+
+    :param settings: that the model was trained with
+    :param path: of the model
+    """
     with closing(settings.make_env(0, n_envs=1)) as games:
         kwargs = settings.hyperparams.get("policy_kwargs", {})
         policy = settings.spec.policy_class(

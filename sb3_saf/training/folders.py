@@ -85,7 +85,7 @@ def write_run(folder: Path, settings: Settings, seed: int, options: Mapping[str,
     :param command: as given
     """
     place = folder / settings.environment.folder_name
-    place.mkdir()
+    place.mkdir(exist_ok=True)
     contents = {
         "config.yml": {**settings.as_dict(), "seed": seed},
         "args.yml": {**options, "seed": seed},

@@ -25,7 +25,8 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
         model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env))
 
     They are those of ``sb3_saf.train --size small``: whole teams in ``TeamRolloutBuffer``, as many game steps in a
-    rollout however few games there are, two minibatches, and the light encoder where observations are tile codes.
+    rollout however few games there are, two minibatches; for HECOGrid, whose observations are tile codes, the light
+    encoder and its discount.
 
     :param env: from ``make_team_env``, with any number of games
     :param overrides: arguments of PPO that win; ``policy_kwargs`` are merged
@@ -42,7 +43,9 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
     teams = int(overrides.get("n_steps", n_steps)) * n_games
     found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
     encoder = _encoder_of(env)
-    policy_kwargs = {} if encoder is None else {"features_extractor_class": encoder}
+    policy_kwargs = {}
+    if encoder is not None:
+        policy_kwargs, found["gamma"] = {"features_extractor_class": encoder}, source.hyperparams["gamma"]
     policy_kwargs |= overrides.get("policy_kwargs") or {}
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
 

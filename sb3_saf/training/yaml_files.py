@@ -12,7 +12,7 @@ import yaml
 from sb3_saf.training.names import unknown_name
 
 #: The paper's experiments, what a laptop trains in an hour, and what a test trains in seconds.
-Size = Literal["paper", "small", "smoke"]
+Size = Literal["paper", "medium", "small", "smoke"]
 SIZES: Final[tuple[Size, ...]] = get_args(Size)
 
 #: The entry for all environments, and the key that names the file to refine.

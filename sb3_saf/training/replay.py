@@ -1,0 +1,106 @@
+"""``python -m sb3_saf.replay``: one page in the browser that plays episodes of trained teams."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from sb3_saf.export.actor import Actor
+from sb3_saf.export.errors import ExportError
+from sb3_saf.inspection.replay import replay
+from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.commands import (
+    CommandError,
+    DefaultsFormatter,
+    OneLineParser,
+    add_environment_options,
+    import_packages,
+    run_command,
+    user_errors,
+)
+from sb3_saf.training.enjoy import TrainedTeam, make_policy
+from sb3_saf.training.folders import read_run
+from sb3_saf.training.seeds import check_seed, evaluation_seed
+from sb3_saf.training.settings import Settings, load_settings, saved_settings
+
+PROGRAM: Final = "python -m sb3_saf.replay"
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser."""
+    parser = OneLineParser(
+        prog=PROGRAM, description="Write a page that plays episodes of a team.", formatter_class=DefaultsFormatter
+    )
+    parser.add_argument(
+        "--model",
+        type=Path,
+        nargs="+",
+        required=True,
+        metavar="FILE",
+        help="a model (.zip), or the folder of exported actors; several are shown side by side",
+    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("replay.html"), help="the page")
+    add_environment_options(parser, "another level than was trained on, such as coordination:3")
+    parser.set_defaults(env=None)
+    parser.add_argument("--algo", default="saf", help=f"of models without the files of their run: {', '.join(ALGOS)}")
+    parser.add_argument("--size", default="small", help="of models without the files of their run")
+    parser.add_argument("--episodes", type=int, default=1, help="games to show")
+    parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
+    parser.add_argument("--seed", type=int, default=0, help="of the games, none of which was trained on")
+    return parser
+
+
+def write_page(arguments: Sequence[str] | None = None) -> Path:
+    """
+    Write the page.
+
+    :param arguments: of the command line; None for those of this process
+    :return: the page
+    :raises CommandError: for what the user can put right
+    """
+    options = make_parser().parse_args(arguments)
+    import_packages(options.gym_packages)
+    with user_errors(ValueError, OSError, ExportError):
+        seed = evaluation_seed(check_seed(options.seed))
+        settings = [_settings_of(path, options) for path in options.model]
+        players: dict[str, Any] = {
+            name: Actor.load(path) if path.is_dir() else TrainedTeam(own, make_policy(own, path), path).policy
+            for name, path, own in zip(_names(options.model), options.model, settings, strict=True)
+        }
+        render_mode = None if settings[0].environment.task else "rgb_array"  # HECOGrid is drawn from its state
+        with closing(
+            settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
+        ) as games:
+            gamma = settings[0].hyperparams.get("gamma", 0.99)
+            return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
+
+
+def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
+    """Return the settings of the run that a model belongs to, or those of the command line."""
+    if not path.exists():
+        raise CommandError(f"--model {path} is not there")
+    configs = sorted(path.parent.glob("*/config.yml")) if path.is_file() else []
+    if len(configs) != 1:
+        return load_settings(options.algo, options.env or "TeamSupport-v0", options.size, options.env_kwargs)
+    config = read_run(path.parent, configs[0].parent.name)
+    if options.env not in (None, config.get("env")):
+        raise CommandError(f"{path} was trained on {config.get('env')}, got --env {options.env}; leave --env out")
+    return saved_settings(config, options.env_kwargs)
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return names that tell models apart: of files, or of files with their folders."""
+    stems = [path.stem for path in paths]
+    return stems if len(set(stems)) == len(stems) else [f"{path.parent.name}/{path.stem}" for path in paths]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command.
+
+    :param arguments: of the command line; None for those of this process
+    """
+    run_command(PROGRAM, lambda: print(write_page(arguments)))
