@@ -24,10 +24,11 @@ nb_execution_mode = "off"
 nb_merge_streams = True
 copybutton_prompt_text = ">>> |... |$ "
 copybutton_prompt_is_regexp = False
-exclude_patterns = ["tools"]
+exclude_patterns = ["extra", "tools"]
 html_theme = "furo"
 html_title = "sb3-saf"
 html_static_path = ["_static"]
+html_extra_path = ["extra"]
 html_css_files = ["tables.css"]
 html_show_sphinx = False
 
