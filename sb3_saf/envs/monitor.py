@@ -5,15 +5,20 @@ from __future__ import annotations
 import os
 import time
 import warnings
+import weakref
 from collections.abc import Mapping
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import numpy as np
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_saf.envs.opposition import OppositionDetector
 from sb3_saf.envs.teams import TeamVecEnvWrapper, check_finite, team_dones
+
+
+_COLUMNS: Final = frozenset({"r", "l", "t"})
 
 
 class TeamMonitor(TeamVecEnvWrapper):
@@ -29,12 +34,14 @@ class TeamMonitor(TeamVecEnvWrapper):
     return. With a TeamMonitor it does return, but takes every agent for an episode and warns that there is no monitor;
     use ``sb3_saf.evaluate_policy``, which counts teams.
 
+    Agents whose rewards oppose each other (one gains what another loses) are no team: a warning says so.
+
     :param venv: rows of flattened teams, game-major, then agent
     :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none. It
         begins with the first step. The file of another run is kept as ``monitor.csv.1``, ``monitor.csv.2`` ...
     :param info_keywords: entries of agent 0's last info to add to the episode's
     :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
-    :raises ValueError: if N is unknown or does not divide the rows
+    :raises ValueError: if N is unknown or does not divide the rows, or a keyword is that of a column of the file
     """
 
     def __init__(
@@ -45,6 +52,12 @@ class TeamMonitor(TeamVecEnvWrapper):
         n_agents: int | None = None,
     ) -> None:
         super().__init__(venv, n_agents)
+        columns = sorted(_COLUMNS.intersection(info_keywords))
+        if columns:
+            raise ValueError(
+                f"expected info_keywords other than the monitor's own columns {sorted(_COLUMNS)}, got {columns}; let "
+                "the environment give them other names"
+            )
         self.info_keywords = info_keywords
         self.episode_count = 0
         self.t_start = time.time()
@@ -52,6 +65,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
         self._filename = filename
+        self._opposition = OppositionDetector(self.n_agents)
         self._writer: ResultsWriter | None = None
 
     def reset(self) -> VecEnvObs:
@@ -78,7 +92,9 @@ class TeamMonitor(TeamVecEnvWrapper):
         check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
         # Sums of many float32 rewards drift; sums of float64 do not.
-        self._returns += rewards.reshape(self.n_games, self.n_agents).sum(axis=1, dtype=np.float64)
+        by_game = rewards.reshape(self.n_games, self.n_agents)
+        self._returns += by_game.sum(axis=1, dtype=np.float64)
+        self._opposition.see(by_game)
         self._lengths += 1
         if ended.any():
             infos = list(infos)
@@ -128,7 +144,9 @@ class TeamMonitor(TeamVecEnvWrapper):
         if self._filename is None:
             return None
         header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(getattr(self.venv, "spec", None))}
-        return ResultsWriter(self._filename, header, self.info_keywords, override_existing)
+        writer = ResultsWriter(self._filename, header, self.info_keywords, override_existing)
+        weakref.finalize(self, writer.close)  # where a run ends by an exception, nobody closes the environment
+        return writer
 
     def checkpoint_state(self) -> dict[str, Any]:
         """
