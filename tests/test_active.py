@@ -287,8 +287,8 @@ def test_minibatches_without_anybody_are_skipped() -> None:
     class Nobody(CentralizedValueWrapper):
         """Nobody takes part in game 0."""
 
-        def _joint_view(self, obs: Any) -> Any:
-            joint = super()._joint_view(obs)
+        def _joint_observation(self, obs: Any) -> Any:
+            joint = super()._joint_observation(obs)
             joint["active"][:N_AGENTS] = 0
             return joint
 

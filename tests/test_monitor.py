@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,86 @@ def test_monitor_file_line_by_line(tmp_path: Path) -> None:
     assert lines[2].startswith("69.0,2,")
     assert len(lines) == 3
     assert env.venv.closed  # type: ignore[attr-defined]
+
+
+def returns_in(path: Path) -> list[float]:
+    return [float(line.split(",")[0]) for line in path.read_text().splitlines()[2:]]
+
+
+Monitors = Callable[..., TeamMonitor]
+
+
+@pytest.fixture
+def monitors(tmp_path: Path) -> Iterator[Monitors]:
+    """Make monitors of one game that write to one folder; their files are closed after the test."""
+    made: list[TeamMonitor] = []
+
+    def make(length: int, **kwargs: Any) -> TeamMonitor:
+        made.append(TeamMonitor(TeamVenv(lengths=(length,)), str(tmp_path), **kwargs))
+        return made[-1]
+
+    yield make
+    for monitor in made:
+        monitor.close()
+
+
+def test_lines_of_an_earlier_run_are_kept_unless_told_otherwise(monitors: Monitors, tmp_path: Path) -> None:
+    path = tmp_path / "monitor.csv"
+    earlier = monitors(2)
+    earlier.reset()
+    assert not path.exists(), "a run that only resets, and is refused then, leaves no trace"
+    play(earlier, 4)
+    lines = path.read_text()
+    monitors(3).reset()
+    assert path.read_text() == lines
+    later = monitors(3)
+    with pytest.warns(UserWarning, match=r"monitor.csv has 2 lines of an earlier run, which are kept: .*override_exis"):
+        play(later, 3)
+    assert path.read_text().startswith(lines)
+    assert returns_in(path) == [69, 69, RETURN_OF_GAME_0]
+    play(monitors(3, override_existing=True), 3)
+    assert returns_in(path) == [RETURN_OF_GAME_0]
+
+
+def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint_and_no_more(monitors: Monitors, tmp_path: Path) -> None:
+    path = tmp_path / "monitor.csv"
+    play(monitors(3), 3)  # an earlier run
+    env = monitors(2)
+    at_the_start = env.checkpoint_state()
+    with pytest.warns(UserWarning, match="1 lines of an earlier run"):
+        play(env, 2)
+    state = env.checkpoint_state()
+    for _ in range(2):
+        env.step(still(env))
+    assert returns_in(path) == [RETURN_OF_GAME_0, 69, 69]
+    for then, lines in ((state, [RETURN_OF_GAME_0, 69]), (at_the_start, [RETURN_OF_GAME_0])):
+        resumed = monitors(2)
+        resumed.reset()
+        resumed.load_checkpoint_state(then)
+        assert returns_in(path) == lines
+        for _ in range(2):
+            resumed.step(still(resumed))
+        assert returns_in(path) == [*lines, 69]
+
+
+def test_keywords_that_are_columns_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"other than the monitor's own columns \['l', 'r', 't'\], got \['l'\]"):
+        TeamMonitor(TeamVenv(), info_keywords=("score", "l"))
+
+
+def test_opponents_are_told_from_teams() -> None:
+    def caught_by(agent: int, step: int) -> float:
+        return float(step % 7 == 0) * (10.0 if agent else -10.0) - 0.1 * (step % 3)
+
+    def each_for_itself(agent: int, step: int) -> float:
+        return float(step % 7 == agent) - 0.1 * (step % 3)
+
+    def play_long(reward: Any) -> None:
+        play(TeamMonitor(TeamVenv(lengths=(100,) * 10, reward=lambda game, agent, step: reward(agent, step))), 200)
+
+    with pytest.warns(UserWarning, match=r"agents 0 and [12] oppose each other \(correlation -1.00 over 2000 game st"):
+        play_long(caught_by)
+    play_long(each_for_itself)  # warnings are errors
 
 
 def test_missing_info_keyword_is_named() -> None:

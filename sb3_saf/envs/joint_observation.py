@@ -1,4 +1,4 @@
-"""The joint view: every row carries what a centralised critic needs, and an actor can still read its own part alone."""
+"""The joint observation: each row carries what a centralised critic needs beside the agent's own observation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs.row_spaces import RowSpaces, channels_first
 from sb3_saf.envs.teams import (
@@ -33,13 +33,13 @@ TIME_LIMITS: Final[tuple[TimeLimit, ...]] = get_args(TimeLimit)
 
 TERMINAL_OBSERVATION: Final = "terminal_observation"
 TRUNCATED: Final = "TimeLimit.truncated"
-#: What sb3-contrib asks an environment for.
+#: The method that sb3-contrib calls.
 _ACTION_MASKS: Final = "action_masks"
 
 
 class CentralizedValueWrapper(TeamVecEnvWrapper):
     """
-    Turn the rows of flattened teams into rows that a centralised critic can judge one by one.
+    Turn the rows of flattened teams into rows that a centralised critic can evaluate one by one.
 
     The observation of a row becomes a Dict:
 
@@ -51,8 +51,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     ``agent`` ``()``           index of the agent in its team, Discrete(N)
     ========= ================ ======================================================================
 
-    Environments that tell more get more keys (:class:`RowSpaces` says how a VecEnv tells it; ``make_team_env`` does
-    it for any PettingZoo environment):
+    Environments that give signals get more keys (:class:`RowSpaces` says how a VecEnv gives them; ``make_team_env``
+    does so for any PettingZoo environment):
 
     =============== ============== ================================================================================
     key             shape of a row content
@@ -88,8 +88,10 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             raw.n_masked_actions,
             None if raw.state is None else channels_first(raw.state),
         )
-        inner = _NoTransposition(venv) if _sb3_would_transpose(team) else venv
-        super().__init__(inner, n_agents, team.to_dict_space())
+        if _sb3_would_transpose(team):
+            venv = _protected_from_transposition(venv, n_agents)
+            raw = RowSpaces.of(venv.observation_space, venv.action_space)
+        super().__init__(venv, n_agents, team.to_dict_space())
         self.time_limit = time_limit
         self.team_spaces = team
         self._raw = raw
@@ -98,7 +100,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._masks_shown: Array | None = None
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""
+        """Return whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""
         return self._shows_masks(attr_name) or super().has_attr(attr_name)
 
     def env_method(
@@ -146,7 +148,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             raise ValueError("expected action masks of 0 and 1")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from there."""
+        """Continue from a state (see :meth:`checkpoint_state`)."""
         self._n_steps, self._masks_shown = state["n_steps"], state["masks_shown"]
 
     def reset(self) -> dict[str, Array]:
@@ -155,7 +157,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
         :return: the Dict observation of all rows
         """
-        return self._joint_view(self.venv.reset())
+        return self._joint_observation(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -172,13 +174,13 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         ended = team_dones(dones, self.n_agents)
         # Copies, because SB3 adds bootstrapped values to the rewards in place.
         return (
-            self._joint_view(obs),
+            self._joint_observation(obs),
             np.array(rewards),
             np.repeat(ended, self.n_agents),
             self._complete_infos(infos, ended),
         )
 
-    def _joint_view(self, obs: object) -> dict[str, Array]:
+    def _joint_observation(self, obs: object) -> dict[str, Array]:
         parts = self._checked_parts(obs, "observations")
         teams = parts[OBS_KEY].reshape(self.n_games, *self.team_spaces.team.shape)
         joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0), AGENT_KEY: self._agents.copy()}
@@ -189,7 +191,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     def _checked_parts(self, obs: Any, what: str, game: int | None = None) -> dict[str, Array]:
         """
-        What rows of all games or one tell, checked and copied.
+        Check and copy the parts of the rows of all games, or of one.
 
         :return: own observations (B, *shape); where told, active agents (E, N), action masks (B, A), states (B, *state)
         """
@@ -246,7 +248,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return infos
 
     def _terminal_parts(self, infos: list[dict[str, Any]], game: int) -> dict[str, Array]:
-        """What the last observations of a team tell whose episode ended, as in :meth:`_checked_parts`."""
+        """Return the parts of the last observations of a team whose episode ended, as in :meth:`_checked_parts`."""
         observations: list[Any] = [info.get(TERMINAL_OBSERVATION) for info in infos]
         missing = [agent for agent, observation in enumerate(observations) if observation is None]
         if missing:
@@ -282,24 +284,52 @@ def _stacked(observations: list[Any], game: int) -> Array:
     return np.stack(observations)
 
 
-class _NoTransposition(VecTransposeImage):
+class DictRows(TeamVecEnvWrapper):
     """
-    Does nothing but keep SB3 from transposing: it adds a VecTransposeImage only where it finds none.
+    Turn rows that are their own observation into Dicts with the key ``"obs"``, as rows with signals have it.
 
-    :param venv: any vector environment
+    :param venv: rows of flattened teams
+    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
     """
 
-    def __init__(self, venv: VecEnv) -> None:
-        # The parent would refuse spaces that are not of images.
-        VecEnvWrapper.__init__(self, venv)
-        self.skip = True
+    def __init__(self, venv: VecEnv, n_agents: int | None = None) -> None:
+        super().__init__(venv, n_agents, spaces.Dict({OBS_KEY: venv.observation_space}))
+
+    def reset(self) -> VecEnvObs:
+        """Start new episodes in all games (see the base class)."""
+        return {OBS_KEY: self.venv.reset()}  # type: ignore[dict-item]
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Wait for the step of all games (see the base class)."""
+        obs, rewards, dones, infos = self.venv.step_wait()
+        infos = [
+            {**info, TERMINAL_OBSERVATION: {OBS_KEY: info[TERMINAL_OBSERVATION]}}
+            if info.get(TERMINAL_OBSERVATION) is not None
+            else info
+            for info in infos
+        ]
+        return {OBS_KEY: obs}, rewards, dones, infos  # type: ignore[dict-item]
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return nothing: the wrapper has no state."""
+        return {}
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """Do nothing."""
+
+
+def _protected_from_transposition(venv: VecEnv, n_agents: int | None) -> VecEnv:
+    """Keep SB3 from transposing what only looks like images: it leaves a VecEnv with a VecTransposeImage alone."""
+    if not isinstance(venv.observation_space, spaces.Dict):  # VecTransposeImage takes Dicts and images
+        venv = DictRows(venv, n_agents)
+    return VecTransposeImage(venv, skip=True)
 
 
 def _sb3_would_transpose(team: TeamSpaces) -> bool:
     """
-    Whether SB3 would take a part for channel-last images and transpose it behind our back.
+    Return whether SB3 would take a part for channel-last images and transpose it.
 
-    The N views of a team in bytes, (N, width, height), look just like an image.
+    The N own observations of a team in bytes, (N, width, height), look like an image.
     """
     seen = [space for space in (team.own, team.team, team.state) if space is not None]
     return any(is_image_space(space) and int(np.argmin(space.shape or (0,))) != 0 for space in seen)

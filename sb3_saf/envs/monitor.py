@@ -17,7 +17,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_saf.envs.opposition import OppositionDetector
 from sb3_saf.envs.teams import TeamVecEnvWrapper, check_finite, team_dones
 
-
 _COLUMNS: Final = frozenset({"r", "l", "t"})
 
 

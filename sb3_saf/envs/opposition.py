@@ -54,9 +54,9 @@ class OppositionDetector:
         if correlations[first, second] < _OPPOSED:
             warnings.warn(
                 f"the rewards of agents {first} and {second} oppose each other (correlation "
-                f"{correlations[first, second]:.2f} over {self._n_steps} game steps): they are opponents, but all agents "
-                "are trained as one team, which shares parameters and a critic. Make a team of one side and play the "
-                "other inside the environment",
+                f"{correlations[first, second]:.2f} over {self._n_steps} game steps): they are opponents, but all "
+                "agents are trained as one team, which shares parameters and a critic. Make a team of one side and "
+                "play the other inside the environment",
                 UserWarning,
                 stacklevel=4,
             )
