@@ -113,7 +113,8 @@ class NativeVecEnv(VecEnv):
 
         :return: observations (B, *observation shape), rewards (B,) float32, dones (B,) bool, infos
         """
-        assert self._actions is not None
+        if self._actions is None:
+            raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
         actions = self._actions.reshape(self.n_games, self.n_agents)
         self._actions = None
         views, over = self.batch.advance(actions, last=self._last)

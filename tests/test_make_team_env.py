@@ -172,6 +172,8 @@ class Walk(gym.Env[Array, int]):
         (lambda: make_team_env("TeamTogether", n_envs=2.0), "n_envs must be an integer of at least 1, got 2.0"),  # type: ignore[arg-type]
         (lambda: make_team_env("TeamTogether", n_envs=True), "n_envs must be an integer of at least 1, got True"),
         (lambda: make_team_env(CounterEnv, n_cpus=0), "n_cpus must be an integer of at least 1, got 0"),
+        (lambda: make_team_env("TeamTogether", seed=-1), "seed must be an integer of at least 0, or None, got -1"),
+        (lambda: make_team_env(CounterEnv, seed=1.5), "seed must be an integer of at least 0, or None, got 1.5"),  # type: ignore[arg-type]
         (
             lambda: make_team_env("TeamTogether", n_envs=2, n_cpus=2),
             r"n_cpus=2 divides games among SuperSuit's processes, but backend='native' steps all games at once; leave "
@@ -218,6 +220,15 @@ class Walk(gym.Env[Array, int]):
 def test_wrong_calls(make: Callable[[], VecEnv], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("env", ["TeamTogether", CounterEnv])
+def test_a_step_that_nobody_started(env: Any) -> None:
+    venv = make_team_env(env)
+    venv.reset()
+    venv.step(np.zeros(venv.num_envs, dtype=int))
+    with pytest.raises(RuntimeError, match=r"no step has been started: call step_async\(actions\) before step_wait"):
+        venv.step_wait()
 
 
 def test_learning_does_not_import_the_game() -> None:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import supersuit
+from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 import hecogrid_envs
@@ -143,6 +145,20 @@ def test_attributes_and_rendering_per_row(backend: Any) -> None:
     assert tiled[0] * tiled[1] == 2 * height * width, "each game is drawn once"
     assert venv.env_is_wrapped(VecMonitor) == [False] * 6
     venv.close()
+
+
+@pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
+@pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy"])
+def test_the_game_trains_in_the_stock_stack(policy: str) -> None:
+    """SuperSuit's own functions and SB3's own algorithm, without anything of this repository but the game."""
+    # NatureCNN takes pictures of at least 36 x 36.
+    env = hecogrid_envs.parallel_env("TeamSupport", **{**SMALL, "view_tile_size": 6})
+    flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    venv = VecMonitor(supersuit.concat_vec_envs_v1(flat, 2, num_cpus=1, base_class="stable_baselines3"))
+    model = PPO(policy, venv, n_steps=8, batch_size=24, n_epochs=1, device="cpu").learn(96)
+    assert model.num_timesteps == 96
+    assert model.ep_info_buffer is not None
+    assert {episode["l"] for episode in model.ep_info_buffer} == {7}
 
 
 def test_steps_do_not_overwrite_earlier_observations() -> None:

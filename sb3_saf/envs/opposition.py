@@ -19,7 +19,8 @@ class OppositionDetector:
     """
     Warn once if two agents' rewards oppose each other: their correlation over the first game steps is below -0.5.
 
-    All algorithms here maximise the sum of a team's rewards, so such agents would be trained towards a compromise.
+    Agents share parameters, and QPLEX maximises the sum of their rewards: what was made for one team. Self-play is the
+    use that opponents may have of it.
 
     :param n_agents: N
     """
@@ -55,8 +56,8 @@ class OppositionDetector:
             warnings.warn(
                 f"the rewards of agents {first} and {second} oppose each other (correlation "
                 f"{correlations[first, second]:.2f} over {self._n_steps} game steps): they are opponents, but all "
-                "agents are trained as one team, which shares parameters and a critic. Make a team of one side and "
-                "play the other inside the environment",
+                "agents are trained as one team with shared parameters. Where that is meant as self-play, ignore "
+                "this warning; else make a team of one side and play the other inside the environment",
                 UserWarning,
                 stacklevel=4,
             )

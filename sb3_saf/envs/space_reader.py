@@ -44,7 +44,9 @@ def counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
     shifted = {key: counted_from_zero(part) for key, part in parts.items()}
     if all(shifted[key] is part for key, part in parts.items()):
         return space
-    return spaces.Dict(shifted) if isinstance(space, spaces.Dict) else spaces.Tuple(tuple(shifted.values()))
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict(list(shifted.items()))  # of a dict the keys would be sorted
+    return spaces.Tuple(tuple(shifted.values()))
 
 
 def first_value(space: spaces.Space[Any]) -> Any:
@@ -159,11 +161,16 @@ class FlatReader(SpaceReader):
     def __init__(self, space: spaces.Space[Any], notes: list[str]) -> None:
         super().__init__(space, notes)
         self._structured = self.rows
-        self.rows = spaces.flatten_space(self._structured)
+        flat = spaces.flatten_space(self._structured)
+        assert isinstance(flat, spaces.Box)
+        if flat.dtype == np.float64 and all(leaf.dtype != np.float64 for leaf in leaves_of(space)):
+            # What integers and float32 become beside each other takes twice the memory for nothing.
+            flat = spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+        self.rows = flat
 
     def read(self, value: Any, owner: str) -> Any:
         """Check a value and flatten it (see the base class)."""
-        return spaces.flatten(self._structured, super().read(value, owner))
+        return np.asarray(spaces.flatten(self._structured, super().read(value, owner)), dtype=self.rows.dtype)
 
 
 def can_be_flattened(space: spaces.Space[Any]) -> bool:
