@@ -125,7 +125,7 @@ def monitors(tmp_path: Path) -> Iterator[Monitors]:
         monitor.close()
 
 
-def test_lines_of_an_earlier_run_are_kept_unless_told_otherwise(monitors: Monitors, tmp_path: Path) -> None:
+def test_the_file_of_an_earlier_run_is_set_aside_and_a_reset_touches_none(monitors: Monitors, tmp_path: Path) -> None:
     path = tmp_path / "monitor.csv"
     earlier = monitors(2)
     earlier.reset()
@@ -134,34 +134,23 @@ def test_lines_of_an_earlier_run_are_kept_unless_told_otherwise(monitors: Monito
     lines = path.read_text()
     monitors(3).reset()
     assert path.read_text() == lines
-    later = monitors(3)
-    with pytest.warns(UserWarning, match=r"monitor.csv has 2 lines of an earlier run, which are kept: .*override_exis"):
-        play(later, 3)
-    assert path.read_text().startswith(lines)
-    assert returns_in(path) == [69, 69, RETURN_OF_GAME_0]
-    play(monitors(3, override_existing=True), 3)
+    play(monitors(3), 3)
+    assert (tmp_path / "monitor.csv.1").read_text() == lines
     assert returns_in(path) == [RETURN_OF_GAME_0]
 
 
-def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint_and_no_more(monitors: Monitors, tmp_path: Path) -> None:
-    path = tmp_path / "monitor.csv"
-    play(monitors(3), 3)  # an earlier run
+def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint(monitors: Monitors, tmp_path: Path) -> None:
     env = monitors(2)
-    at_the_start = env.checkpoint_state()
-    with pytest.warns(UserWarning, match="1 lines of an earlier run"):
-        play(env, 2)
+    play(env, 2)
     state = env.checkpoint_state()
     for _ in range(2):
         env.step(still(env))
-    assert returns_in(path) == [RETURN_OF_GAME_0, 69, 69]
-    for then, lines in ((state, [RETURN_OF_GAME_0, 69]), (at_the_start, [RETURN_OF_GAME_0])):
-        resumed = monitors(2)
-        resumed.reset()
-        resumed.load_checkpoint_state(then)
-        assert returns_in(path) == lines
-        for _ in range(2):
-            resumed.step(still(resumed))
-        assert returns_in(path) == [*lines, 69]
+    assert returns_in(tmp_path / "monitor.csv") == [69, 69]
+    resumed = monitors(2)
+    resumed.reset()
+    resumed.check_checkpoint_state(state)
+    resumed.load_checkpoint_state(state)
+    assert returns_in(tmp_path / "monitor.csv") == [69]
 
 
 def test_keywords_that_are_columns_are_refused() -> None:
