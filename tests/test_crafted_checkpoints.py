@@ -25,7 +25,7 @@ import sb3_saf
 from sb3_saf import QPLEX, CheckpointError, NonFiniteError, resumable_learn
 from sb3_saf.checkpoints.data import decode, encode
 
-ROUNDS = int(os.environ.get("CRAFTED", "50"))
+ROUNDS = int(os.environ.get("CRAFTED", "18"))
 N_AGENTS, N_GAMES, N_STEPS = 2, 2, 6
 ROWS = N_AGENTS * N_GAMES
 TASK: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 7, "n_treasures": 3, "coordination": 1, "max_cycles": 5}

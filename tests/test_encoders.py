@@ -202,10 +202,6 @@ def test_default_encoder_is_chosen_by_space() -> None:
         assert isinstance(ObservationEncoder(space).encoder, MLPEncoder)
 
 
-def test_an_atlas_is_no_weight() -> None:
-    assert not any("atlas" in name for name in PaperCNN(CodeSpace()).state_dict())
-
-
 def test_bad_spaces_are_refused() -> None:
     small = CodeSpace()
     small.atlas = small.atlas[:10]

@@ -14,7 +14,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import sb3_saf
-from hecogrid_envs import game_seeds
 from sb3_saf import QPLEX, FiniteCallback, NonFiniteError, TeamEvalCallback, resumable_learn
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 4
@@ -175,11 +174,6 @@ def test_evaluation_on_the_games_of_training_is_refused(backend: Any) -> None:
     with pytest.raises(ValueError, match=r"got 2 with seeds of training games.*another one"):
         ppo(games(seed=7), seed=5).learn(ROLLOUT, evaluation(5))
     ppo(games(seed=5), seed=7).learn(ROLLOUT, evaluation(5))
-
-
-def test_games_of_any_runs_have_seeds_of_their_own() -> None:
-    seeds = [game for run in (*range(50), 2**31, 2**32 - 1) for game in game_seeds(run, 400)]
-    assert len(set(seeds)) == len(seeds)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------

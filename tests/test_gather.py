@@ -67,8 +67,6 @@ _QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 1_300}
     ("algorithm", "policy", "kwargs"),
     [
         (PPO, "SAFPolicy", _PPO),
-        (PPO, "MAPPOPolicy", _PPO),
-        (PPO, "IPPOPolicy", _PPO),
         (RecurrentPPO, "SAFLstmPolicy", _RECURRENT),
         (QPLEX, "QPLEXPolicy", _QPLEX),
     ],

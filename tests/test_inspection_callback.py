@@ -31,7 +31,6 @@ from sb3_saf import (
     inspect_team,
     make_team_env,
 )
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.inspection import film
 from sb3_saf.inspection.calibration import calibrate, lambda_returns
 from sb3_saf.inspection.games import zone_function
@@ -243,7 +242,6 @@ def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settin
         (PPO, "SAFPolicy", {"knowledge_source": False}, {"pool"}),
         (PPO, "MAPPOPolicy", {}, set()),
         (PPO, "IPPOPolicy", {"heads": "per_agent"}, set()),
-        (RecurrentPPO, "SAFLstmPolicy", {}, {"pool", "knowledge_source", "message"}),
         (RecurrentPPO, "SAFLstmPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
         (RecurrentPPO, "SAFLstmPolicy", {"enable_critic_lstm": False}, {"pool", "knowledge_source", "message"}),
         (RecurrentPPO, "IPPOLstmPolicy", {}, set()),
@@ -517,8 +515,3 @@ def test_a_strip_has_six_moments_in_two_rows() -> None:
     assert strip[0, ::36, 0].tolist() == [0, 10, 20]
     assert strip[46, ::36, 0].tolist() == [29, 39, 49]
     assert film.strip(frames[:2]).shape == (40, 2 * 30 + 6, 3)
-
-
-def test_spaces_of_toys_are_teams() -> None:
-    """The toys are what the callback takes them for."""
-    assert TeamSpaces.from_observation_space(ToyTeams().observation_space).n_agents == 3

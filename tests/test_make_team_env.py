@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from hecogrid_envs.vec_env import NativeVecEnv
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.make import make_team_env
 from sb3_saf.envs.monitor import TeamMonitor
@@ -50,25 +47,6 @@ def test_a_task_and_its_ids_are_the_same_environment() -> None:
     for name in ("TeamSupport-v0", "hecogrid/TeamSupport-v0", "hecogrid/TeamSupport"):
         assert_equal(plain, episode(make_team_env(name, n_envs=2, seed=3, **SMALL)))
     assert sum(int(rewards.sum()) for rewards in plain[6::6]) > 0, "an episode without events would show nothing"
-
-
-def test_both_backends_give_the_same_numbers() -> None:
-    native = make_team_env("KeyForTreasure", n_envs=3, seed=3, n_keys=5, **SMALL)
-    supersuit = make_team_env("KeyForTreasure", n_envs=3, seed=3, n_keys=5, backend="supersuit", **SMALL)
-    assert isinstance(native.unwrapped, NativeVecEnv)
-    assert isinstance(supersuit.unwrapped, SuperSuitVecEnv)
-    assert native.observation_space == supersuit.observation_space
-    assert_equal(episode(native), episode(supersuit))
-
-
-def test_seeds() -> None:
-    def first(seed: int | None) -> Array:
-        return make_team_env("TeamTogether", n_envs=2, seed=seed, **SMALL).reset()["obs"]
-
-    np.testing.assert_array_equal(first(1), first(1))
-    assert not np.array_equal(first(1), first(2))
-    assert not np.array_equal(first(None), first(None))
-    assert not np.array_equal(first(1)[:3], first(1)[3:]), "games of one run differ"
 
 
 def test_hecogrid_gives_tiles_that_draw_the_pixels_of_rgb() -> None:
@@ -146,14 +124,6 @@ def test_agents_that_die_stay_as_idle_rows_until_the_team_is_done() -> None:
     assert infos[0]["episode"]["r"] == (11 + 12) + 22 + 32
 
 
-def test_worker_processes_give_the_same_numbers() -> None:
-    one = episode(make_team_env(CounterEnv, n_envs=3, seed=1), n_steps=7)
-    two = episode(make_team_env(CounterEnv, n_envs=3, seed=1, n_cpus=2), n_steps=7)
-    assert_equal(one, two)
-    tasks = [make_team_env("TeamTogether", 2, 1, "supersuit", n_cpus=n_cpus, **SMALL) for n_cpus in (1, 2)]
-    assert_equal(episode(tasks[0], n_steps=7), episode(tasks[1], n_steps=7))
-
-
 def test_random_policy_is_evaluated_on_it() -> None:
     env = make_team_env("TeamTogether", n_envs=3, seed=0, **SMALL)
     result = evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7)
@@ -229,8 +199,3 @@ def test_a_step_that_nobody_started(env: Any) -> None:
     venv.step(np.zeros(venv.num_envs, dtype=int))
     with pytest.raises(RuntimeError, match=r"no step has been started: call step_async\(actions\) before step_wait"):
         venv.step_wait()
-
-
-def test_learning_does_not_import_the_game() -> None:
-    code = "import sys, sb3_saf.envs.make; sys.exit('hecogrid_envs' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

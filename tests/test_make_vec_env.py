@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 import hecogrid_envs
-from hecogrid_envs import TASK_NAMES, game_seeds, make_vec_env
+from hecogrid_envs import game_seeds, make_vec_env
 
 SMALL: dict[str, Any] = {
     "n_agents": 3,
@@ -44,10 +44,16 @@ def assert_same_frames(one: list[Any], other: list[Any]) -> None:
         assert [x.dtype for x in a[:3]] == [x.dtype for x in b[:3]]
 
 
-@pytest.mark.parametrize("n_cpus", [1, 2])
-@pytest.mark.parametrize("rules", ["paper", "released"])
-@pytest.mark.parametrize("observation", ["rgb", "tiles"])
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize(
+    ("task", "observation", "rules", "n_cpus"),
+    [
+        ("TeamTogether", "rgb", "paper", 1),
+        ("TeamSupport", "tiles", "paper", 1),
+        ("TeamSupport", "rgb", "released", 1),
+        ("KeyForTreasure", "tiles", "released", 1),
+        ("KeyForTreasure", "rgb", "paper", 2),
+    ],
+)
 def test_both_backends_give_the_same_numbers(task: str, observation: str, rules: str, n_cpus: int) -> None:
     params = {**CROWDED, "max_cycles": 20, "rules": rules, "observation": observation}
     native = history(make_vec_env(task, n_envs=4, seed=11, **params), 50)

@@ -83,10 +83,6 @@ def test_constraints_are_exact_and_name_each_version_once_per_python() -> None:
         assert sorted(names) == sorted(set(names))
 
 
-def test_torch_is_the_pinned_release() -> None:
-    assert "torch==2.13.0" in [str(pin) for pin in _pins()]
-
-
 def test_installed_versions_are_the_pinned_ones() -> None:
     applicable = [pin for pin in _pins() if not pin.marker or pin.marker.evaluate()]
     for pin in applicable:
@@ -105,20 +101,6 @@ def test_version_is_written_once() -> None:
         assert getattr(importlib.import_module(package), "__version__", version) == version
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_packages_are_typed_and_complete(package: str) -> None:
-    """``find:`` leaves out folders without ``__init__.py``, which an editable installation would not notice."""
-    assert (ROOT / package / "py.typed").is_file()
-    folders = {path.parent for path in (ROOT / package).rglob("*.py")}
-    assert [str(folder) for folder in folders if not (folder / "__init__.py").is_file()] == []
-
-
-@pytest.mark.parametrize("folder", ["notebooks", "benchmarks", "tests"])
-def test_other_folders_stay_in_the_repository(folder: str) -> None:
-    assert (ROOT / folder).is_dir()
-    assert f"{folder}*" not in _setup_cfg()["options.packages.find"]["include"].split()
-
-
 def _modules_after(statement: str) -> set[str]:
     """Top-level modules that a fresh interpreter holds after ``statement``."""
     code = f"{statement}\nimport sys\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
@@ -127,9 +109,9 @@ def _modules_after(statement: str) -> set[str]:
 
 
 def test_the_game_needs_neither_torch_nor_stable_baselines() -> None:
-    modules = _modules_after("import hecogrid_envs")
+    modules = _modules_after("import hecogrid_envs.rendering, hecogrid_envs.text, hecogrid_envs.play")
     assert "hecogrid_envs" in modules
-    assert modules.isdisjoint({"torch", "stable_baselines3", "sb3_contrib", "sb3_saf", "tensorboard", "pygame"})
+    assert modules.isdisjoint({"torch", "stable_baselines3", "sb3_contrib", "sb3_saf", "tensorboard", "pygame", "PIL"})
 
 
 def test_the_learning_does_not_need_the_game() -> None:
@@ -147,12 +129,6 @@ def _make_commands(text: str) -> list[str]:
 @pytest.mark.skipif(not (ROOT / "README.md").is_file(), reason="README.md is not written yet")
 def test_readme_begins_with_the_two_commands() -> None:
     assert _make_commands((ROOT / "README.md").read_text(encoding="utf-8"))[:2] == ["train", "test"]
-
-
-@pytest.mark.parametrize("page", sorted(path.name for path in ROOT.glob("*.md")))
-def test_make_targets_named_in_pages_exist(page: str) -> None:
-    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
-    assert set(_make_commands((ROOT / page).read_text(encoding="utf-8"))) <= set(targets)
 
 
 @pytest.mark.parametrize("name", INSTALL_FILES)

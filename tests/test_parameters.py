@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 from sb3_saf.networks.policy_pool import PolicyPool
-from sb3_saf.parameters import count, paper_policy, parameter_table
+from sb3_saf.parameters import count, format_table, paper_policy, parameter_table
 from sb3_saf.policies import ippo, mappo, saf
 from sb3_saf.policies.declaration import Declaration
 from sb3_saf.policies.saf import SAFCritic
@@ -44,10 +41,8 @@ def test_safs_projections_and_knowledge_source() -> None:
     assert count(pool.policies) == 4 * ACTOR
 
 
-def test_the_command_prints_the_table_and_the_account_of_the_difference() -> None:
-    command = [sys.executable, "-m", "sb3_saf.parameters"]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    lines = [line.split() for line in printed.splitlines()]
+def test_the_text_has_the_account_of_the_difference() -> None:
+    lines = [line.split() for line in format_table(parameter_table()).splitlines()]
     assert lines[2][:4] == ["IPPO", "1,740,016", "1,740,016", "0"]
     assert lines[3][:4] == ["MAPPO", "2,477,296", "2,477,296", "0"]
     assert lines[4][:4] == ["SAF", "2,556,486", "2,698,342", "-141,856"]

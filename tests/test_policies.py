@@ -57,6 +57,12 @@ VARIANTS: list[tuple[type[TeamActorCriticPolicy], dict[str, Any]]] = [
     (SAFPolicy, {"actor_identity": True}),
 ]
 VARIANTS += [(policy, {}) for policy in POLICIES if policy not in dict(VARIANTS)]
+#: Encoders do not know what stands above them: every policy on vectors, one on pictures and on codes.
+VARIANTS_AND_SPACES: list[tuple[type[TeamActorCriticPolicy], dict[str, Any], spaces.Space[Any]]] = [
+    *((*variant, VECTOR) for variant in VARIANTS),
+    (SAFPolicy, {}, PICTURE),
+    (SAFPolicy, {}, CodeSpace()),
+]
 SMALL = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
 SMALL_SAF = {"latent_dim": 8, "projection_arch": (10,)}
 
@@ -127,8 +133,7 @@ def test_names_that_belong_to_others_are_left_alone() -> None:
 # --- the actor reads its own observation only -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("own", [VECTOR, PICTURE, CodeSpace()], ids=["vector", "picture", "codes"])
-@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+@pytest.mark.parametrize(("policy_class", "kwargs", "own"), VARIANTS_AND_SPACES)
 def test_no_other_agents_observation_changes_an_action_by_a_bit(
     policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], own: spaces.Space[Any]
 ) -> None:
@@ -192,8 +197,7 @@ def loss_and_gradients(
     return loss.detach(), gradients
 
 
-@pytest.mark.parametrize("own", [VECTOR, CodeSpace()], ids=["vector", "codes"])
-@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+@pytest.mark.parametrize(("policy_class", "kwargs", "own"), VARIANTS_AND_SPACES)
 def test_naive_encoding_gives_the_same_loss_and_gradients(
     policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], own: spaces.Space[Any]
 ) -> None:
@@ -444,12 +448,8 @@ def test_adam_steps_all_weights_at_once_unless_told_otherwise(optimizer_class: t
     after = one_by_one.state_dict()
     assert any(not th.equal(value, before[name]) for name, value in after.items())
     th.testing.assert_close(dict(fused.state_dict()), dict(after), rtol=0, atol=1e-6)
-
-
-def test_other_optimizers_get_what_they_were_given() -> None:
-    policy = make_policy(IPPOPolicy, optimizer_class=th.optim.SGD, optimizer_kwargs={"momentum": 0.5})
-    assert policy.optimizer.defaults["momentum"] == 0.5
-    assert not policy.optimizer.defaults["fused"]
+    other = make_policy(IPPOPolicy, optimizer_class=th.optim.SGD, optimizer_kwargs={"momentum": 0.5})
+    assert other.optimizer.defaults["momentum"] == 0.5 and not other.optimizer.defaults["fused"]
 
 
 def test_net_arch_for_actor_and_critic() -> None:
@@ -512,8 +512,6 @@ def test_bad_arguments(kwargs: dict[str, Any], message: str) -> None:
 
 
 def test_unknown_arguments_are_refused() -> None:
-    with pytest.raises(TypeError, match="n_polices"):
-        make_policy(SAFPolicy, n_polices=3)
     with pytest.raises(TypeError, match="n_policies"):
         make_policy(MAPPOPolicy, n_policies=3)
 
@@ -642,10 +640,9 @@ def first_epochs_ratios(batch_size: int, **kwargs: Any) -> th.Tensor:
     return th.cat(callback.ratios)
 
 
-@pytest.mark.parametrize("batch_size", [120, 24])
 @pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
-def test_the_ratio_is_one_before_the_weights_change(action_space: spaces.Space[Any], batch_size: int) -> None:
-    ratios = first_epochs_ratios(batch_size, venv=ToyTeams(action_space=action_space))
+def test_the_ratio_is_one_before_the_weights_change(action_space: spaces.Space[Any]) -> None:
+    ratios = first_epochs_ratios(24, venv=ToyTeams(action_space=action_space))
     assert len(ratios) == 240
     assert (ratios - 1).abs().max() < 1e-6
 
@@ -654,17 +651,6 @@ def test_with_gumbel_it_is_not() -> None:
     # Policies drawn anew are compared with those that acted. (They start alike: make them differ.)
     ratios = first_epochs_ratios(120, policy_kwargs={"selection": "gumbel", "ortho_init": False})
     assert (ratios - 1).abs().max() > 1e-2
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("action_space", [ACTIONS["multi-discrete"], ACTIONS["multi-binary"]], ids=str)
-def test_ppo_learns_with_every_policy_and_action_space(name: str, action_space: spaces.Space[Any]) -> None:
-    model = make_model(name, ToyTeams(action_space=action_space))
-    before = copy.deepcopy(model.policy)
-    model.learn(240)
-    assert model.num_timesteps == 240
-    assert not equal_weights(before, model.policy)
-    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
 @pytest.mark.parametrize("own", [PICTURE, CodeSpace(), spaces.Discrete(4)], ids=["picture", "codes", "discrete"])
@@ -679,19 +665,26 @@ def test_two_runs_of_one_seed_end_alike_also_where_policies_are_drawn() -> None:
     assert not equal_weights(one.policy, third.policy)
 
 
-@pytest.mark.parametrize("name", [*NAMES, "gumbel"])
-@pytest.mark.parametrize("action_space", [ACTIONS["discrete"], ACTIONS["box"]], ids=["discrete", "box"])
-def test_no_weight_is_dead(name: str, action_space: spaces.Space[Any]) -> None:
-    kwargs = {"selection": "gumbel"} if name == "gumbel" else {}
-    model = make_model(
-        "SAFPolicy" if name == "gumbel" else name,
-        ToyTeams(action_space=action_space),
-        policy_kwargs=kwargs,
-        batch_size=120,
-        n_epochs=1,
-    )
+@pytest.mark.parametrize(
+    ("name", "kwargs", "action"),
+    [
+        *((name, {}, "discrete") for name in NAMES),
+        *((name, {}, "box") for name in NAMES),
+        ("SAFPolicy", {"selection": "gumbel"}, "discrete"),
+        ("SAFPolicy", {"selection": "gumbel"}, "box"),
+        ("SAFPolicy", {}, "multi-discrete"),
+        ("MAPPOPolicy", {}, "multi-binary"),
+    ],
+)
+def test_ppo_learns_and_no_weight_is_dead(name: str, kwargs: dict[str, Any], action: str) -> None:
+    venv = ToyTeams(action_space=ACTIONS[action])
+    model = make_model(name, venv, policy_kwargs=kwargs, batch_size=120, n_epochs=1)
+    before = copy.deepcopy(model.policy)
     model.learn(120)
+    assert model.num_timesteps == 120
+    assert not equal_weights(before, model.policy)
     for parameter_name, parameter in model.policy.named_parameters():
+        assert parameter.isfinite().all()
         assert parameter.grad is not None, parameter_name
         assert parameter.grad.flatten(1 if parameter.dim() > 1 else 0).abs().sum(dim=-1).min() > 0, parameter_name
 
@@ -738,17 +731,6 @@ def test_actor_and_encoder_run_without_the_critic() -> None:
     found = actor_distribution(other.actor, other.action_space, parameters)
     assert isinstance(found, CategoricalDistribution)
     th.testing.assert_close(found.distribution.probs, probabilities(policy, obs), rtol=0, atol=1e-6)
-
-
-def test_policies_can_be_copied() -> None:
-    policy = make_policy(SAFPolicy)
-    clone = copy.deepcopy(policy)
-    obs = team_rows(VECTOR)
-    with th.no_grad():
-        for parameter in clone.parameters():
-            parameter.zero_()
-    assert (clone.predict_values(obs) == 0).all()
-    assert (policy.predict_values(obs) != 0).all()
 
 
 def test_parts_can_be_replaced() -> None:

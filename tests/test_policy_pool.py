@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_saf.networks import distributions
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, SinglePolicy
-from sb3_saf.networks.distributions import mixture_log_probs, n_action_parameters
+from sb3_saf.networks.distributions import n_action_parameters
 from sb3_saf.networks.policy_pool import PolicyPool, Selection, draw_policy
 from sb3_saf.policies.distributions import (
     PoolDistribution,
@@ -178,13 +178,6 @@ def test_a_mixture_of_equal_policies_is_that_policy(space: spaces.Space[Any]) ->
     if (entropy := mixture.entropy()) is not None:
         th.testing.assert_close(entropy, plain.entropy())
     assert th.equal(mixture.mode(), plain.mode())
-
-
-def test_weights_enter_before_the_sum_not_after() -> None:
-    # 0.9 * 0.5 + 0.1 * 1.0, worked by hand.
-    log_weights = th.tensor([[0.9, 0.1]]).log()
-    logits = th.tensor([[[0.5, 0.5], [1.0, 1e-30]]]).log()
-    th.testing.assert_close(mixture_log_probs(log_weights, logits).exp(), th.tensor([[0.55, 0.45]]))
 
 
 def test_parameters_as_sb3_calls_them() -> None:

@@ -160,13 +160,6 @@ def test_what_others_see_decides_only_where_it_should() -> None:
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_constant_reward(name: str) -> None:
-    probe = ConstantReward()
-    values = values_of(train(name, probe, n_updates=10), probe)
-    np.testing.assert_allclose(values, 1.0, atol=0.05)
-
-
 @pytest.mark.parametrize(("name", "normalize"), [("IPPOPolicy", True), ("MAPPOPolicy", False), ("SAFPolicy", True)])
 def test_constant_reward_for_ever(name: str, normalize: bool) -> None:
     """1 + 0.9 + 0.81 + ... = 10: time limits are bootstrapped. With true ends it would be 3.6 on average."""

@@ -73,7 +73,8 @@ def crowded(state: StateMapping, rng: np.random.Generator) -> StateMapping:
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+# Thirty examples miss that released support is counted from where the agent came; a hundred find it.
+@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(5, 25))
 def test_kernels_agree_with_the_reference(task: str, params: dict[str, Any], seed: int, n_steps: int) -> None:
     batch = GameBatch(task, HECOGridParams(**params))
@@ -93,7 +94,6 @@ def test_kernels_agree_with_the_reference(task: str, params: dict[str, Any], see
         assert_same_views(batch, world)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     params=configurations(max_tile=MAX_CODED_TILE_SIZE), seed=st.integers(0, 2**32), task=st.sampled_from(TASK_NAMES)
 )
@@ -114,7 +114,6 @@ def test_tiles_draw_the_rgb_observation(params: dict[str, Any], seed: int, task:
         tiles.step(actions)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
 @given(params=configurations(), seed=st.integers(0, 2**32))
 def test_fields_of_view_are_the_reference_visibility(params: dict[str, Any], seed: int) -> None:
     batch = GameBatch("TeamSupport", HECOGridParams(**params))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import pairwise
@@ -75,8 +74,7 @@ def count(cell: npt.NDArray[np.uint8], colour: tuple[int, int, int]) -> int:
 # --- size
 
 
-@pytest.mark.parametrize("tile", [4, 12, 24])
-@pytest.mark.parametrize("heterogeneity", [1, 3])
+@pytest.mark.parametrize(("tile", "heterogeneity"), [(4, 1), (24, 3)])
 def test_picture_is_header_and_map(tile: int, heterogeneity: int) -> None:
     scene = make_scene(heterogeneity=heterogeneity)
     picture = render_scene(scene, tile)
@@ -219,7 +217,7 @@ def test_selected_agent_is_marked() -> None:
     assert np.argwhere(changed).tolist() == [[2, 2]]
 
 
-@pytest.mark.parametrize("number", [2, 3, 4, 9, 10, 11])
+@pytest.mark.parametrize("number", [2, 4, 10, 11])
 def test_one_agent_more_in_a_cell_is_seen(number: int) -> None:
     fewer = cell_of(make_scene([(5, 5, 0, False)] * (number - 1)), 5, 5)
     more = cell_of(make_scene([(5, 5, 0, False)] * number), 5, 5)
@@ -282,8 +280,7 @@ def test_step_score_and_treasures_are_in_the_header() -> None:
     assert draw(scene._replace(step=3, collected=1))[0].tobytes() not in pages
 
 
-@pytest.mark.parametrize("grid_size", [6, 8, 15, 30])
-@pytest.mark.parametrize("tile", [8, 12, 24])
+@pytest.mark.parametrize(("grid_size", "tile"), [(6, 8), (6, 24), (8, 12), (30, 24)])
 def test_words_stay_inside_the_header(grid_size: int, tile: int) -> None:
     """Nothing is cut off on the right, lines do not overlap, and no number of a game needs more room."""
     params = HECOGridParams(
@@ -309,22 +306,10 @@ def test_time_bar_grows_with_the_steps(step: int, share: float) -> None:
 # --- what is not installed
 
 
-def test_importing_loads_neither_pillow_nor_pygame() -> None:
-    code = (
-        "import sys; import hecogrid_envs.rendering, hecogrid_envs.text, hecogrid_envs.play; "
-        "print([name for name in ('PIL', 'pygame', 'torch') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_missing_pillow_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(ImportError, match=r"^drawing games needs Pillow: pip install sb3-saf\[render\]$"):
         rendering._pillow()
-
-
-def test_missing_pygame_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(ImportError, match=r"^a window needs pygame: pip install sb3-saf\[render\]$"):
         HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))

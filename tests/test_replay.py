@@ -34,7 +34,7 @@ def make_env(task: str = "TeamSupport", n_envs: int = 2, **params: Any) -> Any:
 @pytest.fixture(scope="module")
 def model() -> PPO:
     env = make_env()
-    return PPO("SAFPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env)).learn(2_000)
+    return PPO("SAFPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env, n_steps=100, n_epochs=2)).learn(600)
 
 
 def data_of(page: Path) -> Any:

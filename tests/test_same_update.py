@@ -12,13 +12,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_saf import TeamRolloutBuffer
+from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy, TeamRolloutBuffer
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from tests.test_policies import ACTIONS, VARIANTS
+from tests.test_policies import ACTIONS
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 
-#: Policies drawn anew at every evaluation do not evaluate alike twice.
-EXACT = [(policy_class, kwargs) for policy_class, kwargs in VARIANTS if kwargs.get("selection") != "gumbel"]
 #: SB3's buffer as the default, ours, and each with every row encoded.
 WAYS: list[tuple[type[DictRolloutBuffer] | None, bool]] = [
     (None, True),
@@ -61,12 +59,16 @@ def gradients(model: PPO) -> dict[str, th.Tensor]:
     return {name: p.grad for name, p in model.policy.named_parameters() if p.grad is not None}
 
 
+# Every way to set up a policy is tried with both encodings in test_policies.
 @pytest.mark.parametrize(
-    ("own", "action_space"),
-    [(VECTOR, ACTIONS["discrete"]), (CodeSpace(), ACTIONS["box"])],
-    ids=["vector-discrete", "codes-box"],
+    ("policy_class", "kwargs", "own", "action_space"),
+    [
+        (IPPOPolicy, {"actor_identity": True}, VECTOR, ACTIONS["discrete"]),
+        (MAPPOPolicy, {}, CodeSpace(), ACTIONS["box"]),
+        (SAFPolicy, {}, VECTOR, ACTIONS["discrete"]),
+        (SAFPolicy, {"critic_input": "team", "heads": "per_agent"}, CodeSpace(), ACTIONS["box"]),
+    ],
 )
-@pytest.mark.parametrize(("policy_class", "kwargs"), EXACT)
 def test_buffers_and_encodings_give_the_same_loss_and_gradients(
     policy_class: type[TeamActorCriticPolicy],
     kwargs: dict[str, Any],

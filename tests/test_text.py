@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hecogrid_envs import text
@@ -123,7 +123,6 @@ def states(draw: st.DrawFn) -> State:
     }
 
 
-@settings(deadline=None)
 @given(states(), st.booleans(), st.booleans())
 def test_every_state_is_read_back(state: State, colour: bool, heading: bool) -> None:
     zones = np.arange(len(state["walls"])) if heading else None

@@ -24,7 +24,7 @@ def batch_of(n_threads: int, n_games: int = 6) -> GameBatch:
     return batch
 
 
-@pytest.mark.parametrize(("n_threads", "n_games"), [(2, 3), (2, 40), (3, 17), (5, 5), (4, 1)])
+@pytest.mark.parametrize(("n_threads", "n_games"), [(2, 40), (3, 17), (4, 1)])
 def test_whoever_plays_a_game_it_is_the_same(n_threads: int, n_games: int) -> None:
     alone, shared = batch_of(1, n_games), batch_of(n_threads, n_games)
     for row in np.random.default_rng(0).integers(0, 7, size=(200, n_games, 5)):
@@ -68,8 +68,7 @@ def test_a_forked_process_plays_on() -> None:
     subprocess.run(command, check=True, timeout=120)
 
 
-@pytest.mark.parametrize("view_size", [1, 3, 7, 9])
-@pytest.mark.parametrize("tile", [1, 2, 4, 5, 6, 12])
+@pytest.mark.parametrize(("view_size", "tile"), [(1, 1), (3, 5), (7, 4), (7, 12), (9, 2), (9, 6)])
 def test_drawing_stays_inside_its_array(view_size: int, tile: int) -> None:
     params = HECOGridParams(
         n_agents=5, grid_size=12, n_treasures=30, view_size=view_size, view_offset=0, view_tile_size=tile

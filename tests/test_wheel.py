@@ -99,19 +99,10 @@ def take_over_compiled_kernels(folder: Path) -> None:
             shutil.copy(path, copy)
 
 
-def test_it_trains_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
-    code = (
-        "import hecogrid_envs, sb3_saf, zoo_configs\n"
-        "from stable_baselines3 import PPO\n"
-        "print(hecogrid_envs.__file__, sb3_saf.__file__, zoo_configs.__file__, sep='\\n')\n"
-        "env = sb3_saf.make_team_env('TeamSupport', n_envs=2, seed=0, n_agents=3, grid_size=9, n_treasures=5)\n"
-        "PPO('SAFPolicy', env, n_steps=5, batch_size=30, rollout_buffer_class=sb3_saf.TeamRolloutBuffer).learn(30)\n"
-    )
-    files = call(["-c", code], tmp_path, PYTHONPATH=str(installed)).split()
-    assert [Path(file).parents[1] for file in files] == [installed] * 3
-
-
 def test_its_commands_run_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
+    code = "import zoo_configs, hecogrid_envs; print(zoo_configs.__file__, hecogrid_envs.__file__)"
+    files = call(["-c", code], tmp_path, PYTHONPATH=str(installed)).split()
+    assert [Path(file).parents[1] for file in files] == [installed] * 2
     table = call(["-m", "sb3_saf.parameters"], tmp_path, PYTHONPATH=str(installed))
     assert "1,740,016" in table
     options = ["--algo", "saf", "--env", "TeamSupport-v0", "--size", "smoke", "-f", "logs", "--eval-freq", "-1"]
