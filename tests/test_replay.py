@@ -221,7 +221,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         (["--model", "nowhere.zip"], "--model nowhere.zip is not there"),
         (["--model", "nowhere.zip", "--env", "Nothing-v0"], "--model nowhere.zip is not there"),
         (["--model", __file__, "--size", "huge"], "unknown size 'huge'"),
-        (["--model", __file__, "--episodes", "0"], "n_envs must be an integer of at least 1, got 0"),
+        (["--model", __file__], "is not a model saved by Stable-Baselines3"),
     ],
 )
 def test_wrong_commands(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -92,9 +92,13 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return names that tell models apart: of files, or of files with their folders."""
-    stems = [path.stem for path in paths]
-    return stems if len(set(stems)) == len(stems) else [f"{path.parent.name}/{path.stem}" for path in paths]
+    """Return names that tell models apart: of files, with their folders and numbers where need be."""
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        names = [f"{path.parent.name}/{path.stem}" for path in paths]
+    if len(set(names)) < len(names):
+        names = [f"{number}: {name}" for number, name in enumerate(names, 1)]
+    return names
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
