@@ -20,9 +20,9 @@ from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests import test_contrib
 from tests.contrib_teams import random_masks
-from tests.test_contrib import ACTIONS, MASKABLE
+from tests.test_contrib import MASKABLE
 from tests.test_export import LoneAgent, exported, rewrite
-from tests.test_policies import SMALL, SMALL_SAF, constant, make_policy
+from tests.test_policies import ACTIONS, SMALL, SMALL_SAF, constant, make_policy
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import VECTOR, samples
 
