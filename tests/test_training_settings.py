@@ -275,6 +275,7 @@ def test_monitor_is_left_in_the_folder_and_time_limit_reaches_the_wrapper(tmp_pa
     env = settings.make_env(0, monitor_dir=tmp_path / "run", n_envs=2)
     assert (env.num_envs, env.time_limit) == (8, "bootstrap")
     env.reset()
+    env.step(np.zeros(8, dtype=int))
     assert (tmp_path / "run" / "monitor.csv").is_file()
     env.close()
 
