@@ -15,7 +15,6 @@ import pytest
 from stable_baselines3 import PPO
 
 import sb3_saf
-from sb3_saf import quickstart
 from sb3_saf.inspection import replay as replay_module
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.inspection.replay import replay
@@ -203,16 +202,6 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
     browser.find_element("id", "play").click()
     assert browser.find_element("id", "play").text == "Pause"
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
-
-
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    quickstart.main(["--game-steps", "1600", "--output", str(tmp_path / "run"), "--no-progress-bar"])
-    capsys.readouterr()
-    page = tmp_path / "page.html"
-    model_file = str(tmp_path / "run" / "model.zip")
-    command.main(["--model", model_file, model_file, "-o", str(page), "--env-kwargs", "max_cycles:9"])
-    assert capsys.readouterr().out.strip() == str(page)
-    assert [run["steps"] for run in data_of(page)["runs"]] == [9, 9]
 
 
 @pytest.mark.parametrize(
