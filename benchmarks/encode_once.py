@@ -21,7 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf
-from sb3_saf.networks.unique import unique_rows
+from sb3_saf.networks.row_encoder import unique_rows
 from sb3_saf.training.settings import load_settings
 
 #: Games, steps of a rollout, minibatches timed.

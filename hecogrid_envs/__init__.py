@@ -10,12 +10,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hecogrid_envs.batch import GameBatch
+from hecogrid_envs.core.rng import game_seeds
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.registry import env, parallel_env, register_with_pettingzoo
-from hecogrid_envs.seeding import game_seeds
 from hecogrid_envs.state import StateMapping
-from hecogrid_envs.tasks import TASKS
+from hecogrid_envs.tasks import TASKS, env, parallel_env, register_with_pettingzoo
 from hecogrid_envs.tasks.key_for_treasure import KeyForTreasureEnv
 from hecogrid_envs.tasks.team_support import TeamSupportEnv
 from hecogrid_envs.tasks.team_together import TeamTogetherEnv

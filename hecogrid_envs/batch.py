@@ -18,10 +18,10 @@ from numba import typeof
 
 from hecogrid_envs.arrays import aligned, empty_games, world_of
 from hecogrid_envs.constants import N_ACTIONS, Terrain, TreasureState
+from hecogrid_envs.constants import STEP as STEP_AHEAD
+from hecogrid_envs.core.rng import fresh_seed, generator_word
 from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers
-from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.seeding import fresh_seed, generator_word
 from hecogrid_envs.snapshots import check_snapshot, load_snapshot, take_snapshot
 from hecogrid_envs.state import StateMapping, check_state
 from hecogrid_envs.task import TaskName, check_task
@@ -378,3 +378,31 @@ def _announced_compilation() -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def seen_cells(
+    views: npt.NDArray[np.bool_], agent_pos: npt.NDArray[Any], agent_dir: npt.NDArray[Any], offset: int, width: int
+) -> npt.NDArray[np.bool_]:
+    """
+    Return which cells of the map the agents see, from their own views.
+
+    :param views: (N, V, V) bool, what each agent sees in its view, row by row, the agent looking up
+    :param agent_pos: (N, 2) x, y
+    :param agent_dir: (N,)
+    :param offset: rows visible behind the agent
+    :param width: W, side of the map
+    :return: (N, W, W) bool, indexed ``[agent, x, y]``; seen cells beyond the map are left out
+    """
+    side = views.shape[1]
+    agent, row, column = np.nonzero(views)
+    ahead, aside = side - 1 - offset - row, column - side // 2
+    direction = np.asarray(agent_dir)[agent]
+    cell = (
+        np.asarray(agent_pos)[agent]
+        + ahead[:, None] * STEP_AHEAD[direction]
+        + aside[:, None] * STEP_AHEAD[(direction + 1) % 4]
+    )
+    on_map = ((cell >= 0) & (cell < width)).all(axis=1)
+    seen = np.zeros((len(views), width, width), dtype=np.bool_)
+    seen[agent[on_map], cell[on_map, 0], cell[on_map, 1]] = True
+    return seen

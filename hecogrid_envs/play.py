@@ -19,12 +19,12 @@ from typing import Any, Final, Literal, TextIO, get_args, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
+from hecogrid_envs.batch import seen_cells
 from hecogrid_envs.constants import N_ACTIONS, Command, Direction
-from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.registry import parallel_env
 from hecogrid_envs.rendering import Picture, Scene, fit_tile_size, render_scene
+from hecogrid_envs.tasks import parallel_env
 from hecogrid_envs.text import render_text
 from hecogrid_envs.tiles import INVISIBLE
 from hecogrid_envs.window import HumanWindow

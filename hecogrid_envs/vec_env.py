@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from hecogrid_envs.batch import GameBatch, check_actions
 from hecogrid_envs.constants import N_ACTIONS, RenderMode
+from hecogrid_envs.core.rng import game_seeds
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.seeding import game_seeds
 from hecogrid_envs.state import state_option
 from hecogrid_envs.tasks import TASKS
 from hecogrid_envs.tiles import observation_space

@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.policies.base import TeamPolicy
-from sb3_saf.policies.declaration import Declaration
+from sb3_saf.policies.parts import Declaration
 from sb3_saf.registration import DECLARATIONS
 
 N_AGENTS: Final = 10

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 import sb3_saf.policies
 import sb3_saf.qplex
-from sb3_saf.policies.declaration import AlgorithmSpec, Declaration
+from sb3_saf.policies.parts import AlgorithmSpec, Declaration
 
 
 def _declared_in(package: ModuleType) -> Iterator[Declaration]:

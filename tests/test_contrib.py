@@ -22,8 +22,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 import sb3_saf
 from sb3_saf import SAFLstmPolicy, evaluate_team, make_team_env
 from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.distributions import masked_parameters
-from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.distributions import actor_distribution, distribution_of, mixture_of
 from sb3_saf.policies.maskable import TeamMaskablePolicy

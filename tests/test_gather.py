@@ -11,7 +11,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, LightEncoder, TeamRolloutBuffer, make_team_env
-from sb3_saf.networks.gather import gather, gather_agents
+from sb3_saf.networks.layers import gather, gather_agents
 
 
 @pytest.fixture

@@ -36,8 +36,7 @@ from sb3_saf.inspection.calibration import calibrate, lambda_returns
 from sb3_saf.inspection.games import zone_function
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.inspection.scalars import critic_scalars, message_scalars, pool_scalars
-from sb3_saf.networks.actor import PoolOutput
-from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.networks.actor import PolicyPool, PoolOutput
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.ippo import IPPOPolicy
 from sb3_saf.policies.saf import SAFCritic, SAFPolicy

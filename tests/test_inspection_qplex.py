@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_saf import QPLEX, InspectionCallback, evaluate_team, make_team_env
 from sb3_saf.inspection.reading import QReader
 from sb3_saf.inspection.recording import record_episodes
-from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.qplex.policies import QPLEXPolicy
 from tests.probe_envs import ConstantReward
 from tests.toy_envs import TellingEnv

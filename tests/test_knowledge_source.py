@@ -6,13 +6,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch as th
+from gymnasium.spaces import Discrete
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_saf.networks.knowledge_source import KnowledgeSource
-from sb3_saf.networks.layers import Attention, orthogonal_init
+from sb3_saf.networks.layers import Attention, NetworkSpec, orthogonal_init
 from sb3_saf.policies.parts import CriticInput
-from sb3_saf.policies.saf import SAFCritic
+from sb3_saf.policies.saf import SAFCritic, SAFParts
 
 Array = npt.NDArray[np.float64]
 N_TEAMS, N_AGENTS, SIZE = 3, 5, 8
@@ -168,18 +169,9 @@ def test_all_weights_are_trained(source: KnowledgeSource) -> None:
 
 
 def make_critic(critic_input: CriticInput, heads: str = "shared") -> SAFCritic:
-    return SAFCritic(
-        SIZE,
-        N_AGENTS,
-        [16],
-        nn.Tanh,
-        heads=heads,  # type: ignore[arg-type]
-        critic_input=critic_input,
-        agent_identity=True,
-        n_slots=4,
-        latent_dim=6,
-        projection_hidden=[12],
-    )
+    spec = NetworkSpec(SIZE, N_AGENTS, Discrete(2), [16], [16], nn.Tanh, 0.0)
+    parts = SAFParts(heads=heads, critic_input=critic_input, latent_dim=6, projection_arch=(12,))  # type: ignore[arg-type]
+    return SAFCritic(spec, parts)
 
 
 def test_critic_is_the_papers_chain() -> None:

@@ -22,7 +22,7 @@ from pettingzoo.test import (
 
 import hecogrid_envs
 from hecogrid_envs import TASK_NAMES, TASKS, HECOGridEnv, HECOGridParams
-from hecogrid_envs.registry import register_with_pettingzoo
+from hecogrid_envs.tasks import register_with_pettingzoo
 
 SMALL: dict[str, Any] = {"n_agents": 4, "grid_size": 9, "n_treasures": 12, "n_keys": 5, "max_cycles": 20}
 VARIANTS = [

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from sb3_saf.networks.policy_pool import PolicyPool
+from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.parameters import count, format_table, paper_policy, parameter_table
 from sb3_saf.policies import ippo, mappo, saf
-from sb3_saf.policies.declaration import Declaration
+from sb3_saf.policies.parts import Declaration
 from sb3_saf.policies.saf import SAFCritic
 
 ACTOR, OWN_CRITIC, JOINT_CRITIC, CNN = 25_735, 24_961, 98_689, 1_233_056

@@ -740,8 +740,7 @@ def test_parts_can_be_replaced() -> None:
 
     class DoubledParts(MAPPOParts):
         def critic(self, spec: Any) -> DoubledCritic:
-            sizes = (spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn)
-            return DoubledCritic(*sizes, self.heads, self.agent_identity)
+            return DoubledCritic(spec, self)
 
     class DoubledPolicy(MAPPOPolicy):
         parts_class = DoubledParts

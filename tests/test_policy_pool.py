@@ -14,9 +14,8 @@ from stable_baselines3.common.distributions import Distribution, make_proba_dist
 from torch import nn
 
 from sb3_saf.networks import distributions
-from sb3_saf.networks.actor import ActionHead, ActorNetwork, SinglePolicy
+from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy, draw_policy
 from sb3_saf.networks.distributions import n_action_parameters
-from sb3_saf.networks.policy_pool import PolicyPool, Selection, draw_policy
 from sb3_saf.policies.distributions import (
     PoolDistribution,
     SelectedDistribution,

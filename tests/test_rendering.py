@@ -14,8 +14,8 @@ import numpy.typing as npt
 import pytest
 
 from hecogrid_envs import rendering, window
+from hecogrid_envs.batch import seen_cells
 from hecogrid_envs.constants import zone_colour
-from hecogrid_envs.fields_of_view import seen_cells
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.rendering import Scene, fit_tile_size, header_height, render_scene
 from hecogrid_envs.task import TaskName

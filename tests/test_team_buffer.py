@@ -13,8 +13,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.buffers.minibatch import TeamMinibatch
-from sb3_saf.buffers.rollout import TeamRolloutBuffer
+from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from tests.team_venv import VECTOR, Array, TeamVenv

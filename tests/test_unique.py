@@ -11,19 +11,18 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_saf.networks import unique
-from sb3_saf.networks.row_encoder import RowEncoder
-from sb3_saf.networks.unique import UniqueRows, every_row, unique_rows
+from sb3_saf.networks import row_encoder
+from sb3_saf.networks.row_encoder import RowEncoder, UniqueRows, every_row, unique_rows
 
 Finder = Callable[[th.Tensor], UniqueRows]
 
 
 def on_cpu(x: th.Tensor) -> UniqueRows:
-    return unique._unique_on_cpu(unique._bytes_of_rows(x))
+    return row_encoder._unique_on_cpu(row_encoder._bytes_of_rows(x))
 
 
 def on_device(x: th.Tensor) -> UniqueRows:
-    return unique._unique_on_device(unique._bytes_of_rows(x))
+    return row_encoder._unique_on_device(row_encoder._bytes_of_rows(x))
 
 
 FINDERS = pytest.mark.parametrize("find", [on_cpu, on_device])
@@ -94,16 +93,16 @@ def test_edges(find: Finder) -> None:
 
 def test_exact_although_every_hash_collides(monkeypatch: pytest.MonkeyPatch) -> None:
     x = th.randint(0, 4, (60, 2))
-    monkeypatch.setattr(unique, "_hash_row", lambda words, row: np.uint64(7))
-    monkeypatch.setattr(unique, "_find_unique", unique._find_unique.py_func)
+    monkeypatch.setattr(row_encoder, "_hash_row", lambda words, row: np.uint64(7))
+    monkeypatch.setattr(row_encoder, "_find_unique", row_encoder._find_unique.py_func)
     assert_matches_reference(x, on_cpu(x))
-    monkeypatch.setattr(unique, "_hash_words", lambda words: words.new_zeros(len(words)))
+    monkeypatch.setattr(row_encoder, "_hash_words", lambda words: words.new_zeros(len(words)))
     assert_matches_reference(x, on_device(x))
 
 
 def test_hashes_are_computed_in_parts_of_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     x = th.randint(0, 4, (60, 2))
-    monkeypatch.setattr(unique, "_HASH_CHUNK_BYTES", 100)
+    monkeypatch.setattr(row_encoder, "_HASH_CHUNK_BYTES", 100)
     assert_matches_reference(x, on_device(x))
 
 

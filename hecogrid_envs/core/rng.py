@@ -1,10 +1,13 @@
 """
-A small generator of random numbers for each game (SplitMix64, Steele et al. 2014).
+Random numbers of games: their seeds, and the small generator that kernels draw from (SplitMix64, Steele et al. 2014).
 
-Its whole state is one word per game, so a game's future depends on its own past only, whoever its neighbours are.
+The generator's whole state is one word per game, so a game's future depends on its own past only, whoever its
+neighbours are.
 """
 
 from __future__ import annotations
+
+import secrets
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +18,47 @@ _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
+
+#: Game seeds stay within a signed 64-bit integer, so that every stack between here and a game carries them.
+_SEED_BITS = 63
+
+
+def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
+    """
+    Return the seeds of the games of a vector environment.
+
+    Game ``i`` gets the same seed whatever the number of games, and the seeds of neighbouring runs
+    (``seed`` and ``seed + 1``) have nothing in common.
+
+    :param seed: the run's seed, 0 or larger
+    :param n_games: E, number of games
+    :param first: index of the first game
+    :return: E integers below 2**63
+    """
+    return [_game_seed(seed, index) for index in range(first, first + n_games)]
+
+
+def _game_seed(seed: int, index: int) -> int:
+    words = np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)
+    return int(words[0]) >> (64 - _SEED_BITS)
+
+
+def generator_word(seed: int) -> np.uint64:
+    """
+    Return the first state of a game's random generator.
+
+    :param seed: 0 or larger, of any size
+    :raises ValueError: for anything else
+    """
+    if isinstance(seed, (bool, np.bool_)) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed must be an integer of at least 0 or None, got {seed!r}")
+    word: np.uint64 = np.random.SeedSequence(int(seed)).generate_state(1, np.uint64)[0]
+    return word
+
+
+def fresh_seed() -> int:
+    """Draw a seed from the operating system, for games that nobody seeded; no global generator is touched."""
+    return secrets.randbits(_SEED_BITS)
 
 
 @inlined

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hecogrid_envs.core.jit import hot, inlined
+from hecogrid_envs.core.jit import copy_16, hot, inlined, load_word, store_word
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
 from hecogrid_envs.core.types import U8, Games, World, whole
-from hecogrid_envs.core.words import copy_16, load_word, store_word
 
 _ONE = np.uint64(1)
 _BYTE = np.uint64(255)

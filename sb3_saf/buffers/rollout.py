@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import Any, Final
+from collections.abc import Generator, ItemsView
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,6 @@ from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.buffers.minibatch import RolloutReturns, TeamMinibatch, WholeTeams
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -25,9 +24,95 @@ from sb3_saf.envs.teams import (
     TeamSpaces,
     check_whole_teams,
 )
+from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
 
 #: Arrays with one entry per step and row, beside the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
+
+
+class RolloutReturns:
+    """
+    The returns of one rollout, for policies that normalise values.
+
+    :param returns: all returns that are trained on
+    """
+
+    def __init__(self, returns: npt.NDArray[np.floating]) -> None:
+        self._returns = returns
+        self._rescaling: Rescaling | None = None
+
+    def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
+        """
+        Return how values change with this rollout; the first call takes the returns into the statistics.
+
+        :param normalizer: of the policy that is trained
+        """
+        if self._rescaling is None:
+            self._rescaling = normalizer.update(self._returns)
+        return self._rescaling
+
+
+class WholeTeams(NamedTuple):
+    """
+    The teams that the rows of a minibatch belong to.
+
+    :param observations: (G, N, *shape) own observations, agents in index order
+    :param rows: (B,) where the agent of each row is among the G N agents; None if rows are these agents in order
+    :param active: (G, N) bool, agents that take part; None if all do
+    """
+
+    observations: th.Tensor
+    rows: th.Tensor | None = None
+    active: th.Tensor | None = None
+
+
+class TeamMinibatch(dict[str, th.Tensor]):
+    """
+    Observations of the rows of whole teams.
+
+    It is the dict that SB3's buffer gives, but that ``"team"``, N times as large as the rest, is made when it is asked
+    for: policies that know this class read :attr:`teams`.
+
+    :param teams: the teams
+    :param entries: all other entries of the rows' observations, ``"obs"`` among them
+    :param returns: of the rollout that the rows are from
+    :param old_values: (B,) of the rows, in memory of their own
+    """
+
+    def __init__(
+        self, teams: WholeTeams, entries: dict[str, th.Tensor], returns: RolloutReturns, old_values: th.Tensor
+    ) -> None:
+        super().__init__(entries)
+        self.teams = teams
+        self._returns = returns
+        self._old_values: th.Tensor | None = old_values
+
+    def update_statistics(self, normalizer: ValueNormalizer) -> None:
+        """
+        Take the rollout's returns into the statistics, and state the minibatch's old values under them: they are then
+        what the unchanged critic says, and PPO's ``clip_range_vf`` starts from no difference. Once per minibatch.
+
+        :param normalizer: of the policy that is trained
+        """
+        scale, shift = self._returns.rescaling(normalizer)
+        if self._old_values is not None:
+            self._old_values.mul_(scale).add_(shift)
+            self._old_values = None
+
+    def __missing__(self, key: str) -> th.Tensor:
+        """Make ``"team"``, (B, N, *shape)."""
+        if key != TEAM_KEY:
+            raise KeyError(key)
+        observations, rows, _ = self.teams
+        n_teams, n_agents = observations.shape[:2]
+        teams = th.arange(n_teams * n_agents, device=observations.device) if rows is None else rows
+        self[TEAM_KEY] = observations[teams // n_agents]
+        return self[TEAM_KEY]
+
+    def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
+        """Return all entries, ``"team"`` among them: SB3's own policies read every one."""
+        self.__missing__(TEAM_KEY)
+        return super().items()
 
 
 class TeamRolloutBuffer(DictRolloutBuffer):
@@ -38,7 +123,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
       observations per row. A row of HECOGrid with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes
       of action, reward, value and so on, where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Arrays are made
       once and reused by all rollouts.
-    - **Minibatches** hold whole teams, agents in index order (:class:`~sb3_saf.buffers.minibatch.TeamMinibatch`), so no
+    - **Minibatches** hold whole teams, agents in index order (:class:`TeamMinibatch`), so no
       team is encoded in two minibatches, and critics need not look for it. ``batch_size`` counts rows and must be a
       multiple of N; the last minibatch may be smaller.
     - **Advantages** are SB3's, computed by its code.

@@ -1,15 +1,18 @@
-"""Game steps in the logs: SB3 counts rows, that is, every agent of every game."""
+"""Game steps in the logs (SB3 counts rows: every agent of every game), and the check of a model before it learns."""
 
 from __future__ import annotations
 
 import sys
 import time
+import warnings
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import CombinedExtractor
 
-from sb3_saf.callbacks.checks import check_training
-from sb3_saf.envs.teams import find_n_agents
+from sb3_saf.buffers.rollout import TeamRolloutBuffer
+from sb3_saf.envs.teams import TEAM_KEY, TEAM_KEYS, find_n_agents
+from sb3_saf.policies.rows import TeamRowsPolicy
 
 GAME_STEPS_TAG = "time/game_steps"
 GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"
@@ -27,12 +30,42 @@ def game_steps(model: BaseAlgorithm) -> int | None:
     return None if n_agents is None else model.num_timesteps // n_agents
 
 
+def check_training(model: BaseAlgorithm) -> None:
+    """
+    Check a model before it learns; the callbacks of this package call it.
+
+    SB3's own ``"MultiInputPolicy"`` reads all entries of a row, what the whole team sees included, so that no agent
+    could act on its own observation: a warning says so. It may go on, as the policy of one learner that sees all.
+
+    :param model: any algorithm on any environment
+    :raises ValueError: if minibatches cannot hold whole teams, with batch sizes that can
+    """
+    buffer, batch_size = getattr(model, "rollout_buffer", None), getattr(model, "batch_size", None)
+    if isinstance(buffer, TeamRolloutBuffer) and batch_size is not None:
+        buffer.check_batch_size(batch_size)
+    entries = getattr(model.observation_space, "spaces", {})
+    extractor = getattr(model.policy, "features_extractor", None)
+    if set(TEAM_KEYS) <= set(entries) and isinstance(extractor, CombinedExtractor):
+        own = sorted(
+            name
+            for name, policy in model.policy_aliases.items()
+            if issubclass(policy, TeamRowsPolicy) and name == policy.__name__
+        )
+        warnings.warn(
+            f"{type(model.policy).__name__} reads whole rows of teams: its actor sees {TEAM_KEY!r}, what all agents "
+            "see, so that agents cannot act on their own observations. Use a policy whose critic alone reads the team: "
+            f"{', '.join(own)}, as in {type(model).__name__}({own[-1]!r}, env)",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
 class GameStepsCallback(BaseCallback):
     """
     Log ``time/game_steps`` and ``time/game_steps_per_second`` beside SB3's ``time/total_timesteps`` and ``time/fps``,
     which count agents' steps. On environments that are not made of teams it logs nothing.
 
-    Before training it checks policy, buffer and batch size (:func:`~sb3_saf.callbacks.checks.check_training`).
+    Before training it checks policy, buffer and batch size (:func:`check_training`).
 
     ``sb3_saf.train`` and ``resumable_learn`` use it by themselves; pass it to any other ``learn``.
     """

@@ -26,7 +26,7 @@ from sb3_saf.export.manifest import (
     MemoryNet,
 )
 from sb3_saf.networks import encoders
-from sb3_saf.networks.actor import ActorNetwork, PoolOutput, SinglePolicy
+from sb3_saf.networks.actor import ActorNetwork, PolicyPool, PoolOutput, SinglePolicy, draw_policy
 from sb3_saf.networks.distributions import (
     likeliest_action,
     mixture_log_probs,
@@ -36,7 +36,6 @@ from sb3_saf.networks.distributions import (
     sample_action,
 )
 from sb3_saf.networks.encoders import preprocess
-from sb3_saf.networks.policy_pool import PolicyPool, draw_policy
 from sb3_saf.networks.spaces import ObservationSpec, SpaceSpec
 
 Array = npt.NDArray[Any]

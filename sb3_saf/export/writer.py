@@ -33,9 +33,8 @@ from sb3_saf.export.manifest import (
     MemoryNet,
 )
 from sb3_saf.export.network import ACTIVATIONS, ATLAS, AgentNetwork, RawEncoder, make_actor, make_encoder, make_memory
-from sb3_saf.networks.actor import ActionHead, SinglePolicy
+from sb3_saf.networks.actor import ActionHead, PolicyPool, Selection, SinglePolicy
 from sb3_saf.networks.layers import AgentHeads
-from sb3_saf.networks.policy_pool import PolicyPool, Selection
 from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec, spec_of
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN

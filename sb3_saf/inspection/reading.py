@@ -18,9 +18,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.buffers.replay import TeamSteps
 from sb3_saf.envs.teams import STATE_KEY
+from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.critic import JointStates, TeamStates
 from sb3_saf.networks.distributions import masked_parameters, mixture_log_probs
-from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy

@@ -1,22 +1,31 @@
 """
 Actors: from the features of an agent's own observation to its action distribution. Nothing else enters, so that an
-actor runs wherever the agent is. Letters: K rows, d features, P parameters of the action distribution.
+actor runs wherever the agent is.
+
+IPPO and MAPPO act by a :class:`SinglePolicy`, SAF by a :class:`PolicyPool`: a few policies that all agents share, and a
+choice among them by signature keys (arXiv 2210.03022, section 5).
+
+Letters: K rows, U policies, d features, P parameters of one policy's action distribution.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch as th
 from torch import nn
 
+from sb3_saf.networks.distributions import mixture_log_probs, n_action_parameters, policy_parameters
 from sb3_saf.networks.layers import AgentHeads, mlp
 from sb3_saf.networks.spaces import AnySpace, spec_of
 
 #: Orthogonal gain of the last layer: first policies are close to uniform.
 ACTION_GAIN = 0.01
+
+#: How the pool acts: as the exact mixture of its policies, or through one policy drawn anew at every evaluation.
+Selection = Literal["mixture", "gumbel"]
 
 
 class PoolOutput(NamedTuple):
@@ -180,3 +189,105 @@ class SinglePolicy(ActorNetwork):
     def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """See :class:`ActorNetwork`; (K, 1) log weights of zero and (K, 1, P) parameters."""
         return PoolOutput(th.zeros_like(features[:, :1]), self(features, agent).unsqueeze(1))
+
+
+class PolicyPool(ActorNetwork):
+    """
+    U policies, of which one is chosen for each observation: weights = softmax(q . k_u / sqrt(d)), q = g_psel(z).
+
+    ``selection="mixture"``: acting by drawing u from the weights, then the action from policy u. Likelihood, entropy
+    and most likely action are those of the mixture, exactly where the action space allows it (see
+    ``sb3_saf.networks.distributions``).
+
+    ``selection="gumbel"``: one policy is drawn whenever a distribution is made (Gumbel noise on the logits, hard
+    choice, straight-through gradient), and likelihood and entropy are that policy's. This is how the released code
+    behaves; two evaluations of one action may compare different policies. Deterministic actions are the favourite
+    policy's.
+
+    :param features_dim: size of z
+    :param action_space: the action space
+    :param hidden: sizes of the policies' hidden layers
+    :param activation_fn: activation of all MLPs
+    :param n_policies: U, at least 2
+    :param selection: ``"mixture"`` or ``"gumbel"``
+    :param latent_dim: d, size of queries and signature keys
+    :param projection_hidden: sizes of the hidden layers of g_psel
+    :param log_std_init: first log standard deviation, Box actions only
+    :param n_identities: N if choice and policies read who acts, as a one-hot vector beside z; 0 if they do not
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        action_space: AnySpace,
+        hidden: Sequence[int],
+        activation_fn: type[nn.Module],
+        n_policies: int,
+        selection: Selection,
+        latent_dim: int,
+        projection_hidden: Sequence[int],
+        log_std_init: float = 0.0,
+        n_identities: int = 0,
+    ):
+        super().__init__(action_space, n_identities > 0, n_identities)
+        features_dim += n_identities
+        self.selection = selection
+        self.n_policies = n_policies
+        self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        self.signature_keys = nn.Parameter(th.randn(n_policies, latent_dim))
+        self.policies = nn.ModuleList(
+            ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init) for _ in range(n_policies)
+        )
+
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
+        """See :class:`ActorNetwork`."""
+        features = self.with_identity(features, agent)
+        logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
+        return PoolOutput(logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1))
+
+    def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """
+        See :class:`ActorNetwork`.
+
+        :param features: (K, d)
+        :param agent: (K,) int64 index of the agent, where ``reads_agent``
+        :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
+        """
+        if self.is_categorical_mixture:
+            return mixture_log_probs(*self.evaluate(features, agent))
+        return self.unmixed(features, agent)
+
+    def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`ActorNetwork`; (K, d) to (K, U + U P) weights and parameters."""
+        log_weights, actions = self.evaluate(features, agent)
+        return th.cat([log_weights, actions.flatten(1)], dim=1)
+
+    def split(self, parameters: th.Tensor) -> PoolOutput:
+        """
+        Take what :meth:`unmixed` gave apart.
+
+        :param parameters: (B, U + U P)
+        """
+        log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
+        return PoolOutput(log_weights, flat.reshape(-1, self.n_policies, n_action_parameters(self.space)))
+
+    @property
+    def is_categorical_mixture(self) -> bool:
+        """Whether the pool's distribution is one categorical: the mixture is then computed before rows are gathered."""
+        return self.selection == "mixture" and self.space.kind == "discrete"
+
+
+def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Draw one policy per row with its weight; gradients reach the weights straight through the hard choice.
+
+    :param log_weights: (B, U)
+    :param actions: (B, U, P)
+    :return: (B, P), bit for bit the parameters of the drawn policy
+    """
+    uniform = th.rand_like(log_weights).clamp_min(th.finfo(log_weights.dtype).tiny)
+    noisy = log_weights - (-uniform.log()).log()
+    soft = noisy.softmax(dim=1)
+    # Zero in value; in the gradient, the choice counts as if it had been soft.
+    straight_through = ((soft - soft.detach()).unsqueeze(2) * actions.detach()).sum(dim=1)
+    return policy_parameters(actions, noisy.argmax(dim=1)) + straight_through

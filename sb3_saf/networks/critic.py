@@ -1,21 +1,19 @@
 """
-Critics: value estimates for training. Letters: K distinct views, G distinct teams, N agents, d features.
+Critics: value estimates for training. Letters: K unique own observations, G unique teams, N agents, d features.
 
-Views and teams come separately (``features`` and ``teams``), so that what depends on a single view is computed once
-per view.
+Own observations and teams come separately (``features`` and ``teams``), so that what depends on a single observation is
+computed once for it.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Literal, cast
 
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.gather import gather
-from sb3_saf.networks.layers import AgentHeads, mlp
+from sb3_saf.networks.layers import AgentHeads, NetworkSpec, gather, mlp
 
 #: One head for all agents, or one for each.
 Heads = Literal["shared", "per_agent"]
@@ -29,8 +27,8 @@ class TeamCritic(nn.Module, ABC):
         """
         Value of every agent of every team.
 
-        :param features: (K, d) features of views
-        :param teams: (G, N) int64, which view each agent of a team has
+        :param features: (K, d) features of own observations
+        :param teams: (G, N) int64, which of them each agent of a team has
         :param active: (G, N) bool, agents that take part; all if None
         :return: (G, N)
         """
@@ -52,8 +50,8 @@ class TeamStates(nn.Module, ABC):
         """
         State of every agent of every team.
 
-        :param features: (K, d) features of views
-        :param teams: (G, N) int64, which view each agent of a team has
+        :param features: (K, d) features of own observations
+        :param teams: (G, N) int64, which of them each agent of a team has
         :param active: (G, N) bool, agents that take part; all if None
         :return: (G, N, S)
         """
@@ -66,7 +64,7 @@ class JointStates(TeamStates):
     :param features_dim: d
     :param n_agents: N
     :param agent_identity: False leaves out whose state it is: all agents of a team then have the same
-    :param members: makes each agent's own state, of size d; None for the features of its view
+    :param members: makes each agent's own state, of size d; None for the features of its own observation
     """
 
     def __init__(self, features_dim: int, n_agents: int, agent_identity: bool, members: TeamStates | None = None):
@@ -113,23 +111,19 @@ class OwnValueHead(nn.Module):
     """
     Value of an agent from its own features.
 
+    :param spec: of the policy
     :param features_dim: d
-    :param n_agents: N
-    :param hidden: sizes of the hidden layers
-    :param activation_fn: activation of the hidden layers
     :param heads: one head for all agents, or one for each
     """
 
-    def __init__(
-        self, features_dim: int, n_agents: int, hidden: Sequence[int], activation_fn: type[nn.Module], heads: Heads
-    ):
+    def __init__(self, spec: NetworkSpec, features_dim: int, heads: Heads):
         super().__init__()
         self.reads_agent = heads == "per_agent"
 
         def make_head() -> nn.Sequential:
-            return mlp([features_dim, *hidden, 1], activation_fn)
+            return mlp([features_dim, *spec.value_hidden, 1], spec.activation_fn)
 
-        self.head: nn.Module = AgentHeads(make_head, n_agents) if self.reads_agent else make_head()
+        self.head: nn.Module = AgentHeads(make_head, spec.n_agents) if self.reads_agent else make_head()
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
@@ -162,33 +156,19 @@ class JointValueHead(nn.Module):
     One head for all agents is told whose value is asked by the agent's identity (one-hot); without it, all agents of
     a team get the same value. With one head per agent the head is the identity.
 
-    :param features_dim: d
-    :param n_agents: N
-    :param hidden: sizes of the hidden layers
-    :param activation_fn: activation of the hidden layers
+    :param spec: of the policy
+    :param joint_dim: size of the joint features
     :param heads: one head for all agents, or one for each
     :param agent_identity: whether a shared head reads the agent's identity
-    :param joint_dim: size of the joint features where they are not N times d
     """
 
-    def __init__(
-        self,
-        features_dim: int,
-        n_agents: int,
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-        heads: Heads,
-        agent_identity: bool,
-        joint_dim: int | None = None,
-    ):
+    def __init__(self, spec: NetworkSpec, joint_dim: int, heads: Heads, agent_identity: bool):
         super().__init__()
-        self.n_agents = n_agents
-        self.per_agent = heads == "per_agent"
-        self.agent_identity = agent_identity and not self.per_agent
-        n_joint = features_dim * n_agents if joint_dim is None else joint_dim
-        n_inputs = n_joint + (n_agents if self.agent_identity else 0)
-        n_heads = n_agents if self.per_agent else 1
-        self.heads = nn.ModuleList(mlp([n_inputs, *hidden, 1], activation_fn) for _ in range(n_heads))
+        self.n_agents = spec.n_agents
+        self.agent_identity = agent_identity and heads == "shared"
+        n_inputs = joint_dim + (spec.n_agents if self.agent_identity else 0)
+        n_heads = 1 if heads == "shared" else spec.n_agents
+        self.heads = nn.ModuleList(mlp([n_inputs, *spec.value_hidden, 1], spec.activation_fn) for _ in range(n_heads))
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
@@ -199,15 +179,15 @@ class JointValueHead(nn.Module):
         """
         joint = features.flatten(1)
         if self.agent_identity:
-            return self._with_identity(joint, self.n_agents)
+            return self._with_identity(joint)
         values = th.cat([head(joint) for head in self.heads], dim=1)
         return values.expand(-1, self.n_agents)
 
-    def _with_identity(self, joint: th.Tensor, n_agents: int) -> th.Tensor:
+    def _with_identity(self, joint: th.Tensor) -> th.Tensor:
         """(G, N) values of [joint features, one-hot agent]; the first layer reads the joint part once per team."""
         first, *rest = cast(nn.Sequential, self.heads[0])
         assert isinstance(first, nn.Linear)
-        weight_joint, weight_agent = first.weight[:, :-n_agents], first.weight[:, -n_agents:]
+        weight_joint, weight_agent = first.weight.split([joint.shape[1], self.n_agents], dim=1)
         x = nn.functional.linear(joint, weight_joint, first.bias).unsqueeze(1) + weight_agent.t()
         for layer in rest:
             x = layer(x)

@@ -9,14 +9,65 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.gather import gather
+if TYPE_CHECKING:
+    from gymnasium import spaces
 
 HIDDEN_GAIN: Final = math.sqrt(2)
+
+
+class NetworkSpec(NamedTuple):
+    """
+    What a policy tells the networks that it is built from.
+
+    :param features_dim: size of an encoded observation
+    :param n_agents: N
+    :param action_space: one agent's action space
+    :param actor_hidden: sizes of the hidden layers of each action head
+    :param value_hidden: sizes of the hidden layers of each value head
+    :param activation_fn: activation of hidden layers
+    :param log_std_init: first log standard deviation, Box actions only
+    :param state_space: space of the game's state where rows have it
+    """
+
+    features_dim: int
+    n_agents: int
+    action_space: spaces.Space[Any]
+    actor_hidden: list[int]
+    value_hidden: list[int]
+    activation_fn: type[nn.Module]
+    log_std_init: float
+    state_space: spaces.Space[Any] | None = None
+
+
+def gather(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
+    """
+    Return ``x[rows]``, with a gradient that is the same every time.
+
+    On the CPU, PyTorch adds up the gradient of ``x[rows]`` in parallel, in an order that changes from run to run; that
+    of ``index_select`` is added in order, and in a third of the time.
+
+    :param x: (K, *shape)
+    :param rows: int64 of any shape, each in 0..K-1
+    :return: (*rows.shape, *shape)
+    """
+    return x.index_select(0, rows.flatten()).view(*rows.shape, *x.shape[1:])
+
+
+def gather_agents(x: th.Tensor, teams: th.Tensor, agent: th.Tensor) -> th.Tensor:
+    """
+    Return ``x[teams, agent]``, see :func:`gather`.
+
+    :param x: (G, N, *shape)
+    :param teams: (B,) int64
+    :param agent: (B,) int64
+    :return: (B, *shape)
+    """
+    return gather(x.flatten(0, 1), teams * x.shape[1] + agent)
 
 
 class Linear(nn.Linear):

@@ -7,12 +7,57 @@ Letters: B rows, K unique own observations, G teams, N agents, d features; ``*sh
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from math import prod
+from typing import Any, Final, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch as th
+from numba import njit
 
-from sb3_saf.networks.gather import gather
-from sb3_saf.networks.unique import every_row, unique_rows
+from sb3_saf.networks.layers import gather
+
+_WORD: Final = 8  # bytes in a machine word
+#: Bytes of temporary words per step of the device path; bounds its memory, not its result.
+_HASH_CHUNK_BYTES: Final = 1 << 26
+
+
+class UniqueRows(NamedTuple):
+    """
+    The unique rows of a batch, in order of first appearance: ``x[index][inverse]`` equals ``x``.
+
+    :param index: (K,) int64, where each unique row appears first; increasing
+    :param inverse: (B,) int64, the unique row that each row equals
+    """
+
+    index: th.Tensor  # type: ignore[assignment]  # hides a method of tuples that nobody needs here
+    inverse: th.Tensor
+
+
+def unique_rows(x: th.Tensor) -> UniqueRows:
+    """
+    Find the unique rows of a batch, compared by their bytes: rows that are merged are equal to the last bit.
+
+    0.0 and -0.0 count as different, which costs time and nothing else.
+
+    :param x: (B, ...) any dtype, any device
+    :return: K indices and their inverse, on the device of ``x``
+    """
+    x = x.detach()
+    if x.device.type == "cpu":
+        return _unique_on_cpu(_bytes_of_rows(x))
+    return _unique_on_device(_bytes_of_rows(x))
+
+
+def every_row(x: th.Tensor) -> UniqueRows:
+    """
+    Count every row as unique: the naive counterpart of :func:`unique_rows`.
+
+    :param x: (B, ...)
+    :return: index and inverse 0..B-1
+    """
+    rows = th.arange(len(x), device=x.device)
+    return UniqueRows(rows, rows)
 
 
 class EncodedRows(NamedTuple):
@@ -129,3 +174,160 @@ class RowEncoder:
         pairs = self.find(th.stack([own.inverse, agent], dim=1))
         of_pairs = module(gather(own.features, own.inverse[pairs.index]), agent[pairs.index])
         return gather(of_pairs, pairs.inverse)
+
+
+# --- which rows are equal ---------------------------------------------------------------------------------------------
+
+
+def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
+    """(B, bytes) uint8, padded with zeros to whole words, at least one: (B, ...) of any dtype."""
+    n_rows = len(x)
+    width = prod(x.shape[1:])
+    flat = x.contiguous().view(n_rows, width).view(th.uint8)
+    missing = -flat.shape[1] % _WORD if width else _WORD
+    if missing:
+        return th.nn.functional.pad(flat, (0, missing))
+    # Words must start at whole words of the storage, which a slice of bytes need not.
+    return flat.clone() if flat.storage_offset() % _WORD else flat
+
+
+# --- CPU: one pass with an open-addressing hash table -----------------------------------------------------------------
+
+
+def _unique_on_cpu(rows: th.Tensor) -> UniqueRows:
+    words = np.require(rows.numpy(), requirements="A").view(np.uint64)
+    index = np.empty(len(words), dtype=np.int64)
+    inverse = np.empty(len(words), dtype=np.int64)
+    # At most half full, so that probing stays short; a power of two, so that masking replaces the remainder.
+    table = np.full(1 << max(2, 2 * len(words) - 1).bit_length(), -1, dtype=np.int32)
+    count = _find_unique(words, table, np.empty(len(words), dtype=np.uint64), index, inverse)
+    return UniqueRows(th.from_numpy(index[:count].copy()), th.from_numpy(inverse))
+
+
+@njit(cache=True, nogil=True)
+def _hash_row(words: npt.NDArray[np.uint64], row: int) -> np.uint64:
+    """Multiply and fold, in four independent lanes so that the multiplications overlap."""
+    multiplier, shift = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
+    a, b, c, d = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+    width = words.shape[1]
+    i = 0
+    while i + 4 <= width:
+        a = (a ^ words[row, i]) * multiplier
+        b = (b ^ words[row, i + 1]) * multiplier
+        c = (c ^ words[row, i + 2]) * multiplier
+        d = (d ^ words[row, i + 3]) * multiplier
+        # A product carries upwards only: bring the high half down before the next word enters.
+        a ^= a >> shift
+        b ^= b >> shift
+        c ^= c >> shift
+        d ^= d >> shift
+        i += 4
+    while i < width:
+        a = (a ^ words[row, i]) * multiplier
+        a ^= a >> shift
+        i += 1
+    for lane in (b, c, d):
+        a = (a ^ lane) * multiplier
+        a ^= a >> shift
+    return a
+
+
+@njit(cache=True, nogil=True)
+def _equal_rows(words: npt.NDArray[np.uint64], row: int, other: int) -> bool:
+    width = words.shape[1]
+    i = 0
+    # Eight words per branch: the inner loop becomes vector instructions.
+    while i + 8 <= width:
+        difference = np.uint64(0)
+        for j in range(i, i + 8):
+            difference |= words[row, j] ^ words[other, j]
+        if difference != np.uint64(0):
+            return False
+        i += 8
+    while i < width:
+        if words[row, i] != words[other, i]:
+            return False
+        i += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _find_unique(
+    words: npt.NDArray[np.uint64],
+    table: npt.NDArray[np.int32],
+    hashes: npt.NDArray[np.uint64],
+    index: npt.NDArray[np.int64],
+    inverse: npt.NDArray[np.int64],
+) -> int:
+    """Fill ``index`` and ``inverse``; ``table`` holds numbers of unique rows, -1 where free."""
+    mask = np.uint64(table.size - 1)
+    count = 0
+    for row in range(words.shape[0]):
+        # Rows of one team follow each other and share their joint observation: look back before hashing.
+        if row > 0 and _equal_rows(words, row - 1, row):
+            inverse[row] = inverse[row - 1]
+            continue
+        code = _hash_row(words, row)
+        slot = code & mask
+        while True:
+            known = table[slot]
+            if known < 0:
+                table[slot] = count
+                hashes[count] = code
+                index[count] = row
+                inverse[row] = count
+                count += 1
+                break
+            if hashes[known] == code and _equal_rows(words, index[known], row):
+                inverse[row] = known
+                break
+            slot = (slot + np.uint64(1)) & mask
+    return count
+
+
+# --- other devices: 64-bit hashes, sorted, then every row compared with the one that stands for it ------------------
+
+
+def _unique_on_device(rows: th.Tensor) -> UniqueRows:
+    """Works on any device, the CPU included."""
+    words = rows.view(th.int64)
+    proposal = _in_order_of_appearance(*th.unique(_hash_words(words), return_inverse=True))
+    if _confirmed(words, proposal):
+        return proposal
+    # Two different rows share a hash (odds of about B^2 / 2^65): sort whole rows instead.
+    return _in_order_of_appearance(*th.unique(words, dim=0, return_inverse=True))
+
+
+def _hash_words(words: th.Tensor) -> th.Tensor:
+    """(B,) int64 hashes of (B, W) words: a sum of mixed words, arithmetic modulo 2^64."""
+    generator = np.random.default_rng(0x5AF)
+    low, high = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+    factors = generator.integers(low, high, size=(2, words.shape[1]), dtype=np.int64) | 1
+    first, second = th.as_tensor(factors, device=words.device)
+    rows_at_once = max(1, _HASH_CHUNK_BYTES // (words.shape[1] * _WORD))
+    hashes = [_mix(_mix(part * first) * second).sum(dim=1) for part in th.split(words, rows_at_once)]
+    return _mix(th.cat(hashes)) if hashes else words.new_empty(0)
+
+
+def _mix(x: th.Tensor) -> th.Tensor:
+    return x ^ (x >> 32)
+
+
+def _in_order_of_appearance(values: th.Tensor, inverse: th.Tensor) -> UniqueRows:
+    """Renumber the sorted groups of ``th.unique`` by their first member."""
+    inverse = inverse.reshape(-1)
+    rows = th.arange(len(inverse), device=inverse.device)
+    first = rows.new_full((len(values),), len(inverse)).scatter_reduce(0, inverse, rows, "amin")
+    index, order = first.sort()
+    rank = th.empty_like(order)
+    rank[order] = th.arange(len(order), device=order.device)
+    return UniqueRows(index, rank[inverse])
+
+
+def _confirmed(words: th.Tensor, proposal: UniqueRows) -> bool:
+    rows_at_once = max(1, _HASH_CHUNK_BYTES // (words.shape[1] * _WORD))
+    stands_for = proposal.index[proposal.inverse]
+    same: Any = words.new_ones((), dtype=th.bool)
+    for part, other in zip(th.split(words, rows_at_once), th.split(stands_for, rows_at_once), strict=True):
+        same = same & (part == words[other]).all()
+    return bool(same)

@@ -8,7 +8,7 @@ How it works inside stock PPO:
 2. SB3 trains with its squared error on the raw scale. The gradient of a value is rescaled on its way back, which makes
    it the gradient of the squared error of normalised numbers (:meth:`ValueNormalizer.forward`).
 3. The statistics need the returns, which the rollout buffer computes. The minibatches of ``TeamRolloutBuffer`` carry
-   them (``sb3_saf.buffers.minibatch``); the policy takes them in when it sees the first minibatch of a rollout, before
+   them (``sb3_saf.buffers.rollout``); the policy takes them in when it sees the first minibatch of a rollout, before
    anything is learned from it. Training on minibatches of other buffers raises a ValueError.
 
 Letters: B rows.

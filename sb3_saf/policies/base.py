@@ -9,11 +9,12 @@ agents.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from functools import partial
 from typing import Any, ClassVar, Final, NamedTuple, NoReturn
 
+import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
@@ -22,18 +23,22 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.buffers.minibatch import TeamMinibatch
+from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
-from sb3_saf.networks.gather import gather_agents
-from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
+from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams
 from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.extractors import ObservationEncoder
-from sb3_saf.policies.parts import NetworkSpec, TeamParts
+from sb3_saf.policies.parts import TeamParts
 from sb3_saf.policies.rows import TeamRowsPolicy, entry_of, pop_named
+
+#: Action masks of MaskablePPO, (B, M).
+Masks = npt.NDArray[Any] | th.Tensor
+#: A head of the actor: (K, d) features and (K,) agents or None, to (K, ...).
+Head = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -200,6 +205,48 @@ class TeamPolicy(TeamRowsPolicy):
 
     # --- what SB3 calls ---------------------------------------------------------------------------------------------
 
+    def forward(
+        self, obs: PyTorchObs, deterministic: bool = False, action_masks: Masks | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Act and estimate values.
+
+        :param obs: rows
+        :param deterministic: whether to take the most likely actions
+        :param action_masks: (B, M) of MaskablePPO; None allows everything
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
+        """
+        encoded = self._encoded(obs)
+        distribution = self._distribution(obs, encoded.own, action_masks)
+        actions = distribution.get_actions(deterministic=deterministic)
+        log_prob = distribution.log_prob(actions)
+        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, encoded), log_prob
+
+    def evaluate_actions(
+        self, obs: PyTorchObs, actions: th.Tensor, action_masks: Masks | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """
+        Evaluate given actions.
+
+        :param obs: rows
+        :param actions: (B, ...) actions
+        :param action_masks: (B, M) of MaskablePPO; None allows everything
+        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
+        """
+        self._check_minibatch(obs)
+        encoded = self._encoded(obs)
+        distribution = self._distribution(obs, encoded.own, action_masks)
+        return self._values(obs, encoded), self._likelihood(distribution, actions), distribution.entropy()
+
+    def get_distribution(self, obs: PyTorchObs, action_masks: Masks | None = None) -> Distribution:
+        """
+        Return the action distribution; ``team`` is not read and may be missing.
+
+        :param obs: rows, or own observations alone (B, ...)
+        :param action_masks: (B, M) of MaskablePPO; None allows everything
+        """
+        return self._distribution(obs, self.encode_own(obs), action_masks)
+
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
         """
         Estimate values.
@@ -254,17 +301,19 @@ class TeamPolicy(TeamRowsPolicy):
         """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
         return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
 
-    def _distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: th.Tensor | None = None) -> Distribution:
-        """Over actions that both the rows' own masks and ``action_masks``, (B, M) bool, allow."""
+    def _distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None = None) -> Distribution:
+        """Over actions that both the rows' own masks and ``action_masks``, (B, M), allow."""
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs)
         if action_masks is not None:
-            masks = action_masks if masks is None else masks & action_masks
-        if masks is None:
-            parameters = self.row_encoder.apply(self.actor, own, agent)
-            return actor_distribution(self.actor, self.action_space, parameters)
-        unmixed = self.row_encoder.apply(self.actor.unmixed, own, agent)
-        return actor_distribution(self.actor, self.action_space, unmixed, masks)
+            allowed = th.as_tensor(action_masks, dtype=th.bool, device=own.inverse.device).reshape(len(own.inverse), -1)
+            masks = allowed if masks is None else masks & allowed
+        return self._distribution_of(lambda module: self.row_encoder.apply(module, own, agent), masks)
+
+    def _distribution_of(self, apply: Callable[[Head], th.Tensor], masks: th.Tensor | None) -> Distribution:
+        """Of the actor, which ``apply`` calls for all rows; masks apply to every policy of a pool."""
+        parameters = apply(self.actor if masks is None else self.actor.unmixed)
+        return actor_distribution(self.actor, self.action_space, parameters, masks)
 
     def _values(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
         """(B, 1) values."""
@@ -304,7 +353,7 @@ def _refuse_to_train(gradient: th.Tensor) -> NoReturn:
     raise ValueError(
         "normalize_values=True needs a rollout buffer that updates the statistics of returns, but values are being "
         "trained and none did; pass rollout_buffer_class=sb3_saf.TeamRolloutBuffer (or, in a buffer of your own, give "
-        "sb3_saf.buffers.minibatch.TeamMinibatch), or leave normalize_values=False"
+        "sb3_saf.buffers.rollout.TeamMinibatch), or leave normalize_values=False"
     )
 
 
@@ -319,41 +368,6 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
     """Policy for PPO, A2C and TRPO on rows of teams; see :class:`TeamPolicy` for the parameters."""
 
     normalizes_values: ClassVar[bool] = True
-
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """
-        Act and estimate values.
-
-        :param obs: rows
-        :param deterministic: whether to take the most likely actions
-        :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
-        """
-        encoded = self._encoded(obs)
-        distribution = self._distribution(obs, encoded.own)
-        actions = distribution.get_actions(deterministic=deterministic)
-        log_prob = distribution.log_prob(actions)
-        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, encoded), log_prob
-
-    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """
-        Evaluate given actions.
-
-        :param obs: rows
-        :param actions: (B, ...) actions
-        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
-        """
-        self._check_minibatch(obs)
-        encoded = self._encoded(obs)
-        distribution = self._distribution(obs, encoded.own)
-        return self._values(obs, encoded), distribution.log_prob(actions), distribution.entropy()
-
-    def get_distribution(self, obs: PyTorchObs) -> Distribution:
-        """
-        Action distribution; ``team`` is not read and may be missing.
-
-        :param obs: rows, or own observations alone (B, ...)
-        """
-        return self._distribution(obs, self.encode_own(obs))
 
 
 def _refuse(use_sde: bool, share_features_extractor: bool) -> None:

@@ -22,7 +22,7 @@ from torch import nn
 from torch.distributions import Distribution as TorchDistribution
 from torch.distributions import register_kl
 
-from sb3_saf.networks.actor import ActorNetwork, PoolOutput
+from sb3_saf.networks.actor import ActorNetwork, PolicyPool, PoolOutput, draw_policy
 from sb3_saf.networks.distributions import (
     masked_parameters,
     mixture_entropy,
@@ -32,7 +32,6 @@ from sb3_saf.networks.distributions import (
     mixture_sample,
     policy_parameters,
 )
-from sb3_saf.networks.policy_pool import PolicyPool, draw_policy
 from sb3_saf.networks.spaces import spec_of
 
 
@@ -107,10 +106,8 @@ class _FromPool(Distribution):
         super().__init__()
 
     def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
-        """Not here: the networks are those of ``sb3_saf.networks.policy_pool.PolicyPool``."""
-        raise NotImplementedError(
-            "the parameters of a pool's distribution come from sb3_saf.networks.policy_pool.PolicyPool"
-        )
+        """Not here: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
+        raise NotImplementedError("the parameters of a pool's distribution come from sb3_saf.networks.actor.PolicyPool")
 
     @abstractmethod
     def proba_distribution(self, *args: Any, **kwargs: Any) -> Any:

@@ -9,10 +9,10 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_saf.networks.critic import OwnValueHead
+from sb3_saf.networks.layers import NetworkSpec
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.declaration import AlgorithmSpec, Declaration, PaperTable, team_policies
 from sb3_saf.policies.maskable import TeamMaskablePolicy
-from sb3_saf.policies.parts import NetworkSpec, TeamParts
+from sb3_saf.policies.parts import AlgorithmSpec, Declaration, PaperTable, TeamParts, team_policies
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 
 
@@ -27,7 +27,7 @@ class IPPOParts(TeamParts):
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead:
         """V_i from z_i."""
-        return OwnValueHead(spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn, self.heads)
+        return OwnValueHead(spec, spec.features_dim, self.heads)
 
 
 class IPPOPolicy(TeamActorCriticPolicy):

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import torch as th
-from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
-from torch import nn
 
 from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.critic import (
-    Heads,
     JointStates,
     JointValueHead,
     OwnValueHead,
@@ -22,12 +18,19 @@ from sb3_saf.networks.critic import (
     TeamCritic,
     TeamStates,
 )
-from sb3_saf.networks.gather import gather
+from sb3_saf.networks.layers import NetworkSpec, gather
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.declaration import AlgorithmSpec, Declaration, PaperTable, team_policies
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.maskable import TeamMaskablePolicy
-from sb3_saf.policies.parts import CriticInput, NetworkSpec, TeamParts, check_choice
+from sb3_saf.policies.parts import (
+    AlgorithmSpec,
+    CriticInput,
+    Declaration,
+    PaperTable,
+    TeamParts,
+    check_choice,
+    team_policies,
+)
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 
 
@@ -35,25 +38,14 @@ class JointCritic(TeamCritic):
     """
     V_i from the features of all agents side by side, [z_1, ..., z_N].
 
-    :param features_dim: d
-    :param n_agents: N
-    :param hidden: sizes of the hidden layers
-    :param activation_fn: activation of the hidden layers
-    :param heads: one head for all agents, or one for each
-    :param agent_identity: whether a shared head reads whose value is asked
+    :param spec: of the policy
+    :param parts: ``heads`` and ``agent_identity``
     """
 
-    def __init__(
-        self,
-        features_dim: int,
-        n_agents: int,
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-        heads: Heads,
-        agent_identity: bool,
-    ):
+    def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
         super().__init__()
-        self.value_head = JointValueHead(features_dim, n_agents, hidden, activation_fn, heads, agent_identity)
+        joint_dim = spec.n_agents * spec.features_dim
+        self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
 
     def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; features of agents that take no part are read as zeros."""
@@ -68,30 +60,20 @@ class JointStateCritic(StateCritic):
     """
     V_i from the encoded state of the game.
 
-    :param state_space: space of the state
-    :param features_dim: size of the encoded state
-    :param n_agents: N
-    :param hidden: sizes of the hidden layers
-    :param activation_fn: activation of the hidden layers
-    :param heads: one head for all agents, or one for each
-    :param agent_identity: whether a shared head reads whose value is asked
+    :param spec: of the policy; an encoded state is as large as an encoded observation
+    :param parts: ``heads`` and ``agent_identity``
+    :raises ValueError: if rows have no state
     """
 
-    def __init__(
-        self,
-        state_space: spaces.Space[Any],
-        features_dim: int,
-        n_agents: int,
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-        heads: Heads,
-        agent_identity: bool,
-    ):
+    def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
         super().__init__()
-        self.encoder = ObservationEncoder(state_space, features_dim)
-        self.value_head = JointValueHead(
-            features_dim, n_agents, hidden, activation_fn, heads, agent_identity, joint_dim=features_dim
-        )
+        if spec.state_space is None:
+            raise ValueError(
+                f"critic_input='state' needs observations with {STATE_KEY!r}, and these have none; build the "
+                "environment with sb3_saf.make_team_env(..., state=True), or leave critic_input out"
+            )
+        self.encoder = ObservationEncoder(spec.state_space, spec.features_dim)
+        self.value_head = JointValueHead(spec, spec.features_dim, parts.heads, parts.agent_identity)
 
     def forward(self, states: th.Tensor) -> th.Tensor:
         """See :class:`StateCritic`."""
@@ -124,19 +106,7 @@ class MAPPOParts(TeamParts):
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """V_i from [z_1, ..., z_N], or from the state."""
-        if self.critic_input == "state":
-            return JointStateCritic(
-                _required(spec.state_space),
-                spec.features_dim,
-                spec.n_agents,
-                spec.value_hidden,
-                spec.activation_fn,
-                self.heads,
-                self.agent_identity,
-            )
-        return JointCritic(
-            spec.features_dim, spec.n_agents, spec.value_hidden, spec.activation_fn, self.heads, self.agent_identity
-        )
+        return JointStateCritic(spec, self) if self.critic_input == "state" else JointCritic(spec, self)
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
         """[z_1, ..., z_N], and whose value is asked where one head serves all agents."""
@@ -149,15 +119,6 @@ class MAPPOParts(TeamParts):
 
     def _joint(self, features_dim: int, n_agents: int, members: TeamStates | None = None) -> JointStates:
         return JointStates(features_dim, n_agents, self.agent_identity and self.heads == "shared", members)
-
-
-def _required(state_space: spaces.Space[Any] | None) -> spaces.Space[Any]:
-    if state_space is None:
-        raise ValueError(
-            f"critic_input='state' needs observations with {STATE_KEY!r}, and these have none; build the environment "
-            "with sb3_saf.make_team_env(..., state=True), or leave critic_input out"
-        )
-    return state_space
 
 
 class MAPPOPolicy(TeamActorCriticPolicy):

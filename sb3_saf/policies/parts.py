@@ -1,48 +1,35 @@
 """
-What an algorithm is made of: its actor and its critic.
+What the file of an algorithm gives: its parts (actor and critic), and a declaration (its policies and its names).
 
 Policy classes differ in what SB3 asks of them (PPO's, recurrent, maskable ...); parts differ in the algorithm. A policy
 class names its parts and takes their fields as constructor arguments, so that each default is written once.
+
+Registration, command lines, the paper's table and the tests that sweep over all algorithms read the declaration: a
+further algorithm is one more file in this folder (and its YAML in ``zoo_configs``, and its page).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, get_args
 
-from gymnasium import spaces
-from torch import nn
+from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
+from sb3_saf.networks.layers import NetworkSpec
 
 #: What a critic may read: the agent's own part, the whole team's, or the state of the game.
 CriticInput = Literal["own", "team", "state"]
 
-
-class NetworkSpec(NamedTuple):
-    """
-    What a policy tells its parts.
-
-    :param features_dim: size of an encoded observation
-    :param n_agents: N
-    :param action_space: one agent's action space
-    :param actor_hidden: sizes of the hidden layers of each action head
-    :param value_hidden: sizes of the hidden layers of each value head
-    :param activation_fn: activation of hidden layers
-    :param log_std_init: first log standard deviation, Box actions only
-    :param state_space: space of the game's state where rows have it
-    """
-
-    features_dim: int
-    n_agents: int
-    action_space: spaces.Space[Any]
-    actor_hidden: list[int]
-    value_hidden: list[int]
-    activation_fn: type[nn.Module]
-    log_std_init: float
-    state_space: spaces.Space[Any] | None = None
+#: Policy classes by the algorithms that train them.
+Policies = Mapping[type[BaseAlgorithm], tuple[type[BasePolicy], ...]]
 
 
 @dataclass(frozen=True)
@@ -85,6 +72,74 @@ class TeamParts(ABC):
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
         """Make what a critic with memory reads of each agent; None for the features of its own observation."""
         return None
+
+
+@dataclass(frozen=True)
+class AlgorithmSpec:
+    """
+    What a name of the command lines stands for.
+
+    :param algorithm: the algorithm's class
+    :param policy: name of its policy
+    :param config: name of the YAML file in ``zoo_configs``, without ``.yml``
+    :param policy_kwargs: what makes the policy this one; nothing overrides it
+    """
+
+    algorithm: type[BaseAlgorithm]
+    policy: str
+    config: str
+    policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def draws_actions(self) -> bool:
+        """Whether drawn actions are the policy's own; those of off-policy algorithms are exploration."""
+        return not issubclass(self.algorithm, OffPolicyAlgorithm)
+
+    @property
+    def policy_class(self) -> type[BasePolicy]:
+        """The policy's class."""
+        return self.algorithm.policy_aliases[self.policy]
+
+
+class PaperTable(NamedTuple):
+    """
+    The algorithm's line in the paper's table of parameters.
+
+    :param policy_kwargs: arguments with which a policy has as many parameters
+    :param n_parameters: the paper's figure
+    """
+
+    policy_kwargs: Mapping[str, Any]
+    n_parameters: int
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """
+    An algorithm.
+
+    :param name: what it is called, such as ``"SAF"``
+    :param policies: its policy classes, by the algorithms of SB3 and sb3-contrib that train them; the first of each is
+        also known as ``f"{name}Policy"`` and as ``name``
+    :param commands: its names on command lines, in log folders and results
+    :param paper_table: None for an algorithm that is not in it
+    """
+
+    name: str
+    policies: Policies
+    commands: Mapping[str, AlgorithmSpec]
+    paper_table: PaperTable | None = None
+
+
+def team_policies(policy: type[BasePolicy], recurrent: type[BasePolicy], maskable: type[BasePolicy]) -> Policies:
+    """Return which algorithms train the policies that are made of one set of parts."""
+    return {
+        PPO: (policy,),
+        A2C: (policy,),
+        TRPO: (policy,),
+        RecurrentPPO: (recurrent,),
+        MaskablePPO: (maskable,),
+    }
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

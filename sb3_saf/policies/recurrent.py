@@ -22,7 +22,6 @@ from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.row_encoder import EncodedRows
 from sb3_saf.policies.base import Encoded, NetArch, TeamPolicy
-from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.parts import check_at_least_one
 
 LstmStates = tuple[th.Tensor, ...]
@@ -132,8 +131,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
             num_layers=self.lstm_actor.num_layers,
             **self.lstm_kwargs,
         )
-        head = OwnValueHead(lstm.hidden_size, spec.n_agents, spec.value_hidden, spec.activation_fn, self.parts.heads)
-        return RecurrentCritic(team_states, lstm, head)
+        return RecurrentCritic(team_states, lstm, OwnValueHead(spec, lstm.hidden_size, self.parts.heads))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
@@ -187,7 +185,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> tuple[Distribution, LstmStates]:
         """
-        Action distribution; ``team`` is not read and may be missing.
+        Return the action distribution; ``team`` is not read and may be missing.
 
         :param obs: rows, or own observations alone (B, ...)
         :param lstm_states: of the actor
@@ -234,10 +232,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         latent, states = self._process(own.of_rows(), lstm_states, episode_starts, self.lstm_actor)
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs, padded=True)
-        if masks is None:
-            return actor_distribution(self.actor, self.action_space, self.actor(latent, agent)), states
-        unmixed = self.actor.unmixed(latent, agent)
-        return actor_distribution(self.actor, self.action_space, unmixed, masks), states
+        return self._distribution_of(lambda module: module(latent, agent), masks), states
 
     def _recall_values(
         self, obs: PyTorchObs, encoded: Encoded, lstm_states: LstmStates, episode_starts: th.Tensor

@@ -13,7 +13,7 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_saf.buffers.minibatch import TeamMinibatch
+from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, ALL_KEYS, OBS_KEY, TEAM_KEY, TeamSpaces
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.networks.spaces import pixels_to_codes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple, get_args
 
@@ -11,17 +10,23 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from torch import nn
 
-from sb3_saf.networks.actor import ActorNetwork
-from sb3_saf.networks.critic import Heads, JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
-from sb3_saf.networks.gather import gather
+from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
+from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
-from sb3_saf.networks.layers import mlp
-from sb3_saf.networks.policy_pool import PolicyPool, Selection
+from sb3_saf.networks.layers import NetworkSpec, gather, mlp
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.declaration import AlgorithmSpec, Declaration, PaperTable, team_policies
 from sb3_saf.policies.mappo import MAPPOParts
 from sb3_saf.policies.maskable import TeamMaskablePolicy
-from sb3_saf.policies.parts import CriticInput, NetworkSpec, TeamParts, check_at_least_one, check_choice
+from sb3_saf.policies.parts import (
+    AlgorithmSpec,
+    CriticInput,
+    Declaration,
+    PaperTable,
+    TeamParts,
+    check_at_least_one,
+    check_choice,
+    team_policies,
+)
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 
 
@@ -43,28 +48,20 @@ class SAFStates(TeamStates):
 
     m'_i = g_theta(z_i), s_i = g_omega(z_i), slots written from m', m_i read with s_i, s_i^SAF = g_phi([s_i, m_i]).
 
-    :param features_dim: size of z
-    :param n_agents: N
-    :param activation_fn: activation of all MLPs
-    :param n_slots: L
-    :param latent_dim: d, size of messages, states and slots
-    :param projection_hidden: sizes of the hidden layers of g_theta, g_omega and g_phi
+    :param spec: of the policy
+    :param parts: sizes of the networks
     """
 
-    def __init__(
-        self,
-        features_dim: int,
-        n_agents: int,
-        activation_fn: type[nn.Module],
-        n_slots: int,
-        latent_dim: int,
-        projection_hidden: Sequence[int],
-    ):
-        super().__init__(latent_dim)
-        self.message_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
-        self.state_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
-        self.knowledge_source = KnowledgeSource(n_agents, latent_dim, n_slots)
-        self.combine_net = mlp([2 * latent_dim, *projection_hidden, latent_dim], activation_fn)
+    def __init__(self, spec: NetworkSpec, parts: SAFParts):
+        super().__init__(parts.latent_dim)
+
+        def projection(n_inputs: int) -> nn.Sequential:
+            return mlp([n_inputs, *parts.projection_arch, parts.latent_dim], spec.activation_fn)
+
+        self.message_net = projection(spec.features_dim)  # g_theta
+        self.state_net = projection(spec.features_dim)  # g_omega
+        self.knowledge_source = KnowledgeSource(spec.n_agents, parts.latent_dim, parts.n_slots)
+        self.combine_net = projection(2 * parts.latent_dim)  # g_phi
 
     def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`."""
@@ -75,11 +72,11 @@ class SAFStates(TeamStates):
         """
         Send every agent's message through the knowledge source.
 
-        :param features: (K, d) features of views
-        :param teams: (G, N) int64, which view each agent of a team has
+        :param features: (K, d) features of own observations
+        :param teams: (G, N) int64, which of them each agent of a team has
         :param active: (G, N) bool, agents that take part; all if None
         """
-        # g_theta and g_omega depend on one view only: once per view, then gathered.
+        # g_theta and g_omega depend on one observation only: computed once for each, then gathered.
         messages, states = gather(self.message_net(features), teams), gather(self.state_net(features), teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
 
@@ -99,37 +96,18 @@ class SAFCritic(SAFStates, TeamCritic):
     """
     V_i from s_i^SAF, or from those of the whole team.
 
-    :param features_dim: size of z
-    :param n_agents: N
-    :param hidden: sizes of the hidden layers of the value head
-    :param activation_fn: activation of all MLPs
-    :param heads: one value head for all agents, or one for each
-    :param critic_input: whether the value head reads the agent's ``"own"`` s^SAF or those of the whole ``"team"``
-    :param agent_identity: whether a shared head on the whole team reads whose value is asked
-    :param n_slots: L
-    :param latent_dim: d, size of messages, states and slots
-    :param projection_hidden: sizes of the hidden layers of g_theta, g_omega and g_phi
+    :param spec: of the policy
+    :param parts: ``critic_input``, ``heads``, ``agent_identity`` and sizes
     """
 
-    def __init__(
-        self,
-        features_dim: int,
-        n_agents: int,
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-        heads: Heads,
-        critic_input: CriticInput,
-        agent_identity: bool,
-        n_slots: int,
-        latent_dim: int,
-        projection_hidden: Sequence[int],
-    ):
-        super().__init__(features_dim, n_agents, activation_fn, n_slots, latent_dim, projection_hidden)
+    def __init__(self, spec: NetworkSpec, parts: SAFParts):
+        super().__init__(spec, parts)
         self.value_head: OwnValueHead | JointValueHead
-        if critic_input == "own":
-            self.value_head = OwnValueHead(latent_dim, n_agents, hidden, activation_fn, heads)
+        if parts.critic_input == "own":
+            self.value_head = OwnValueHead(spec, parts.latent_dim, parts.heads)
         else:
-            self.value_head = JointValueHead(latent_dim, n_agents, hidden, activation_fn, heads, agent_identity)
+            joint_dim = spec.n_agents * parts.latent_dim
+            self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
 
     def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`."""
@@ -208,33 +186,13 @@ class SAFParts(MAPPOParts):
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """V_i from s_i^SAF."""
-        if not self.knowledge_source:
-            return super().critic(spec)
-        return SAFCritic(
-            spec.features_dim,
-            spec.n_agents,
-            spec.value_hidden,
-            spec.activation_fn,
-            heads=self.heads,
-            critic_input=self.critic_input,
-            agent_identity=self.agent_identity,
-            n_slots=self.n_slots,
-            latent_dim=self.latent_dim,
-            projection_hidden=self.projection_arch,
-        )
+        return SAFCritic(spec, self) if self.knowledge_source else super().critic(spec)
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
         """s_i^SAF, or those of all agents."""
         if not self.knowledge_source:
             return super().team_states(spec)
-        states = SAFStates(
-            spec.features_dim,
-            spec.n_agents,
-            spec.activation_fn,
-            n_slots=self.n_slots,
-            latent_dim=self.latent_dim,
-            projection_hidden=self.projection_arch,
-        )
+        states = SAFStates(spec, self)
         return states if self.critic_input == "own" else self._joint(self.latent_dim, spec.n_agents, states)
 
 

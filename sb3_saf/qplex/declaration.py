@@ -1,10 +1,10 @@
-"""What QPLEX declares, see ``sb3_saf.policies.declaration``."""
+"""What QPLEX declares, see ``sb3_saf.policies.parts``."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from sb3_saf.policies.declaration import AlgorithmSpec, Declaration
+from sb3_saf.policies.parts import AlgorithmSpec, Declaration
 from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
 from sb3_saf.qplex.qplex import QPLEX
 

@@ -10,9 +10,8 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.networks.actor import ActorNetwork
+from sb3_saf.networks.actor import ActorNetwork, PolicyPool, draw_policy
 from sb3_saf.networks.distributions import policy_parameters
-from sb3_saf.networks.policy_pool import PolicyPool, draw_policy
 
 #: Hidden and cell state of agents, each (K, H).
 Memory = tuple[th.Tensor, th.Tensor]

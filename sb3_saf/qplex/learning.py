@@ -14,8 +14,8 @@ import torch as th
 from torch import nn
 
 from sb3_saf.buffers.replay import Sequences, TeamReplaySamples, TeamSteps
-from sb3_saf.networks.gather import gather
-from sb3_saf.networks.unique import UniqueRows
+from sb3_saf.networks.layers import gather
+from sb3_saf.networks.row_encoder import UniqueRows
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.mixers import JointChoice, Mixed
 from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy

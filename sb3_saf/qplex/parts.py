@@ -9,9 +9,8 @@ from typing import get_args
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
+from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
-from sb3_saf.networks.policy_pool import PolicyPool
 from sb3_saf.policies.parts import check_at_least_one, check_choice
 from sb3_saf.qplex.heads import AgentMemory
 from sb3_saf.qplex.mixers import Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer, check_mixer

@@ -17,8 +17,7 @@ from torch import nn
 
 from sb3_saf.envs.teams import Array
 from sb3_saf.networks.actor import ActorNetwork
-from sb3_saf.networks.gather import gather
-from sb3_saf.networks.layers import HIDDEN_GAIN, orthogonal_init
+from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.rows import TeamRowsPolicy, pop_named
 from sb3_saf.qplex.heads import AgentMemory, q_values

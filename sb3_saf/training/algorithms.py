@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from sb3_saf.policies.declaration import AlgorithmSpec
+from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS
 from sb3_saf.training.names import unknown_name
 

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from hecogrid_envs.seeding import game_seeds
+from hecogrid_envs.core.rng import game_seeds
 from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, OBS_KEY, TeamSpaces
 from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.seeds import evaluation_seed
