@@ -24,15 +24,14 @@ from sb3_saf import SAFLstmPolicy, evaluate_team, make_team_env
 from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.distributions import masked_parameters
-from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.policies.distributions import actor_distribution, distribution_of, mixture_of
-from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from sb3_saf.registration import DECLARATIONS
 from tests.contrib_teams import CueTeams, MaskedTeams, choices_of, is_allowed, random_masks
 from tests.test_policies import ACTIONS, equal_weights
 from tests.toy_envs import CounterEnv
-from tests.toy_teams import VECTOR, ToyTeams, take, team_rows, to_numpy
+from tests.toy_teams import VECTOR, ToyTeams, gather_rows, team_rows, to_numpy
 
 HIDDEN = 6
 #: Every algorithm that is declared for RecurrentPPO.
@@ -321,13 +320,13 @@ def test_memory_against_an_independent_loop(family: str, kwargs: dict[str, Any])
     assert isinstance(policy.value_net, RecurrentCritic)
     n_steps, rows = 5, team_rows(VECTOR, n_games=10)
     # Two sequences: agent 2 of games 0 to 4, and agent 0 of games 5 to 9 as if they were one game's steps.
-    sequences = take(rows, [3 * t + 2 for t in range(n_steps)] + [15 + 3 * t for t in range(n_steps)])
+    sequences = gather_rows(rows, [3 * t + 2 for t in range(n_steps)] + [15 + 3 * t for t in range(n_steps)])
     starts = [[False] * n_steps, [False, False, True, False, False]]
     values, log_prob, _ = policy.evaluate_actions(
         sequences, th.zeros(10).long(), RNNStates(no_memory(2), no_memory(2)), th.tensor(starts).flatten().float()
     )
     for number, agent in enumerate((2, 0)):
-        steps = take(sequences, slice(number * n_steps, (number + 1) * n_steps))  # type: ignore[arg-type]
+        steps = gather_rows(sequences, slice(number * n_steps, (number + 1) * n_steps))  # type: ignore[arg-type]
         latent = lstm_by_hand(policy.lstm_actor, policy.features_extractor(steps["obs"]), starts[number])
         agents = th.full((n_steps,), agent)
         expected = actor_distribution(policy.actor, policy.action_space, policy.actor(latent, agents)).log_prob(

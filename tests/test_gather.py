@@ -1,4 +1,4 @@
-"""Rows are taken by number so that gradients, and with them trainings, repeat on any number of threads."""
+"""Rows are gathered so that gradients, and with them trainings, repeat on any number of threads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def two_threads() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
-def test_taking_is_indexing(shape: tuple[int, ...]) -> None:
+def test_gather_is_indexing(shape: tuple[int, ...]) -> None:
     x = th.randn(4, *shape, dtype=th.float64, requires_grad=True)
     rows = th.tensor([[0, 3, 3], [1, 0, 3]])
     assert th.equal(gather(x, rows), x[rows])

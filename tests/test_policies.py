@@ -25,7 +25,7 @@ from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import DECLARATIONS, register
-from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, take, team_rows, to_numpy
+from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, gather_rows, team_rows, to_numpy
 
 #: Every policy that is declared for PPO, sorted by name.
 POLICIES: list[type[TeamActorCriticPolicy]] = sorted(
@@ -142,7 +142,7 @@ def test_no_other_agents_observation_changes_an_action_by_a_bit(
     other = team_rows(own, n_views=12, seed=1)["team"]
     all_actions = [th.full((12,), action) for action in range(3)]
     for rows in (range(12), [7]):
-        one = take(obs, list(rows))
+        one = gather_rows(obs, list(rows))
         two = one | {"team": other[list(rows)]}
         outcomes = []
         for variant in (one, two):
@@ -164,7 +164,7 @@ def test_no_other_agents_observation_changes_an_action_by_a_bit(
 
 @pytest.mark.parametrize("policy_class", [MAPPOPolicy, SAFPolicy])
 def test_the_team_reaches_values_but_not_actions(policy_class: type[TeamActorCriticPolicy]) -> None:
-    policy, obs = make_policy(policy_class), take(team_rows(VECTOR, n_views=50), [7])
+    policy, obs = make_policy(policy_class), gather_rows(team_rows(VECTOR, n_views=50), [7])
     obs["team"].requires_grad_()
     values, log_prob, entropy = policy.evaluate_actions(obs, th.zeros(1, dtype=th.int64))
     assert entropy is not None
@@ -179,7 +179,7 @@ def test_ippos_values_do_not_read_the_team() -> None:
     assert policy.predict_values(obs).shape == (12, 1)
 
 
-# --- encoding distinct views once -------------------------------------------------------------------------------------
+# --- encoding unique observations once --------------------------------------------------------------------------------
 
 
 def loss_and_gradients(
@@ -206,8 +206,8 @@ def test_naive_encoding_gives_the_same_loss_and_gradients(
     naive.load_state_dict(policy.state_dict())
     obs = team_rows(own, n_games=10)
     for rows in (th.arange(30), th.randperm(30)[:17], th.tensor([4])):
-        loss, gradients = loss_and_gradients(policy, take(obs, rows))
-        expected_loss, expected = loss_and_gradients(naive, take(obs, rows))
+        loss, gradients = loss_and_gradients(policy, gather_rows(obs, rows))
+        expected_loss, expected = loss_and_gradients(naive, gather_rows(obs, rows))
         th.testing.assert_close(loss, expected_loss, rtol=1e-5, atol=1e-6)
         assert gradients.keys() == expected.keys()
         for name, gradient in gradients.items():
@@ -225,7 +225,7 @@ def test_whole_teams_are_judged_without_search_and_as_rows_in_any_order(
 ) -> None:
     policy, obs = make_policy(policy_class, encode_once=encode_once, **kwargs), team_rows(VECTOR, n_views=50)
     shuffled = th.tensor([2, 0, 1, 3, 5, 4, 6, 7, 8, 9, 10, 11])
-    expected = policy.predict_values(take(obs, shuffled))
+    expected = policy.predict_values(gather_rows(obs, shuffled))
     joint_rows, searched = policy.row_encoder.joint_rows, list[int]()
 
     def noting(*args: Any) -> Any:
@@ -240,11 +240,11 @@ def test_whole_teams_are_judged_without_search_and_as_rows_in_any_order(
     obs["team"][1, 0] = obs["obs"][9]
     other = policy.predict_values(obs)
     assert searched
-    th.testing.assert_close(other[1:2], policy.predict_values(take(obs, [1])), rtol=0, atol=1e-6)
+    th.testing.assert_close(other[1:2], policy.predict_values(gather_rows(obs, [1])), rtol=0, atol=1e-6)
     assert abs(other[1] - values[1]) > 1e-5
 
 
-def test_each_distinct_view_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_unique_observation_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = make_policy(SAFPolicy, chunk_size=4)
     encoded: list[tuple[float, ...]] = []
     forward = policy.features_extractor.forward
@@ -259,7 +259,7 @@ def test_each_distinct_view_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> 
     policy(obs)
     assert len(encoded) == len(set(encoded)) == 9
     encoded.clear()
-    policy(take(obs, [0, 1]))
+    policy(gather_rows(obs, [0, 1]))
     assert len(encoded) == len(set(encoded)) <= 3
 
 
@@ -271,9 +271,9 @@ def test_rows_do_not_depend_on_their_neighbours(
     values = policy.predict_values(obs)
     assert values.shape == (12, 1)
     order = th.randperm(12)
-    th.testing.assert_close(policy.predict_values(take(obs, order)), values[order], rtol=0, atol=1e-6)
+    th.testing.assert_close(policy.predict_values(gather_rows(obs, order)), values[order], rtol=0, atol=1e-6)
     for row in range(12):
-        th.testing.assert_close(policy.predict_values(take(obs, [row])), values[[row]], rtol=0, atol=1e-6)
+        th.testing.assert_close(policy.predict_values(gather_rows(obs, [row])), values[[row]], rtol=0, atol=1e-6)
     th.testing.assert_close(policy(obs)[1], values, rtol=0, atol=1e-6)
     th.testing.assert_close(policy.evaluate_actions(obs, th.zeros(12).long())[0], values, rtol=0, atol=1e-6)
 

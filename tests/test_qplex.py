@@ -141,7 +141,7 @@ def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
 @pytest.mark.parametrize(
     ("policy", "kind"), [("QPLEXPolicy", "all"), ("QPLEXPoolPolicy", "features"), ("QPLEXLstmPolicy", "all")]
 )
-def test_distinct_views_give_the_numbers_of_every_row(policy: str, kind: str) -> None:
+def test_unique_rows_give_the_numbers_of_every_row(policy: str, kind: str) -> None:
     errors = []
     for encode_once in (True, False):
         env = telling_env() if kind == "all" else ToyTeams()

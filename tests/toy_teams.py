@@ -47,7 +47,7 @@ def team_rows(
     }
 
 
-def take(obs: PyTorchObs, rows: Sequence[int] | th.Tensor) -> dict[str, th.Tensor]:
+def gather_rows(obs: PyTorchObs, rows: Sequence[int] | th.Tensor) -> dict[str, th.Tensor]:
     """Some rows of a batch."""
     assert isinstance(obs, dict)
     return {key: value[rows] for key, value in obs.items()}
@@ -66,7 +66,7 @@ class ToyTeams(VecEnv):
     :param action_space: action space
     :param n_agents: N
     :param n_games: E
-    :param n_views: distinct own observations that occur
+    :param n_views: unique own observations that occur
     :param length: steps per episode
     """
 

@@ -36,9 +36,8 @@ from sb3_saf.export.network import ACTIVATIONS, ATLAS, AgentNetwork, RawEncoder,
 from sb3_saf.networks.actor import ActionHead, PolicyPool, Selection, SinglePolicy
 from sb3_saf.networks.layers import AgentHeads
 from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec, spec_of
-from sb3_saf.policies.base import TeamPolicy
+from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
-from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
 

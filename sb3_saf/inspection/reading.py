@@ -21,8 +21,7 @@ from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.critic import JointStates, TeamStates
 from sb3_saf.networks.distributions import masked_parameters, mixture_log_probs
-from sb3_saf.policies.base import TeamPolicy
-from sb3_saf.policies.maskable import TeamMaskablePolicy
+from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from sb3_saf.policies.saf import SAFCritic, SAFStates
 from sb3_saf.qplex.heads import q_values

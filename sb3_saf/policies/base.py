@@ -1,6 +1,6 @@
 """
-What the policies of SAF, MAPPO and IPPO share: their construction (``TeamPolicy``), and SB3's ActorCriticPolicy of them
-(``TeamActorCriticPolicy``).
+What the policies of SAF, MAPPO and IPPO share: ``TeamPolicy``, and what it becomes for PPO, A2C and TRPO
+(``TeamActorCriticPolicy``) and for MaskablePPO (``TeamMaskablePolicy``).
 
 The actor reads ``obs`` (and ``agent``, where it reads who acts); only the critic reads ``team``. Letters: B rows, N
 agents.
@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Final, NamedTuple, NoReturn
 import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -368,6 +369,22 @@ class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc
     """Policy for PPO, A2C and TRPO on rows of teams; see :class:`TeamPolicy` for the parameters."""
 
     normalizes_values: ClassVar[bool] = True
+
+
+class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore[misc]  # value_net: ours
+    """
+    Policy for MaskablePPO on rows of teams; see :class:`TeamPolicy` for the parameters.
+
+    sb3-contrib asks the environment for masks, ``venv.env_method("action_masks")``: one per row, that is, per agent.
+
+    Masks are (B, M): one flag per choice of an action, those of each dimension in turn (of a MultiBinary: off, on).
+    The actions of each policy of a pool are masked before they are mixed: likelihood and entropy are exactly those of
+    drawing a policy and then one of its allowed actions. A mask that allows nothing leaves the actions equally likely.
+    Where observations have masks, too, an action must be allowed by both.
+    """
+
+    #: There are no masks for Box actions, so nothing reads it.
+    log_std_init: float = 0.0
 
 
 def _refuse(use_sde: bool, share_features_extractor: bool) -> None:

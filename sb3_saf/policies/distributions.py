@@ -6,7 +6,6 @@ Letters: B rows, U policies, P parameters, D action dimensions.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any, ClassVar, cast
 
 import torch as th
@@ -102,16 +101,9 @@ def mixture_of(action_space: spaces.Space[Any], log_weights: th.Tensor, paramete
 class _FromPool(Distribution):
     """What SB3 asks of a distribution beside its mathematics."""
 
-    def __init__(self) -> None:
-        super().__init__()
-
     def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
         """Not here: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
         raise NotImplementedError("the parameters of a pool's distribution come from sb3_saf.networks.actor.PolicyPool")
-
-    @abstractmethod
-    def proba_distribution(self, *args: Any, **kwargs: Any) -> Any:
-        """Set the parameters."""
 
     def actions_from_params(self, *args: Any, deterministic: bool = False, **kwargs: Any) -> th.Tensor:
         """Set the parameters (see ``proba_distribution``) and act."""

@@ -10,8 +10,7 @@ from stable_baselines3 import PPO
 
 from sb3_saf.networks.critic import OwnValueHead
 from sb3_saf.networks.layers import NetworkSpec
-from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.maskable import TeamMaskablePolicy
+from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.parts import AlgorithmSpec, Declaration, PaperTable, TeamParts, team_policies
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 

@@ -19,9 +19,8 @@ from sb3_saf.networks.critic import (
     TeamStates,
 )
 from sb3_saf.networks.layers import NetworkSpec, gather
-from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.extractors import ObservationEncoder
-from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.parts import (
     AlgorithmSpec,
     CriticInput,

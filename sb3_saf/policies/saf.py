@@ -14,9 +14,8 @@ from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
 from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
 from sb3_saf.networks.layers import NetworkSpec, gather, mlp
-from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.mappo import MAPPOParts
-from sb3_saf.policies.maskable import TeamMaskablePolicy
 from sb3_saf.policies.parts import (
     AlgorithmSpec,
     CriticInput,
