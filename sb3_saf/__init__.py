@@ -10,8 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from typing import NoReturn
 
+from sb3_saf.errors import ExportError
 from sb3_saf.export.actor import Actor
-from sb3_saf.export.errors import ExportError
 
 
 def _is_installed(name: str) -> bool:

@@ -14,7 +14,7 @@ import yaml
 from sb3_saf.export.weights import _entry, _tensors
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.callbacks import SeededEvalCallback
-from sb3_saf.training.devices import check_device
+from sb3_saf.training.commands import check_device
 from sb3_saf.training.settings import load_settings
 
 ENV = "TeamTogether-v0"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.training.run import CHECKPOINTS, RunOptions, Training, load_parameters, train
 from sb3_saf.training.settings import Settings, load_settings
+from tests.test_training_commands import equal, weights
 
 ENV = "TeamTogether-v0"
 
@@ -19,14 +19,6 @@ ENV = "TeamTogether-v0"
 @pytest.fixture(scope="module")
 def settings() -> Settings:
     return load_settings("saf", ENV, "smoke")
-
-
-def weights(model: Any) -> dict[str, th.Tensor]:
-    return {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
-
-
-def equal(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:
-    return one.keys() == other.keys() and all(one[name].equal(other[name]) for name in one)
 
 
 @pytest.fixture(scope="module")

@@ -194,7 +194,7 @@ def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
     ("text", "message"),
     [
         ("default: {n_envs: 2", "not valid YAML"),
-        ("- 1", "must map 'default'"),
+        ("- 1", r"must map 'default' and environment ids to settings, got \[1\]"),
         ("", "must map 'default'"),
         ("default: 3", "'default' must map names to values"),
         ("default: {n_envs: 2, n_envs: 3}", "'n_envs' is there twice"),
@@ -202,6 +202,9 @@ def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
         ("default: {sizes: 3}", "'sizes' must map"),
         ("TeamTogeter-v0: {}", "did you mean 'TeamTogether-v0'"),
         ("default: {n_env: 2}", "did you mean 'n_envs'"),
+        ("base: sfa", r"unknown base 'sfa' \(did you mean 'saf'\?\)"),
+        ("a: &a {x: 1}\ndefault: {<<: [*a, *a]}", r"merge keys \(<<\) are not supported"),
+        ("#" * 300_000, "it has more than 200,000 bytes"),
         ("default: {n_envs: !!python/object/apply:os.getcwd []}", "not valid YAML"),
     ],
 )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import platform
 import warnings
-from importlib.metadata import PackageNotFoundError, version
 
+import numpy as np
+import stable_baselines3
 import torch as th
 
 from sb3_saf.checkpoints.checks import check_text, refused
@@ -13,22 +14,17 @@ from sb3_saf.checkpoints.data import Tree
 
 
 def software() -> dict[str, str]:
-    """Versions and the number of threads."""
+    """Return versions and the number of threads."""
+    from sb3_saf import __version__  # the package imports this module
+
     return {
-        "sb3_saf": _version("sb3-saf"),
-        "stable_baselines3": _version("stable-baselines3"),
+        "sb3_saf": __version__,
+        "stable_baselines3": stable_baselines3.__version__,
         "torch": th.__version__,
-        "numpy": _version("numpy"),
+        "numpy": np.__version__,
         "processor": platform.machine(),
         "torch threads": str(th.get_num_threads()),
     }
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:  # run from a checkout that was never installed
-        return "0+unknown"
 
 
 def check_software(saved: Tree) -> None:

@@ -27,9 +27,9 @@ from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import plain, read_json, write_json
 from sb3_saf.experiments.grid import Cell, RunConfig
 from sb3_saf.training.commands import option_words
+from sb3_saf.training.folders import software_versions
 from sb3_saf.training.run import CHECKPOINTS, RunOptions, load_parameters, train
 from sb3_saf.training.seeds import evaluation_seed
-from sb3_saf.training.versions import software_versions
 
 #: Points of a learning curve at most.
 CURVE_POINTS: Final = 100

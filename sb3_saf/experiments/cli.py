@@ -19,8 +19,7 @@ from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.page import PROGRAM
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.commands import USAGE_ERROR, KeyValues, OneLineParser
-from sb3_saf.training.devices import check_device
+from sb3_saf.training.commands import USAGE_ERROR, KeyValues, OneLineParser, check_device
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.seeds import check_seed
 from sb3_saf.training.yaml_files import SIZES, Size

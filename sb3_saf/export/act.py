@@ -30,22 +30,16 @@ Array = npt.NDArray[Any]
 
 class Memory:
     """
-    What an actor remembers of an episode: the state of its LSTM, zeros at first. Make a new one for each episode.
+    What an actor remembers of an episode: hidden and cell state of its LSTM, (layers, K, H), zeros at first.
 
-    :param hidden: (layers, K, H); None for zeros
-    :param cell: (layers, K, H); None for zeros
+    Make a new one for each episode.
     """
 
     def __init__(self, hidden: Array | None = None, cell: Array | None = None):
         self.hidden, self.cell = hidden, cell
 
     def arrays(self, net: dict[str, Any], n_rows: int) -> tuple[Array, Array]:
-        """
-        Give hidden and cell state, (layers, K, H) each.
-
-        :param net: ``"memory"`` of ``actor.json``
-        :param n_rows: K, as many as at the last step
-        """
+        """Return hidden and cell state, (layers, K, H) each; ``net`` is ``"memory"`` of ``actor.json``."""
         shape = (net["n_layers"], n_rows, net["hidden_size"])
         zeros = np.zeros(shape, np.float32)
         hidden, cell = (zeros if part is None else part for part in (self.hidden, self.cell))
@@ -78,13 +72,11 @@ def as_batch(observation: Any, space: dict[str, Any]) -> tuple[Array, bool]:
 
 def as_masks(action_mask: Any, manifest: dict[str, Any], n_rows: int) -> Array | None:
     """
-    Check masks of actions.
+    Check masks of actions; a ValueError says if they are missing, not wanted, of another shape, or allow nothing.
 
     :param action_mask: (M,) for one observation, (K, M) for a batch; or None
     :param manifest: ``"action"`` and ``"action_mask"`` as in ``actor.json``
-    :param n_rows: K
     :return: (K, M) bool, or None for none
-    :raises ValueError: if masks are missing, not wanted, of another shape, or allow nothing where something must be
     """
     wanted = manifest["action_mask"]
     n_choices = sum(manifest["action"]["choices"])
@@ -111,13 +103,12 @@ def as_masks(action_mask: Any, manifest: dict[str, Any], n_rows: int) -> Array |
 
 def feeds(session: Any, known: dict[str, Array], rng: np.random.Generator | None) -> dict[str, Array]:
     """
-    Give every input of the graph a value.
+    Give every input of the graph a value: those that are known, noise, everything allowed, and zeros.
 
     :param session: onnxruntime's
     :param known: inputs by name, ``"observation"`` among them
-    :param rng: where noise comes from: inputs are called by the generator's method and what it is for, as
-        ``gumbel_policy`` or ``normal_action``. None for zeros
-    :return: ``known`` and the others: noise, everything allowed, and zeros
+    :param rng: where noise comes from, by the method that an input's name begins with, as ``gumbel_policy`` or
+        ``normal_action``; None for zeros
     """
     rows, values = len(known["observation"]), dict(known)
     for entry in session.get_inputs():

@@ -1,8 +1,7 @@
 """
 An actor from files: one agent's part of a trained team.
 
-This module and what it imports use neither Stable-Baselines3 nor Gymnasium, so that ``sb3_saf.Actor`` also works where
-these are not installed.
+This module and what it imports use neither Stable-Baselines3 nor Gymnasium: ``sb3_saf.Actor`` works without them.
 """
 
 from __future__ import annotations
@@ -77,11 +76,7 @@ class Actor:
         return self.manifest.memory is not None
 
     def new_memory(self) -> Memory:
-        """
-        Make what an agent remembers at the start of an episode: nothing. :meth:`act` keeps it up to date.
-
-        :raises ValueError: if the actor does not remember
-        """
+        """Make what an agent remembers at the start of an episode: nothing. :meth:`act` keeps it up to date."""
         if not self.has_memory:
             raise ValueError(f"{self.manifest.policy} acts on single observations and has no memory; leave memory out")
         return Memory()
@@ -122,12 +117,9 @@ class Actor:
 
     def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Compute the probability of every action, for discrete actions.
+        Return the probability of every action, (A,) or (K, A) for a batch, for discrete actions.
 
-        :param observation: see :meth:`act`
-        :param action_mask: see :meth:`act`
-        :param memory: see :meth:`act`; it stays as it is
-        :return: (A,), or (K, A) for a batch
+        Arguments as of :meth:`act`; the memory stays as it is.
         """
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()
@@ -138,14 +130,10 @@ class Actor:
 
     def log_prob(self, observation: Any, action: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Compute the log-likelihood of actions: that of drawing a policy of the pool by its weight, and the action from
-        it.
+        Return the log-likelihood of actions, () or (K,) for a batch: of drawing a policy of the pool by its weight, and
+        the action from it.
 
-        :param observation: see :meth:`act`
-        :param action: one action, or as many as there are observations
-        :param action_mask: see :meth:`act`
-        :param memory: see :meth:`act`; it stays as it is
-        :return: (), or (K,) for a batch
+        Arguments as of :meth:`act`; the memory stays as it is.
         """
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()
@@ -161,7 +149,7 @@ class Actor:
             raise ValueError(f"{self.manifest.policy} has values of actions and takes the best: no action is drawn")
 
     def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[Inputs, bool]:
-        """What the runtime reads, checked, and whether a batch came."""
+        """Return what the runtime reads, checked, and whether a batch came."""
         batch, is_batch = self._batch(observation)
         mask = as_masks(action_mask, self._masks, len(batch))
         return Inputs(batch, mask, self._states(memory, len(batch))), is_batch
@@ -194,7 +182,7 @@ class Actor:
 
 
 def _is_picture(array: Array, codes: SpaceSpec) -> bool:
-    """Whether an array is pixels, one picture or a batch, where tile codes are expected."""
+    """Return whether an array is pixels, one picture or a batch, where tile codes are expected."""
     channels, height, width = codes.picture_shape
     return array.ndim in (3, 4) and array.shape[-3:] in ((height, width, channels), (channels, height, width))
 
@@ -232,12 +220,12 @@ def _checked_agent(manifest: Manifest, agent: int | None) -> int | None:
 
 
 def _plain(space: SpaceSpec) -> dict[str, Any]:
-    """A space as ``act.py`` finds it in the file."""
+    """Return a space as ``act.py`` finds it in the file."""
     return {"shape": space.shape, "dtype": space.dtype, "choices": space.choices, "picture": space.picture}
 
 
 def _can_become(array: Array, dtype: np.dtype[Any]) -> bool:
-    """Whether numbers keep their meaning: any number may become a float, others must stay the same."""
+    """Return whether numbers keep their meaning: any number may become a float, others must stay the same."""
     if array.dtype.kind not in "biuf":
         return False
     if dtype.kind == "f" or np.can_cast(array.dtype, dtype):

@@ -1,4 +1,4 @@
-"""Whether an exported network gives the model's numbers."""
+"""Check that an exported network gives the model's numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import torch as th
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import MemoryNet
 from sb3_saf.export.network import AgentNetwork, States
 from sb3_saf.policies.base import TeamPolicy
@@ -38,11 +38,7 @@ def some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str,
 
 
 def check_network(policy: ExportablePolicy, network: AgentNetwork, inputs: dict[str, th.Tensor]) -> None:
-    """
-    Compare the exported network with the model.
-
-    :raises ExportError: if they differ by more than rounding does
-    """
+    """Compare the exported network with the model; an ExportError if they differ by more than rounding does."""
     was_training = policy.training
     policy.set_training_mode(False)
     with th.no_grad():
@@ -55,7 +51,7 @@ def check_network(policy: ExportablePolicy, network: AgentNetwork, inputs: dict[
 
 
 def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> States:
-    """What the model's own actor gives, and what it remembers then."""
+    """Return what the model's own actor gives, and what it remembers then."""
     latent = policy.extract_features(inputs["observation"])
     states: States = ()
     if isinstance(policy, TeamRecurrentPolicy):
@@ -64,10 +60,6 @@ def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> States:
 
 
 def check_close(found: th.Tensor, expected: th.Tensor, otherwise: str) -> None:
-    """
-    Compare outputs.
-
-    :raises ExportError: if they differ by more than rounding does
-    """
+    """Compare outputs; an ExportError if they differ by more than rounding does."""
     if found.shape != expected.shape or not th.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
         raise ExportError(f"the exported network does not give the model's numbers: {otherwise}")

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import DATA_FILES, FORMAT, MANIFEST_FILE, SCRIPT_FILE, DataFile
 
 #: All that a folder of an export holds. Python leaves the cache where ``act.py`` was imported.
@@ -21,9 +21,7 @@ def read_limited(path: Path, limit: int) -> bytes:
     """
     Read a file that may be anything.
 
-    :param path: the file
-    :param limit: bytes that it may have
-    :raises ExportError: if it is missing, no regular file (reading a pipe would wait for ever) or too long
+    :raises ExportError: if it is missing, no regular file (reading a pipe would wait for ever) or longer than the limit
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
@@ -38,13 +36,7 @@ def read_limited(path: Path, limit: int) -> bytes:
 
 
 def read_checked(path: Path, expected: DataFile) -> bytes:
-    """
-    Read a file and compare it with its description.
-
-    :param path: the file
-    :param expected: what the manifest says
-    :raises ExportError: if they differ
-    """
+    """Read a file and compare it with its description in the manifest."""
     data = read_limited(path, expected.size)
     if DataFile.of(data) != expected:
         raise ExportError(
@@ -56,14 +48,10 @@ def read_checked(path: Path, expected: DataFile) -> bytes:
 
 def write_folder(folder: Path, files: Mapping[str, bytes], overwrite: bool) -> None:
     """
-    Write a folder whole or not at all.
+    Write a folder of files by name, whole or not at all.
 
-    Files go to a new folder beside it, which then takes its name. What was there before is removed last.
-
-    :param folder: where to
-    :param files: content by name
-    :param overwrite: whether to replace a folder that is not an export, with everything in it
-    :raises ExportError: if something is there that is not to be replaced
+    Files go to a new folder beside it, which then takes its name. What was there before is removed last; ``overwrite``
+    replaces a folder that is not an export, with everything in it.
     """
     target = folder.expanduser().resolve()
     _check_replaceable(target, overwrite)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.errors import ExportError
 from sb3_saf.networks.spaces import MAX_SIZE, Size, SpaceSpec
 
 FORMAT: Final = "sb3_saf.actor"
@@ -119,12 +119,7 @@ class MemoryNet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DataFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """
-    A file beside the manifest.
-
-    :param size: its length in bytes
-    :param sha256: its checksum
-    """
+    """A file beside the manifest: its length in bytes and its checksum."""
 
     size: Annotated[int, Meta(ge=1, le=1 << 31)]
     sha256: Text
@@ -175,17 +170,13 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.action.kind == "discrete" and self.selection != "greedy"
 
     def to_json(self) -> str:
-        """Give the text of the file, its own checksum included."""
+        """Return the text of the file, its own checksum included."""
         entries = {"format": FORMAT, **msgspec.to_builtins(self)}
         return json.dumps({**entries, "checksum": checksum(entries)}, indent=1, allow_nan=False) + "\n"
 
     @classmethod
     def from_json(cls, text: bytes) -> Manifest:
-        """
-        Read and check.
-
-        :raises ExportError: for anything that :meth:`to_json` would not have written
-        """
+        """Read and check; whatever :meth:`to_json` would not have written is an ExportError."""
         try:
             entries = msgspec.json.decode(text)
             stated = _checked_format(entries).pop("checksum", None)
@@ -217,7 +208,7 @@ def refuse(message: str, cause: Exception | None = None) -> NoReturn:
 
 
 def checksum(entries: Any) -> str:
-    """SHA-256 of a manifest's entries, however they are laid out in the file."""
+    """Return the SHA-256 of a manifest's entries, however they are laid out in the file."""
     try:
         return hashlib.sha256(json.dumps(entries, sort_keys=True).encode("utf-8")).hexdigest()
     except (ValueError, TypeError, RecursionError) as error:

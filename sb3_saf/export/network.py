@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import nn
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import (
     MANIFEST_FILE,
     WEIGHTS_FILE,
@@ -48,20 +48,14 @@ ATLAS: Final = "encoder.pixels.atlas"
 
 
 class RawEncoder(nn.Module):
-    """
-    An encoder that reads raw observations.
-
-    :param encoder: reads preprocessed observations
-    :param space: of one own observation
-    :param divide_by_255: whether pictures of bytes are scaled to [0, 1]
-    """
+    """An encoder that reads raw observations of a space; pictures of bytes may be scaled to [0, 1]."""
 
     def __init__(self, encoder: nn.Module, space: SpaceSpec, divide_by_255: bool):
         super().__init__()
         self.encoder, self.space, self.divide_by_255 = encoder, space, divide_by_255
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
-        """(K, *shape) to (K, d)."""
+        """Encode (K, *shape) as (K, d)."""
         features: th.Tensor = self.encoder(preprocess(observation, self.space, self.divide_by_255))
         return features
 
@@ -120,12 +114,7 @@ class AgentNetwork(nn.Module):
 
     @classmethod
     def of(cls, manifest: Manifest, atlas: Array | None) -> AgentNetwork:
-        """
-        Make the network that a manifest describes, with weights yet to be loaded.
-
-        :param manifest: of an export that describes encoder and actor
-        :param atlas: pixels of tile codes, if observations are such
-        """
+        """Make the network of a manifest, with weights yet to be loaded; ``atlas`` has the pixels of tile codes."""
         encoder, actor, memory = manifest.encoder, manifest.actor, manifest.memory
         assert encoder is not None and actor is not None
         latent_dim = encoder.features_dim if memory is None else memory.hidden_size
@@ -155,12 +144,12 @@ class AgentNetwork(nn.Module):
         return self.actor.evaluate(latent, agent), states
 
     def tensors(self) -> dict[str, th.Tensor]:
-        """The weights under the names that files have."""
+        """Return the weights under the names that files have."""
         return {_name_in_file(name): tensor for name, tensor in self.state_dict().items()}
 
 
 def _name_in_file(name: str) -> str:
-    """Names of format version 2, which are shorter than those of the modules."""
+    """Return the name of format version 2, which is shorter than that of the module."""
     return name.replace("encoder.encoder.", "encoder.").replace("actor.head.heads.", "actor.heads.")
 
 
@@ -197,12 +186,10 @@ def decide(space: SpaceSpec, selection: str, output: PoolOutput, deterministic: 
 
 def load_network(manifest: Manifest, weights: bytes) -> tuple[AgentNetwork, Array | None]:
     """
-    Make the network that a manifest describes.
+    Make the network that a manifest describes from the content of a safetensors file.
 
     Sizes are compared with the file's before anything of these sizes is made.
 
-    :param manifest: of the export
-    :param weights: content of the safetensors file
     :return: the network, and the pixels of tile codes if observations are such
     :raises ExportError: if they do not fit each other
     """

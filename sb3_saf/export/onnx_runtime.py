@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_saf.errors import ExportError
 from sb3_saf.export.act import feeds
-from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import read_checked
 from sb3_saf.export.manifest import ONNX_FILE, Manifest
 from sb3_saf.export.runtime import Array, Inputs, Rng, Runtime, States
@@ -19,42 +19,35 @@ if TYPE_CHECKING:
     from sb3_saf.networks.actor import PoolOutput
 
 
-def make_onnx_runtime(folder: Path, manifest: Manifest, agent: int | None) -> Runtime:
-    """
-    Make what runs a graph.
+def make_session(data: bytes) -> Any:
+    """Return onnxruntime's session of a graph, on one thread of the CPU."""
+    import onnxruntime
 
-    :param folder: of the export
-    :param manifest: what it says
-    :param agent: index of the agent, where it matters who acts
-    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"], enable_fallback=0)
+
+
+def make_onnx_runtime(folder: Path, manifest: Manifest, agent: int | None) -> Runtime:
+    """Make what runs the graph of an export."""
     graph = Graph(folder, manifest, agent)
     return OnnxRuntime(graph) if manifest.format_version > 2 else _version_2(graph)
 
 
 class Graph:
-    """
-    A graph in onnxruntime, on one thread of the CPU, whose outputs are checked.
-
-    :param folder: of the export
-    :param manifest: what it says
-    :param agent: index of the agent, where it matters who acts
-    """
+    """A graph in onnxruntime, whose outputs are checked; ``agent`` where it matters who acts."""
 
     def __init__(self, folder: Path, manifest: Manifest, agent: int | None):
         try:
-            import onnxruntime
+            import onnxruntime  # noqa: F401
         except ImportError as error:
             raise ImportError('runtime="onnx" needs onnxruntime: pip install "sb3-saf[export]"') from error
         if ONNX_FILE not in manifest.files:
             raise ExportError(f'{folder} was exported without {ONNX_FILE}; load it with runtime="torch"')
         data = read_checked(folder / ONNX_FILE, manifest.files[ONNX_FILE])
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4
         try:
-            self.session = onnxruntime.InferenceSession(
-                data, options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )
+            self.session = make_session(data)
         except Exception as error:  # its errors have no common class but this
             raise ExportError(f"{ONNX_FILE} is not a valid ONNX file: {str(error)[:200]}") from error
         sizes = [size for entry in self.session.get_inputs() for size in entry.shape[1:] if isinstance(size, int)]
@@ -63,7 +56,7 @@ class Graph:
         self.manifest, self.agent = manifest, agent
 
     def known(self, inputs: Inputs) -> dict[str, Array]:
-        """Give the inputs of the graph that do not depend on what is asked."""
+        """Return the inputs of the graph that do not depend on what is asked."""
         known = {"observation": inputs.observation, **dict(zip(("hidden", "cell"), inputs.states, strict=False))}
         if inputs.action_mask is not None:
             known["action_mask"] = inputs.action_mask
@@ -72,13 +65,7 @@ class Graph:
         return known
 
     def run(self, names: list[str], values: dict[str, Array]) -> list[Array]:
-        """
-        Run the graph.
-
-        :param names: of outputs
-        :param values: of inputs
-        :raises ExportError: if the graph does not run, or gives NaN
-        """
+        """Return the named outputs; an ExportError if the graph does not run, or gives NaN."""
         try:
             outputs = [np.asarray(output) for output in self.session.run(names, values)]
         except Exception as error:
@@ -89,11 +76,7 @@ class Graph:
 
 
 class OnnxRuntime:
-    """
-    A graph that decides.
-
-    :param graph: of the current format version
-    """
+    """A graph of the current format version, which decides."""
 
     def __init__(self, graph: Graph):
         self.graph, self.manifest = graph, graph.manifest
@@ -137,7 +120,7 @@ class OnnxRuntime:
 
 
 def _atlas(graph: Graph) -> Array | None:
-    """The pixels of tile codes, which the graph's file has beside it."""
+    """Return the pixels of tile codes, which the graph's file has beside it."""
     shape = graph.manifest.observation.atlas
     text = graph.session.get_modelmeta().custom_metadata_map.get("atlas")
     if shape is None or text is None:
@@ -149,7 +132,7 @@ def _atlas(graph: Graph) -> Array | None:
 
 
 def _version_2(graph: Graph) -> Runtime:
-    """Graphs of format version 2 give weights and parameters of policies; torch decides."""
+    """Run graphs of format version 2, which give weights and parameters of policies; torch decides."""
     try:
         import torch as th
 

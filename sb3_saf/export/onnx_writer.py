@@ -11,9 +11,10 @@ from contextlib import contextmanager
 import torch as th
 from torch import nn
 
+from sb3_saf.errors import ExportError
 from sb3_saf.export.comparison import check_close
-from sb3_saf.export.errors import ExportError
 from sb3_saf.export.network import AgentNetwork, Array, decide
+from sb3_saf.export.onnx_runtime import make_session
 from sb3_saf.networks.actor import PoolOutput
 from sb3_saf.networks.distributions import (
     masked_parameters,
@@ -30,13 +31,7 @@ _NOISE = {"box": "normal", "multi_binary": "logistic", "discrete": "gumbel", "mu
 
 
 class DecidingNetwork(nn.Module):
-    """
-    An agent's network with its decisions; random numbers are inputs.
-
-    :param network: the agent's
-    :param space: the action space
-    :param selection: see ``sb3_saf.export.network.decide``
-    """
+    """An agent's network with its decisions in an action space; random numbers are inputs."""
 
     low: th.Tensor
     high: th.Tensor
@@ -49,12 +44,7 @@ class DecidingNetwork(nn.Module):
                 self.register_buffer(side, th.tensor(bound, dtype=th.float32).expand(space.shape).clone())
 
     def forward(self, inputs: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
-        """
-        Decide.
-
-        :param inputs: see :func:`onnx_bytes`
-        :return: outputs, see :func:`output_names`
-        """
+        """Return the outputs of :func:`output_names` for the inputs of :func:`onnx_bytes`."""
         states = (inputs["hidden"], inputs["cell"]) if "hidden" in inputs else ()
         output, states = self.network(inputs["observation"], inputs.get("agent"), states)
         if "action_mask" in inputs:
@@ -68,7 +58,7 @@ class DecidingNetwork(nn.Module):
         return likeliest, drawn, log_prob, *log_probs, *states
 
     def _drawn(self, output: PoolOutput, inputs: dict[str, th.Tensor]) -> th.Tensor:
-        """(K, D): noise makes draws of the largest: the policy, and then its choices."""
+        """Draw (K, D): noise makes draws of the largest: the policy, and then its choices."""
         policy = (output.log_weights + inputs["gumbel_policy"]).argmax(dim=1)
         parameters = policy_parameters(output.actions, policy)
         noise = inputs[f"{_NOISE[self.space.kind]}_action"]
@@ -81,19 +71,13 @@ class DecidingNetwork(nn.Module):
         return th.stack([part.argmax(dim=1) for part in parts], dim=1)
 
     def _in_space(self, chosen: th.Tensor) -> th.Tensor:
-        """(K, *shape): (K, D)."""
+        """Bring (K, D) into the space, (K, *shape)."""
         chosen = chosen.reshape(-1, *self.space.shape)
         return chosen if self.space.kind != "box" else th.minimum(th.maximum(chosen, self.low), self.high)
 
 
 def output_names(space: SpaceSpec, selection: str, has_memory: bool) -> list[str]:
-    """
-    Name the outputs of a graph.
-
-    :param space: the action space
-    :param selection: see ``sb3_saf.export.network.decide``
-    :param has_memory: whether there is an LSTM
-    """
+    """Name the outputs of a graph."""
     names = ["most_likely"]
     if selection != "greedy":
         names += ["drawn", "log_prob"] + (["log_probs"] if space.kind == "discrete" else [])
@@ -130,7 +114,7 @@ def onnx_bytes(
     :raises ExportError: if the network cannot be written as a graph, or the graph gives other numbers
     """
     try:
-        import onnxruntime
+        import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401 - torch's exporter is built on it
     except ImportError as error:
         raise ImportError(
@@ -141,10 +125,7 @@ def onnx_bytes(
     names = output_names(space, selection, network.memory is not None)
     metadata = {} if atlas is None else {"atlas": base64.b64encode(atlas.tobytes()).decode()}
     data = _written(deciding, inputs, names, metadata)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    found = session.run(names, {name: tensor.numpy() for name, tensor in inputs.items()})
+    found = make_session(data).run(names, {name: tensor.numpy() for name, tensor in inputs.items()})
     with th.no_grad():
         expected = deciding(inputs)
     for output, wanted in zip(found, expected, strict=True):
@@ -155,7 +136,7 @@ def onnx_bytes(
 def _more_inputs(
     network: AgentNetwork, space: SpaceSpec, selection: str, inputs: dict[str, th.Tensor], has_masks: bool
 ) -> dict[str, th.Tensor]:
-    """Examples of the inputs that only decisions read."""
+    """Return examples of the inputs that only decisions read."""
     n_rows = len(inputs["observation"])
     more = {"action_mask": th.ones(n_rows, sum(space.choices), dtype=th.bool)} if has_masks else {}
     if selection == "greedy":
@@ -202,7 +183,7 @@ def _written(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's messages about its own stages."""
+    """Silence the exporter's messages about its own stages."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

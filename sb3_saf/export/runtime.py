@@ -15,13 +15,7 @@ Rng: TypeAlias = int | np.random.Generator | None
 
 
 class Inputs(NamedTuple):
-    """
-    What an agent knows.
-
-    :param observation: (K, *shape) own observations
-    :param action_mask: (K, M) bool, legal choices; None if all are
-    :param states: what is remembered
-    """
+    """What an agent knows: (K, *shape) own observations, (K, M) legal choices, None if all are, and its memory."""
 
     observation: Array
     action_mask: Array | None
@@ -35,10 +29,10 @@ class Runtime(Protocol):
     atlas: Array | None
 
     def act(self, inputs: Inputs, deterministic: bool, rng: Rng) -> tuple[Array, States]:
-        """(K, *shape) actions, and what is remembered then."""
+        """Return (K, *shape) actions, and what is remembered then."""
 
     def log_probs(self, inputs: Inputs) -> Array:
-        """(K, A) log-probabilities of discrete actions."""
+        """Return (K, A) log-probabilities of discrete actions."""
 
     def log_prob(self, inputs: Inputs, actions: Array) -> Array:
-        """(K,) log-likelihoods of actions (K, D)."""
+        """Return (K,) log-likelihoods of actions (K, D)."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch as th
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.errors import ExportError
 from sb3_saf.export.files import read_checked
 from sb3_saf.export.manifest import WEIGHTS_FILE, Manifest
 from sb3_saf.export.network import decide, load_network
@@ -19,13 +19,7 @@ from sb3_saf.networks.distributions import masked_parameters, mixture_log_prob, 
 
 
 class TorchRuntime:
-    """
-    The network, on the CPU.
-
-    :param folder: of the export
-    :param manifest: what it says
-    :param agent: index of the agent, where it matters who acts
-    """
+    """The network of an export, on the CPU; ``agent`` where it matters who acts."""
 
     def __init__(self, folder: Path, manifest: Manifest, agent: int | None):
         if WEIGHTS_FILE not in manifest.files:

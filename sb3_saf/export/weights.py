@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.export.errors import ExportError
+from sb3_saf.errors import ExportError
 
 _ENTRY: Final = "policy.pth"
 #: What a file of tensors may be longer than the tensors.
@@ -43,7 +43,7 @@ def load_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -
 
 
 def _entry(path: Path, limit: int) -> bytes:
-    """The policy's file from a model's zip."""
+    """Return the policy's file in a model's zip."""
     if not path.is_file():
         raise ExportError(f"expected a model saved by Stable-Baselines3, found no file {path}")
     try:

@@ -11,13 +11,14 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from msgspec.structs import replace
 from safetensors.torch import save
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
+from sb3_saf.errors import ExportError
 from sb3_saf.export.comparison import ExportablePolicy, check_network, some_inputs
-from sb3_saf.export.errors import ExportError
 from sb3_saf.export.files import write_folder
 from sb3_saf.export.manifest import (
     MANIFEST_FILE,
@@ -104,7 +105,7 @@ def export_actors(
 
 
 def _tensors(network: AgentNetwork, observation: ObservationSpec) -> dict[str, th.Tensor]:
-    """What the file of weights has: the weights, and the pixels of tile codes, which an actor finds nowhere else."""
+    """Return the weights, and the pixels of tile codes, which an actor finds nowhere else."""
     tensors = {name: tensor.contiguous() for name, tensor in network.tensors().items()}
     return tensors if observation.atlas is None else tensors | {ATLAS: th.tensor(observation.atlas)}
 
@@ -158,7 +159,7 @@ class _Described(NamedTuple):
         )
 
     def network(self, policy: ExportablePolicy) -> AgentNetwork:
-        """The network with the policy's weights, on the CPU."""
+        """Make the network with the policy's weights, on the CPU."""
         encoder: nn.Module = _OwnExtractor(policy)
         if self.encoder is not None:
             inner = make_encoder(self.encoder, self.observation)
@@ -175,7 +176,7 @@ class _Described(NamedTuple):
         return AgentNetwork(encoder, memory, actor).requires_grad_(False).eval()
 
     def manifest(self, policy: ExportablePolicy, data: dict[str, DataFile]) -> Manifest:
-        """The manifest beside some files."""
+        """Make the manifest of some files."""
         from sb3_saf import __version__
 
         complete = WEIGHTS_FILE in data
@@ -205,7 +206,7 @@ class _OwnExtractor(nn.Module):
         self.extractor = copy.deepcopy(policy.features_extractor).cpu()
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) raw own observations to (K, d)."""
+        """Encode (K, *shape) raw own observations as (K, d)."""
         features: th.Tensor = self.extractor(preprocess_obs(observations, self.space, self.normalize_images))
         return features
 
@@ -220,7 +221,7 @@ def _selection(policy: ExportablePolicy) -> Selection | Literal["greedy"]:
 
 
 def _action_mask(policy: ExportablePolicy) -> Literal["none", "optional", "required"]:
-    """Whether the policy asks for masks: with each observation, or only if somebody has one."""
+    """Return whether the policy asks for masks: with each observation, or only if somebody has one."""
     if policy.team_spaces.action_mask is not None:
         return "required"
     return "optional" if isinstance(policy, TeamMaskablePolicy) else "none"
@@ -243,19 +244,17 @@ def _inner_encoder(policy: ExportablePolicy) -> nn.Module:
 
 
 def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
-    """None for an encoder that is not exactly one of ours: a subclass may do anything."""
+    """Describe the encoder; None for one that is not exactly one of ours: a subclass may do anything."""
     encoder, features_dim = _inner_encoder(policy), policy.features_dim
     divide = bool(policy.normalize_images and spec_of(policy.team_spaces.own).picture)
     if type(encoder) not in (PaperCNN, NatureEncoder, MLPEncoder, LightEncoder):
         return None
     net = EncoderNet(cast(EncoderName, type(encoder).__name__), features_dim, divide)
     if isinstance(encoder, MLPEncoder):
-        return EncoderNet(net.name, features_dim, divide, hidden=_hidden(encoder.net)[0])
+        return replace(net, hidden=_hidden(encoder.net)[0])
     if isinstance(encoder, LightEncoder):
-        return EncoderNet(
-            net.name,
-            features_dim,
-            divide,
+        return replace(
+            net,
             tile_size=int(encoder.tile_size),
             embedding_dim=encoder.embed.out_features,
             hidden=_hidden(encoder.net)[0],
@@ -281,7 +280,7 @@ def _describe_actor(policy: ExportablePolicy) -> ActorNet:
 
 
 def _hidden(net: nn.Sequential) -> tuple[int, ...]:
-    """Sizes of the hidden layers of an MLP."""
+    """Return the sizes of the hidden layers of an MLP."""
     return tuple(layer.out_features for layer in net if isinstance(layer, nn.Linear))[:-1]
 
 

@@ -13,11 +13,7 @@ ALGOS: Final[dict[str, AlgorithmSpec]] = COMMANDS
 
 
 def find_algorithm(algo: str) -> AlgorithmSpec:
-    """
-    Look up an algorithm.
-
-    :raises ValueError: for an unknown name, with the nearest one
-    """
+    """Return an algorithm; an unknown name is a ValueError that names the nearest one."""
     if algo not in ALGOS:
         raise unknown_name("algorithm", algo, ALGOS)
     return ALGOS[algo]

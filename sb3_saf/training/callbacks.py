@@ -31,13 +31,7 @@ def _game_steps(model: Any) -> int:
 
 
 class SeededEvalCallback(TeamEvalCallback):
-    """
-    ``TeamEvalCallback`` that leaves training as it would be without it, and evaluates the final policy, too.
-
-    :param args: as ``TeamEvalCallback``
-    :param seed: the run's seed
-    :param kwargs: as ``TeamEvalCallback``
-    """
+    """Evaluate, the final policy, too, with a seed of its own: training stays as it would be without."""
 
     def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -56,11 +50,7 @@ class SeededEvalCallback(TeamEvalCallback):
         return {"n_evaluations": self._n_evaluations, "evaluated_at": self._evaluated_at}
 
     def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
-        """
-        Go on from there.
-
-        :param state: from :meth:`checkpoint_state`
-        """
+        """Go on from there."""
         self._n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
 
     def _on_training_end(self) -> None:
@@ -92,27 +82,21 @@ class GameStepsProgressBar(ProgressBarCallback):
 
 
 class RemainingTime(BaseCallback):
-    """
-    Print, once, how long the rest of the training will take, as soon as the first rollouts tell.
-
-    :param verbose: 0 for silence
-    """
+    """Print, once, how long the rest of the training will take, as soon as the first rollouts tell."""
 
     def __init__(self, verbose: int = 1) -> None:
         super().__init__(verbose)
         self._n_rollouts = 0
-        self._started: tuple[float, int] | None = None
-        self._told = False
+        self._started = 0.0, 0
+        self._told = verbose == 0
 
     def _on_rollout_start(self) -> None:
         self._n_rollouts += 1
         now, steps = time.perf_counter(), _game_steps(self.model)
-        if self._started is None:
-            if self._n_rollouts > 1:  # the first one compiles and fills caches
-                self._started = now, steps
-            return
+        if self._n_rollouts == 2:  # the first one compiles and fills caches
+            self._started = now, steps
         seconds = now - self._started[0]
-        if self._told or self.verbose == 0 or self._n_rollouts < 2 + _MEASURED_ROLLOUTS or seconds < _MEASURED_SECONDS:
+        if self._told or self._n_rollouts < 2 + _MEASURED_ROLLOUTS or seconds < _MEASURED_SECONDS:
             return
         self._told = True
         rate = (steps - self._started[1]) / seconds
@@ -125,13 +109,7 @@ class RemainingTime(BaseCallback):
 
 
 class CheckpointInGameSteps(BaseCallback):
-    """
-    Save the model every so many game steps, as ``rl_model_<game steps>_steps.zip``.
-
-    :param save_freq: game steps between saved models, summed over all parallel games
-    :param folder: where to
-    :param verbose: 1 to print each file's name
-    """
+    """Save the model every ``save_freq`` game steps, of all games together, as ``rl_model_<game steps>_steps.zip``."""
 
     def __init__(self, save_freq: int, folder: str | Path, verbose: int = 0) -> None:
         super().__init__(verbose)

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+import torch as th
+
 from sb3_saf.training.environments import HOW_TO_NAME
 from sb3_saf.training.yaml_files import parse_value
 
@@ -24,11 +26,7 @@ class CommandError(Exception):
 
 @contextmanager
 def user_errors(*kinds: type[Exception]) -> Iterator[None]:
-    """
-    Turn errors that the user can put right into :class:`CommandError`: no traceback.
-
-    :param kinds: of errors; ValueError by default
-    """
+    """Turn errors that the user can put right (ValueError by default) into :class:`CommandError`: no traceback."""
     caught = kinds or (ValueError,)
     try:
         yield
@@ -77,24 +75,12 @@ class KeyValues(argparse.Action):
 
 
 def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
-    """
-    Return the words that give pairs to an option of :class:`KeyValues`.
-
-    :param option: such as ``"--env-kwargs"``
-    :param pairs: plain data
-    :return: empty if there are none
-    """
+    """Return the words that give pairs of plain data to an option of :class:`KeyValues`; none if there are no pairs."""
     return [option, *(f"{key}:{json.dumps(value)}" for key, value in pairs.items())] if pairs else []
 
 
-def run_command(program: str, command: Callable[[], None]) -> None:
-    """
-    Run a command; errors for the user, and files that cannot be read or written, go to stderr as one line, with exit
-    code 2.
-
-    :param program: what the user typed, for the line
-    :param command: the command
-    """
+def run_command(program: str, command: Callable[[], object]) -> None:
+    """Run a command; errors for the user, and of files, are one line on stderr and exit code 2."""
     try:
         command()
         sys.stdout.flush()
@@ -109,11 +95,7 @@ def run_command(program: str, command: Callable[[], None]) -> None:
 
 
 def require(*modules: str) -> None:
-    """
-    Check that optional packages are installed.
-
-    :raises CommandError: with the command that installs them
-    """
+    """Check that optional packages are installed; else a :class:`CommandError` has the command that installs them."""
     for module in modules:
         try:
             importlib.import_module(module)
@@ -124,11 +106,7 @@ def require(*modules: str) -> None:
 
 
 def import_packages(packages: Sequence[str]) -> None:
-    """
-    Import the packages of ``--gym-packages``, which register environments.
-
-    :raises CommandError: if one cannot be imported
-    """
+    """Import the packages of ``--gym-packages``, which register environments."""
     for package in packages:
         try:
             importlib.import_module(package)
@@ -137,14 +115,39 @@ def import_packages(packages: Sequence[str]) -> None:
 
 
 def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -> None:
-    """
-    Add ``--env``, ``--env-kwargs`` and ``--gym-packages``.
-
-    :param parser: a parser or a group of it
-    :param of_level: help of ``--env-kwargs``
-    """
+    """Add ``--env``, ``--env-kwargs`` (with the help ``of_level``) and ``--gym-packages``."""
     parser.add_argument("--env", default="TeamTogether-v0", help=HOW_TO_NAME)
     parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help=of_level)
     parser.add_argument(
         "--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import, which register environments"
     )
+
+
+def check_device(device: str) -> str:
+    """
+    Return a device's name if the device is there; Stable-Baselines3 would silently train on the CPU.
+
+    :param device: as SB3 takes it: ``"auto"``, ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ...
+    :raises ValueError: with what is there
+    """
+    if device == "auto":
+        return device
+    try:
+        wanted = th.device(device)
+    except RuntimeError:
+        raise ValueError(f"--device must be auto, cpu, cuda, cuda:1 or another of torch's, got {device!r}") from None
+    if wanted.type == "cuda":
+        count = th.cuda.device_count() if th.cuda.is_available() else 0
+        if (wanted.index or 0) >= count:
+            raise ValueError(
+                f"--device {device} is not there: torch {th.__version__} sees {count or 'no'} CUDA device"
+                f"{'' if count == 1 else 's'}; take --device cpu or auto, or check the driver (nvidia-smi) and that "
+                "torch was built for CUDA (python -c 'import torch; print(torch.version.cuda)')"
+            )
+    elif wanted.type != "cpu":
+        try:
+            th.empty(1, device=wanted)
+        except (RuntimeError, NotImplementedError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"--device {device} cannot be used here ({reason}); take --device cpu or auto") from None
+    return device

@@ -35,26 +35,14 @@ PROGRAM: Final = "python -m sb3_saf.enjoy"
 
 @dataclass(frozen=True)
 class TrainedTeam:
-    """
-    A policy with the games that it plays.
-
-    :param settings: of the run, with the level to play
-    :param policy: with the weights of the run
-    :param path: of the model
-    """
+    """A policy, the settings of the games that it plays, and the file that its weights came from."""
 
     settings: Settings
     policy: BasePolicy
     path: Path
 
     def measure(self, n_episodes: int, seed: int, deterministic: bool) -> EvaluationResult:
-        """
-        Measure team returns over games that no run was trained on.
-
-        :param n_episodes: team episodes, each in a game of its own
-        :param seed: of games and actions
-        :param deterministic: whether to take the most likely actions
-        """
+        """Measure team returns over games that no run was trained on, each episode in a game of its own."""
         set_random_seed(seed)
         with closing(self.settings.make_env(seed, evaluation=True, n_envs=n_episodes)) as games:
             load_normalization(games, self.path.parent)
@@ -86,13 +74,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
-    """
-    Measure and show.
-
-    :param arguments: of the command line; None for those of this process
-    :return: the team returns
-    :raises CommandError: for what the user can put right
-    """
+    """Measure and show; return the team returns."""
     options = make_parser().parse_args(arguments)
     import_packages(options.gym_packages)
     if options.episodes < 1:
@@ -112,12 +94,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
 
 
 def load_team(options: argparse.Namespace) -> TrainedTeam:
-    """
-    Find a run, and make its policy. Weights are read as numbers: no code of a model's file is run.
-
-    :param options: of the command line
-    :raises ValueError: if there is no such run, or it does not fit
-    """
+    """Find a run, and make its policy. Weights are read as numbers: no code of a model's file is run."""
     find_algorithm(options.algo)
     environment = find_environment(options.env)
     which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
@@ -135,12 +112,7 @@ def load_team(options: argparse.Namespace) -> TrainedTeam:
 
 
 def make_policy(settings: Settings, path: Path) -> BasePolicy:
-    """
-    Make a policy with the weights of a model's file, which are read as numbers.
-
-    :param settings: that the model was trained with
-    :param path: of the model
-    """
+    """Make the policy of the settings with the weights of a model's file, which are read as numbers."""
     with closing(settings.make_env(0, n_envs=1)) as games:
         kwargs = settings.hyperparams.get("policy_kwargs", {})
         policy = settings.spec.policy_class(
@@ -156,13 +128,5 @@ def _no_learning(progress_remaining: float) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command.
-
-    :param arguments: of the command line; None for those of this process
-    """
-
-    def command() -> None:
-        enjoy(arguments)
-
-    run_command(PROGRAM, command)
+    """Run the command, with the arguments of this process by default."""
+    run_command(PROGRAM, lambda: enjoy(arguments))

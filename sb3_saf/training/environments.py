@@ -35,7 +35,7 @@ class TeamEnvironment:
     An environment by name.
 
     :param id: its name
-    :param make: a function that makes a game, with ``render_mode`` and parameters; None for HECOGrid
+    :param make: makes a game from ``render_mode`` and parameters; None for HECOGrid
     """
 
     id: str
@@ -62,11 +62,7 @@ class TeamEnvironment:
         return "rgb_array" if self.task else None
 
     def complete(self, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """
-        Check parameters of the game and add the defaults, where they are known.
-
-        :raises ValueError: if the game cannot be made
-        """
+        """Check parameters of the game and add the defaults, where they are known."""
         if self.task is None:
             return dict(env_kwargs)
         params = HECOGridParams.from_kwargs({**_HECOGRID_DEFAULTS, **env_kwargs})
@@ -74,11 +70,7 @@ class TeamEnvironment:
         return asdict(params)
 
     def count_agents(self, env_kwargs: Mapping[str, Any]) -> int:
-        """
-        Count the agents, N, by making a game.
-
-        :raises ValueError: if it cannot be made, or does not say who its agents are
-        """
+        """Count the agents, N, by making a game."""
         if self.task is not None:
             return int(env_kwargs["n_agents"])
         game = self.make_game(env_kwargs)
@@ -89,11 +81,7 @@ class TeamEnvironment:
         return len(agents)
 
     def make_game(self, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> Any:
-        """
-        Make one game.
-
-        :raises ValueError: if it refuses its parameters, or is no ParallelEnv
-        """
+        """Make one game; a ValueError says that it refuses its parameters, or is no ParallelEnv."""
         kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
         if self.make is None:
             assert self.task is not None
@@ -113,12 +101,7 @@ def folder_name(env_id: str) -> str:
 
 
 def find_environment(env_id: str) -> TeamEnvironment:
-    """
-    Look up an environment. Modules that it names are imported.
-
-    :param env_id: see ``HOW_TO_NAME``
-    :raises ValueError: if there is none of that name
-    """
+    """Look up an environment by a name as in ``HOW_TO_NAME``. Modules that it names are imported."""
     name = env_id.removeprefix(f"{HECOGRID}/") if isinstance(env_id, str) else str(env_id)
     if name in TASK_OF_ENV:
         return TeamEnvironment(name)
@@ -138,14 +121,7 @@ def _is_module(name: str) -> bool:
 
 
 def import_by_name(module: str, name: str, what: str) -> Any:
-    """
-    Import something callable.
-
-    :param module: dotted name
-    :param name: of what to take from it
-    :param what: who asks, for errors
-    :raises ValueError: if it is not there
-    """
+    """Import something callable from a module; ``what`` says in errors who asks."""
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, TypeError, ValueError) as error:

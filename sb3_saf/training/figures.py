@@ -55,13 +55,7 @@ TEAM_RETURN: Final = "team return (treasures)"
 
 
 class Style(NamedTuple):
-    """
-    How a method looks, the same in every figure.
-
-    :param colour: of lines and bars
-    :param line: style of lines
-    :param hatch: of bars
-    """
+    """How a method looks, the same in every figure."""
 
     colour: str
     line: str = "-"
@@ -69,11 +63,7 @@ class Style(NamedTuple):
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, Style]:
-    """
-    One style per method. Known methods always have theirs, those with memory the colour of those without.
-
-    :param methods: names, in any order
-    """
+    """Return one style per method. Known methods always have theirs, those with memory the colour of those without."""
     styles = {method: _style(method) for method in methods}
     taken = {_COLOURS["random"], *(style.colour for style in styles.values() if style is not None)}
     free = [colour for colour in _COLOURS.values() if colour not in taken] or list(_COLOURS.values())
@@ -91,7 +81,7 @@ def _style(method: str) -> Style | None:
 
 
 def _methods_of(table: pd.DataFrame) -> list[str]:
-    """Known ones first, in the order of the colours."""
+    """Return the methods of a table, known ones first, in the order of the colours."""
     known = list(_COLOURS)
     found = list(dict.fromkeys(table["method"]))
     return sorted(found, key=lambda method: known.index(method) if method in known else len(known))
@@ -115,7 +105,7 @@ def _figure(n_panels: int, height: float = 3.6) -> tuple[Figure, list[Axes]]:
 
 
 def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
-    """Title on top, one legend for all panels below, so that it covers no data."""
+    """Add the title on top, and one legend for all panels below, so that it covers no data."""
     entries: dict[str, Artist] = {}
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
@@ -133,7 +123,7 @@ def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
 
 
 def _start_at_zero(axes: Axes, values: Floats) -> None:
-    """Nobody collects less than nothing, whatever an interval of two seeds says."""
+    """Begin at 0 where no score is negative, whatever the interval of two seeds says."""
     if len(values) and values.min() >= 0:
         axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
 
@@ -146,12 +136,10 @@ def draw_curves(
     references: Mapping[str, float] | None = None,
 ) -> Figure:
     """
-    Learning curves: mean and 95 % interval (Student's t) over seeds.
+    Draw learning curves: mean and 95 % interval (Student's t) over seeds.
 
     :param runs: columns ``method``, ``seed``, ``game_steps``, ``score``
-    :param title: of the figure
     :param panel: column whose values get a panel each, for instance ``"task"``
-    :param y_label: what a score is
     :param references: names and scores of horizontal lines, for instance of scripted teams
     """
     require_columns(runs, CURVE_COLUMNS)
@@ -183,14 +171,12 @@ def draw_levels(
     y_label: str = TEAM_RETURN,
 ) -> Figure:
     """
-    Bars of the return against a level: mean and 95 % interval (Student's t) over seeds.
+    Draw bars of the return against a level: mean and 95 % interval (Student's t) over seeds.
 
     :param results: columns ``method``, ``seed``, ``score`` and the column named by ``level``; several rows of a run
         (episodes) are averaged
     :param level: for instance ``"coordination"``
-    :param title: of the figure
     :param panel: column whose values get a panel each, for instance ``"task"``
-    :param y_label: what a score is
     """
     require_columns(results, ("method", "seed", level, "score"))
     panels = _panels(results, panel)
@@ -204,7 +190,7 @@ def draw_levels(
 
 
 def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, Style]) -> None:
-    """The bars of one panel: side by side at each level, in the order of the methods."""
+    """Draw the bars of one panel: side by side at each level, in the order of the methods."""
     methods, levels = _methods_of(rows), sorted(rows[level].unique())
     width = min(0.3, 0.8 / len(methods))
     for index, method in enumerate(methods):
@@ -228,11 +214,9 @@ def draw_aggregates(
     scores: Mapping[str, Floats], title: str | None = None, x_label: str = "normalised score"
 ) -> Figure:
     """
-    Interquartile means and performance profiles, both with stratified bootstrap intervals (rliable).
+    Draw interquartile means and performance profiles, both with stratified bootstrap intervals (rliable).
 
     :param scores: (S, K) scores of each method on S seeds and K tasks, normalised, 0 to 1
-    :param title: of the figure
-    :param x_label: what a score is, with its unit
     """
     methods = _methods_of(pd.DataFrame({"method": list(scores)}))
     styles = method_styles(methods)

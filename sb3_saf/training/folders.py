@@ -1,13 +1,18 @@
 """
-Log folders as RL-Zoo3 lays them out, so that its plotting commands read them: a run is ``FOLDER/ALGO/ENV_NUMBER``, with
-the model ``ENV.zip`` and, in ``ENV/``, what it was made with.
+Log folders as RL-Zoo3 lays them out, so that its plotting commands read them.
+
+A run is ``FOLDER/ALGO/NAME_NUMBER``, FOLDER what ``-f`` gives and NAME the environment's in file names, with the model
+``NAME.zip`` and, in ``NAME/``, what it was made with.
 """
 
 from __future__ import annotations
 
+import platform
 import re
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,49 +23,34 @@ from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.training.environments import TeamEnvironment
 from sb3_saf.training.run import CHECKPOINTS
 from sb3_saf.training.settings import Settings
-from sb3_saf.training.versions import software_versions
 from sb3_saf.training.yaml_files import read_plain_file
 
 #: Options that, beside the settings, decide what a run leaves; ``config.yml`` does not have them.
 _DECIDING: Final = ("eval_freq", "eval_episodes", "n_eval_envs", "eval_env_kwargs", "deterministic_eval", "save_freq")
+#: Whose versions can change a result.
+_PACKAGES: Final = (
+    *("sb3-saf", "stable-baselines3", "sb3-contrib", "rl_zoo3", "optuna", "torch"),
+    *("numpy", "numba", "gymnasium", "pettingzoo", "supersuit"),
+)
 _UUID: Final = r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}"
 _SAVED_MODEL: Final = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
 def run_number(folder: Path, name: str) -> int | None:
-    """
-    Read the number of a run from the name of its folder.
-
-    :param folder: of the run
-    :param name: of the environment, as it is in folders
-    :return: None if it is no run of that environment
-    """
+    """Read the number of a run from its folder's name; None if it is no run of that environment."""
     found = re.fullmatch(rf"{re.escape(name)}_(\d+)(?:_{_UUID})?", folder.name)
     return int(found[1]) if found else None
 
 
 def runs_of(log_folder: Path, algo: str, name: str) -> list[tuple[int, Path]]:
-    """
-    List the runs of an algorithm on an environment, with their numbers, in order.
-
-    :param log_folder: as given with ``-f``
-    :param algo: name in ``ALGOS``
-    :param name: of the environment, as it is in folders
-    """
+    """List the runs of an algorithm on an environment, with their numbers, in order."""
     folder = log_folder / algo
     runs = [(run_number(run, name), run) for run in folder.iterdir()] if folder.is_dir() else []
     return sorted((number, run) for number, run in runs if number is not None and run.is_dir())
 
 
 def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = False) -> Path:
-    """
-    Make the folder of a new run, which no other process has.
-
-    :param log_folder: as given with ``-f``
-    :param algo: name in ``ALGOS``
-    :param name: of the environment, as it is in folders
-    :param unique: whether to add a unique id to the folder's name
-    """
+    """Make the folder of a new run, which no other process has; ``unique`` adds a unique id to its name."""
     ending = f"_{uuid.uuid4()}" if unique else ""
     while True:
         number = max((number for number, _ in runs_of(log_folder, algo, name)), default=0) + 1
@@ -75,15 +65,7 @@ def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = Fa
 
 
 def write_run(folder: Path, settings: Settings, seed: int, options: Mapping[str, Any], command: str) -> None:
-    """
-    Write what a run is made with: ``config.yml``, ``args.yml``, ``versions.yml``, ``command.txt``.
-
-    :param folder: of the run
-    :param settings: all of them, resolved
-    :param seed: of the run
-    :param options: as given
-    :param command: as given
-    """
+    """Write what a run is made with: ``config.yml``, ``args.yml``, ``versions.yml``, ``command.txt``."""
     place = folder / settings.environment.folder_name
     place.mkdir(exist_ok=True)
     contents = {
@@ -96,14 +78,17 @@ def write_run(folder: Path, settings: Settings, seed: int, options: Mapping[str,
     (place / "command.txt").write_text(command + "\n", encoding="utf-8")
 
 
-def read_run(folder: Path, name: str) -> dict[str, Any]:
-    """
-    Read the settings of a run, ``config.yml``.
+def software_versions() -> dict[str, str]:
+    """Return the versions of Python, the system, and every installed package that can change a result."""
+    versions = {"python": platform.python_version(), "system": platform.platform()}
+    for package in _PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    return versions
 
-    :param folder: of the run
-    :param name: of the environment, as it is in folders
-    :raises ValueError: if the folder is not that of a run
-    """
+
+def read_run(folder: Path, name: str) -> dict[str, Any]:
+    """Read the settings of a run, ``config.yml``; a ValueError says that the folder is not that of a run."""
     path = folder / name / "config.yml"
     if not path.is_file():
         raise ValueError(f"{folder} is no run of sb3_saf.train: there is no {path}")
@@ -117,12 +102,10 @@ def find_unfinished(
     settings: Settings, seed: int | None, options: Mapping[str, Any], log_folder: Path
 ) -> tuple[Path, int] | None:
     """
-    Find the latest run of the same settings that has checkpoints left, as finished ones have not, and is not at work.
+    Find the latest run of the same settings and options that another process is not at work on and that has checkpoints
+    left, as finished ones have not.
 
-    :param settings: of the run
     :param seed: of the run; None for any
-    :param options: as given
-    :param log_folder: as given with ``-f``
     :return: its folder and seed; None if there is none
     """
     name, wanted = settings.environment.folder_name, _plain(settings.as_dict())
@@ -139,7 +122,7 @@ def find_unfinished(
 
 
 def _plain(content: object) -> Any:
-    """As YAML gives it back: tuples are lists."""
+    """Return content as YAML gives it back: tuples are lists."""
     if isinstance(content, Mapping):
         return {str(key): _plain(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
@@ -165,9 +148,6 @@ def find_model(
     """
     Find a trained model.
 
-    :param log_folder: as given with ``-f``
-    :param algo: name in ``ALGOS``
-    :param environment: that it was trained on
     :param number: of the run; 0 for the latest
     :param which: None for the model at the end, "best", "last" for the last saved one, or the game steps of a saved one
     :return: the run's folder, and the model's file

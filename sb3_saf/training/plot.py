@@ -47,12 +47,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def plot(arguments: Sequence[str] | None = None) -> None:
-    """
-    Draw a figure.
-
-    :param arguments: of the command line; None for those of this process
-    :raises CommandError: for what the user can put right
-    """
+    """Draw a figure and print its path."""
     options = make_parser().parse_args(arguments)
     if options.output.suffix not in FORMATS:
         raise CommandError(f"--output must end with {', '.join(FORMATS)}, got {str(options.output)!r}")
@@ -97,9 +92,5 @@ def _draw(options: argparse.Namespace) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command.
-
-    :param arguments: of the command line; None for those of this process
-    """
+    """Run the command, with the arguments of this process by default."""
     run_command(PROGRAM, lambda: plot(arguments))

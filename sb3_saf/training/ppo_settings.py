@@ -1,4 +1,4 @@
-"""Good arguments for PPO on teams, for those who write their own scripts."""
+"""Arguments with which PPO learns well on teams, for scripts."""
 
 from __future__ import annotations
 

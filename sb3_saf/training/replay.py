@@ -8,8 +8,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
+from sb3_saf.errors import ExportError
 from sb3_saf.export.actor import Actor
-from sb3_saf.export.errors import ExportError
 from sb3_saf.inspection.replay import replay
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import (
@@ -21,7 +21,7 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.enjoy import TrainedTeam, make_policy
+from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import read_run
 from sb3_saf.training.seeds import check_seed, evaluation_seed
 from sb3_saf.training.settings import Settings, load_settings, saved_settings
@@ -54,20 +54,14 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def write_page(arguments: Sequence[str] | None = None) -> Path:
-    """
-    Write the page.
-
-    :param arguments: of the command line; None for those of this process
-    :return: the page
-    :raises CommandError: for what the user can put right
-    """
+    """Write the page and return its path."""
     options = make_parser().parse_args(arguments)
     import_packages(options.gym_packages)
     with user_errors(ValueError, OSError, ExportError):
         seed = evaluation_seed(check_seed(options.seed))
         settings = [_settings_of(path, options) for path in options.model]
         players: dict[str, Any] = {
-            name: Actor.load(path) if path.is_dir() else TrainedTeam(own, make_policy(own, path), path).policy
+            name: Actor.load(path) if path.is_dir() else make_policy(own, path)
             for name, path, own in zip(_names(options.model), options.model, settings, strict=True)
         }
         render_mode = None if settings[0].environment.task else "rgb_array"  # HECOGrid is drawn from its state
@@ -102,9 +96,5 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command.
-
-    :param arguments: of the command line; None for those of this process
-    """
+    """Run the command, with the arguments of this process by default."""
     run_command(PROGRAM, lambda: print(write_page(arguments)))

@@ -115,13 +115,9 @@ def train(
 
 class Training:
     """
-    Games, model and callbacks of one run, ready to learn. A context manager that closes the games.
+    Games, model and callbacks of one run, ready to learn; arguments as of :func:`train`.
 
-    :param settings: as :func:`train`
-    :param seed: as :func:`train`
-    :param folder: as :func:`train`
-    :param options: as :func:`train`
-    :param callbacks: as :func:`train`
+    A context manager that closes the games.
     """
 
     def __init__(
@@ -157,11 +153,7 @@ class Training:
         self._open.close()
 
     def learn(self) -> BaseAlgorithm:
-        """
-        Train and save. If Ctrl-C or SIGTERM end the training, the model is saved as it is.
-
-        :return: the model
-        """
+        """Train, save, and return the model. If Ctrl-C or SIGTERM end the training, the model is saved as it is."""
         try:
             self._learn()
         except (KeyboardInterrupt, SystemExit):
@@ -199,7 +191,7 @@ class Training:
             save_normalization(self.games, self.folder)
 
     def _games(self, settings: Settings, **kwargs: Any) -> CentralizedValueWrapper:
-        """Games that are closed with the training."""
+        """Make games that are closed with the training."""
         games = settings.make_env(self.seed, **kwargs)
         self._open.callback(games.close)
         return games
@@ -268,7 +260,7 @@ class Training:
         )
 
     def _every(self, frequency: int | None, times_per_run: int) -> int:
-        """Game steps between two events; 0 for never."""
+        """Return the game steps between two events; 0 for never."""
         if frequency is None:
             return max(1, self.settings.game_steps // times_per_run)
         return max(0, frequency)
@@ -276,10 +268,9 @@ class Training:
 
 def load_parameters(model: BaseAlgorithm, path: Path) -> None:
     """
-    Take weights and optimiser of a saved model. Only tensors are read: nothing of the file is run as code.
+    Take weights and optimiser of a saved model, a ``.zip``. Only tensors are read: nothing of the file is run as code.
 
     :param model: made with the policy and the ``policy_kwargs`` of the saved one
-    :param path: a ``.zip`` that ``save`` has written
     :raises ValueError: if the file does not fit
     """
     try:

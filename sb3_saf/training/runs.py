@@ -30,13 +30,7 @@ _FINAL_PART: Final = 0.1
 
 @dataclass(frozen=True)
 class Run:
-    """
-    A folder that ``sb3_saf.train`` has left.
-
-    :param folder: the folder
-    :param name: of the environment, as it is in folders
-    :param number: of the run, counted for each algorithm and environment
-    """
+    """A folder that ``sb3_saf.train`` has left: its path, the environment's name in folders, and its number."""
 
     folder: Path
     name: str
@@ -53,21 +47,11 @@ class Run:
         return saved_settings(self.config)
 
     def curve(self, source: Source) -> pd.DataFrame:
-        """
-        Team return along training.
-
-        :param source: where scores come from
-        :return: columns ``game_steps``, ``score``
-        :raises ValueError: if there are no results
-        """
+        """Return the team return along training, columns ``game_steps``, ``score``."""
         return self._evaluations() if source == "evaluation" else self._training()
 
     def final_score(self, source: Source) -> float:
-        """
-        Mean team return at the end: of the last evaluation, or of the last tenth of training.
-
-        :param source: where scores come from
-        """
+        """Return the mean team return of the last evaluation, or of the last tenth of training."""
         curve = self.curve(source)
         if source == "evaluation":
             return float(curve["score"].iloc[-1])
@@ -93,11 +77,10 @@ class Run:
 
 def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFrame:
     """
-    The learning curve of the games that were trained on.
+    Return the learning curve of the games that were trained on: ``game_steps``, and ``score``, the mean team return.
 
     :param monitor: a ``monitor.csv``, or the ``monitor_dir`` that ``make_team_env`` was given
     :param n_points: means of about as many episodes each
-    :return: columns ``game_steps``, ``score``, the mean team return
     :raises ValueError: if no episode has ended
     """
     path = Path(monitor)
@@ -116,14 +99,7 @@ def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFra
 
 
 def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
-    """
-    Find the runs in a log folder.
-
-    :param folder: the log folder
-    :param algos: only these; all if empty
-    :param env_ids: only these; all if empty
-    :raises ValueError: if there is no folder or no run, or an algorithm has none
-    """
+    """Find the runs in a log folder, of some algorithms and environments, or of all where none are given."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; give the -f that sb3_saf.train was given")
     names = {folder_name(env_id) for env_id in env_ids}
@@ -148,11 +124,9 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
     """
     Tell runs apart.
 
-    :param runs: the runs
-    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game; a
-        method's name says in what it differs from the zoo's settings and from other runs, or, where
-        that is much, has a number, and ``changes`` says it. Of runs that are alike but for their number only the latest
-        is there.
+    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game. A
+        method's name says in what it differs from the zoo's settings and from other runs, or, where that is much, has a
+        number, and ``changes`` says it. Of runs that are alike but for their number only the latest is there.
     """
     rows = []
     for run in runs:
@@ -167,7 +141,7 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def _changes(runs: Sequence[Run]) -> list[str]:
-    """What differs from the zoo's settings, and not in all runs of the algorithm at that size alike."""
+    """Return what differs from the zoo's settings, and not in all runs of the algorithm at that size alike."""
     own = [_different_from_the_zoo(run.settings) for run in runs]
     kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
     texts = []
@@ -179,7 +153,7 @@ def _changes(runs: Sequence[Run]) -> list[str]:
 
 
 def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
-    """Settings other than what the zoo has for the same game today, as text."""
+    """Return settings other than what the zoo has for the same game today, as text."""
     zoo = load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)
     ours, theirs = _flat(settings), _flat(zoo)
     keys = [key for key in {**theirs, **ours} if repr(ours.get(key)) != repr(theirs.get(key))]
@@ -197,7 +171,7 @@ def _short(value: object) -> str:
 
 
 def _method_names(algos: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """The algorithm with its changes, or with a number where these are more than a legend has room for."""
+    """Name the algorithm with its changes, or with a number where these are more than a legend has room for."""
     numbers: dict[str, dict[str, int]] = {}
     names = []
     for algo, text in zip(algos, changes, strict=True):
@@ -210,12 +184,7 @@ def _method_names(algos: Sequence[str], changes: Sequence[str]) -> list[str]:
 
 
 def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
-    """
-    A name for the games of each row: the environment, and the parameters in which the rows differ.
-
-    :param table: from :func:`describe`
-    :param without: parameters that shall not be named
-    """
+    """Name the games of each row of :func:`describe`: the environment, and the parameters in which the rows differ."""
     named = {"method", "changes", "seed", "env", "run", *without}
     varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
     return [

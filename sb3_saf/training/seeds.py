@@ -13,11 +13,7 @@ _EVALUATION: Final = 1
 
 
 def check_seed(seed: object) -> int:
-    """
-    Check the seed of a run.
-
-    :raises ValueError: if it is no whole number from 0 to 2**32 - 1
-    """
+    """Return the seed of a run if it is a whole number from 0 to 2**32 - 1; else a ValueError."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= MAX_SEED:
         raise ValueError(f"seed must be a whole number from 0 to {MAX_SEED}, got {seed!r}")
     return int(seed)
@@ -25,13 +21,10 @@ def check_seed(seed: object) -> int:
 
 def evaluation_seed(seed: int) -> int:
     """
-    The seed from which a run's evaluation games get theirs.
+    Return the seed from which a run's evaluation games get theirs, from 2**62 to 2**63 - 1.
 
     A branch of its own in the run's tree of seeds, with the top bit of 63 set. So it is no seed that a run can have,
     and evaluation games differ from the training games of this run and of all others.
-
-    :param seed: the run's seed
-    :return: from 2**62 to 2**63 - 1
     """
     word = np.random.SeedSequence(check_seed(seed), spawn_key=(_EVALUATION,)).generate_state(1, np.uint64)[0]
     return (int(word) >> 2) | (1 << 62)

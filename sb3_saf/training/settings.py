@@ -141,11 +141,7 @@ class Settings:
         return wrap_rows(env, self.wrapping, float(self.plain.get("gamma", 0.99)), is_training=not evaluation)
 
     def make_game(self, render_mode: str | None = None) -> Any:
-        """
-        Make one game, a PettingZoo ParallelEnv with the wrappers of the settings.
-
-        :param render_mode: how it can be drawn; None for not at all
-        """
+        """Make one game, a PettingZoo ParallelEnv with the wrappers of the settings."""
         return wrap_game(self.environment.make_game(self.env_kwargs, render_mode), self.wrapping)
 
     def make_model(
@@ -158,13 +154,10 @@ class Settings:
         verbose: int = 0,
     ) -> BaseAlgorithm:
         """
-        Make the algorithm, ready for ``learn(settings.total_timesteps)``.
+        Make the algorithm, ready for ``learn(settings.total_timesteps)``; further arguments as SB3 takes them.
 
         :param env: from :meth:`make_env`
         :param seed: the run's seed
-        :param device: as SB3 takes it
-        :param tensorboard_log: folder, None for none
-        :param verbose: as SB3 takes it
         :raises ValueError: if the algorithm refuses its arguments
         """
         try:
@@ -181,7 +174,7 @@ class Settings:
             raise ValueError(str(error)) from error
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything as plain data, for a file beside the results."""
+        """Return everything as plain data, for a file beside the results."""
         return {
             "algo": self.algo,
             "env": self.env_id,
@@ -295,7 +288,7 @@ def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) ->
 
 
 def _exclusive(given: dict[str, Any]) -> dict[str, Any]:
-    """Whoever gives a batch size takes the number of minibatches back, and the other way round."""
+    """Take the number of minibatches back where a batch size is given."""
     if given.get("batch_size") is not None and given.get("n_minibatches") is not None:
         raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
     if given.get("batch_size") is not None:
@@ -355,7 +348,7 @@ def _check_wrapping(
 
 
 def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_envs: int) -> int:
-    """Whole teams of a minibatch: one team is the rows of one game at one step."""
+    """Return the whole teams of a minibatch: one team is the rows of one game at one step."""
     n_steps = plain.get("n_steps")
     if n_steps is None:
         raise ValueError(f"n_minibatches divides a rollout, which needs n_steps; {spec.algorithm.__name__} has none")
@@ -363,7 +356,7 @@ def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_
 
 
 def _check_batch_size(batch_size: object, n_agents: int, buffer: object) -> None:
-    """Minibatches of the team buffer are whole teams, which it would say only after the first rollout."""
+    """Check that minibatches are whole teams, which the team buffer would say only after the first rollout."""
     if buffer != TeamRolloutBuffer.__name__ or batch_size is None:
         return
     if resolve("batch_size", batch_size, int) % n_agents:

@@ -7,15 +7,16 @@ K tasks, X thresholds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+import torch as th
 
 from sb3_saf.evaluation import confidence_interval
+from sb3_saf.randomness import own_randomness
 
 Floats = npt.NDArray[np.float64]
 
@@ -27,13 +28,7 @@ CURVE_COLUMNS: Final = ("method", "seed", "game_steps", "score")
 
 
 class Estimate(NamedTuple):
-    """
-    A value with its 95 % interval.
-
-    :param value: the estimate
-    :param low: lower end; NaN where one run cannot tell
-    :param high: upper end
-    """
+    """A value with its 95 % interval, NaN where one run cannot tell."""
 
     value: float
     low: float
@@ -41,38 +36,22 @@ class Estimate(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """
-    Share of runs whose score is above each threshold.
+    """Share of runs whose score is above each threshold, with its 95 % interval; (X,) each."""
 
-    :param thresholds: (X,)
-    :param share: (X,)
-    :param low: (X,) lower end of the 95 % interval
-    :param high: (X,) upper end
-    """
-
-    thresholds: Floats
     share: Floats
     low: Floats
     high: Floats
 
 
 def mean_over_seeds(values: Sequence[float] | Floats) -> Estimate:
-    """
-    Mean and Student's t interval of one value per seed.
-
-    :param values: (S,)
-    """
+    """Return mean and Student's t interval of one value per seed, (S,)."""
     sample = np.asarray(values, dtype=np.float64)
     low, high = confidence_interval(sample) if len(sample) > 1 else (np.nan, np.nan)
     return Estimate(float(sample.mean()), low, high)
 
 
 def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
-    """
-    Check a table before it is drawn.
-
-    :raises ValueError: with the columns that are missing, or if there are no rows
-    """
+    """Check that a table has columns, and rows; else a ValueError with those that are missing."""
     missing = [column for column in columns if column not in table.columns]
     if missing:
         raise ValueError(f"expected a table with the columns {', '.join(columns)}; {', '.join(missing)} is missing")
@@ -82,7 +61,7 @@ def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
 
 def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    Mean and interval over the seeds of one method at each point of training.
+    Return mean and interval over the seeds of one method at each point of training.
 
     Seeds that were measured at different points are interpolated, and only where all of them were measured: a curve
     that goes on with fewer seeds would jump.
@@ -104,12 +83,10 @@ def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
 
 def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Floats]:
     """
-    Scores by method as rliable takes them.
+    Return scores by method, (S, K) each, as rliable takes them.
 
     :param results: columns ``method``, ``seed``, the column named by ``task``, ``score``; several rows of a run
         (episodes) are averaged
-    :param task: the column whose values count as tasks
-    :return: (S, K) for each method
     :raises ValueError: if a method lacks a task, or a seed of one
     """
     require_columns(results, ("method", "seed", task, "score"))
@@ -136,11 +113,7 @@ def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Float
 
 
 def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
-    """
-    Interquartile mean of each method with a stratified bootstrap interval over seeds.
-
-    :param scores: (S, K) normalised scores of each method
-    """
+    """Return the interquartile mean of each method's (S, K) scores with a stratified bootstrap interval over seeds."""
     values, intervals = _bootstrap(scores, lambda runs: np.array([_interquartile_mean(runs)]))
     return {
         method: Estimate(float(values[method][0]), *(float(end) for end in intervals[method][:, 0]))
@@ -149,43 +122,28 @@ def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
 
 
 def _interquartile_mean(runs: Floats) -> float:
-    """``aggregate_iqm`` of rliable, called some ten thousand times: scipy's checks of arguments are all its cost."""
+    """Return ``aggregate_iqm`` of rliable without scipy's checks, which cost all its time in ten thousand calls."""
     scores = np.sort(runs, axis=None)
     cut = len(scores) // 4
     return float(scores[cut : len(scores) - cut].mean())
 
 
 def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> dict[str, Profile]:
-    """
-    Share of (seed, task) pairs above each threshold, with stratified bootstrap intervals.
-
-    :param scores: (S, K) normalised scores of each method
-    :param thresholds: (X,)
-    """
+    """Return the share of each method's (S, K) scores above thresholds (X,), with stratified bootstrap intervals."""
     shares, intervals = _bootstrap(scores, lambda runs: (runs[..., None] > thresholds).mean(axis=(0, 1)))
-    return {method: Profile(thresholds, shares[method], *intervals[method]) for method in scores}
+    return {method: Profile(shares[method], *intervals[method]) for method in scores}
 
 
 def _bootstrap(
     scores: Mapping[str, Floats], statistic: Callable[[Floats], Floats]
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """Point estimates and 95 % intervals of rliable; with a single seed nothing is known of the spread: NaN."""
+    """Return point estimates and 95 % intervals of rliable; with a single seed nothing is known of the spread: NaN."""
     from rliable.library import get_interval_estimates
 
-    with _seeded_global_generator():
+    # rliable draws from NumPy's global generator, whatever ``random_state`` it gets.
+    with own_randomness(BOOTSTRAP_SEED, th.device("cpu")):
         values, intervals = get_interval_estimates(dict(scores), statistic, reps=N_RESAMPLES)
     for method, runs in scores.items():
         if len(runs) < 2:
             intervals[method] = np.full_like(intervals[method], np.nan)
     return values, intervals
-
-
-@contextmanager
-def _seeded_global_generator() -> Iterator[None]:
-    """Resampling repeats: rliable draws from NumPy's global generator, whatever ``random_state`` it gets."""
-    state: Any = np.random.get_state()  # noqa: NPY002
-    np.random.seed(BOOTSTRAP_SEED)  # noqa: NPY002
-    try:
-        yield
-    finally:
-        np.random.set_state(state)  # noqa: NPY002

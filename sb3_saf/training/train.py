@@ -28,12 +28,12 @@ from sb3_saf.training.commands import (
     KeyValues,
     OneLineParser,
     add_environment_options,
+    check_device,
     import_packages,
     require,
     run_command,
     user_errors,
 )
-from sb3_saf.training.devices import check_device
 from sb3_saf.training.folders import find_unfinished, make_run_folder, write_run
 from sb3_saf.training.run import RunOptions, Training
 from sb3_saf.training.seeds import MAX_SEED, check_seed
@@ -162,12 +162,7 @@ def _add_tuning(group: argparse._ArgumentGroup) -> None:
 
 
 def train(arguments: Sequence[str] | None = None) -> None:
-    """
-    Train or tune.
-
-    :param arguments: of the command line; None for those of this process
-    :raises CommandError: for what the user can put right
-    """
+    """Train or tune; what the user can put right is a :class:`CommandError`."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = make_parser().parse_args(given)
     _check(options)
@@ -227,18 +222,24 @@ def _check_trial(options: argparse.Namespace) -> None:
 
 
 def _settings(
-    options: argparse.Namespace, sampled: Mapping[str, Any] | None = None, *, evaluation: bool = False
-) -> Settings:
-    """The settings asked for; what the user gave wins over those of a trial."""
-    env_kwargs = {**options.env_kwargs, **(options.eval_env_kwargs if evaluation else {})}
+    options: argparse.Namespace, sampled: Mapping[str, Any] | None = None
+) -> tuple[Settings, Settings | None]:
+    """
+    Return the settings of training and, where they are others, of evaluation.
+
+    What the user gave wins over what was sampled for a trial.
+    """
     overrides = merge(sampled or {}, _fixed(options))
-    return load_settings(options.algo, options.env, options.size, env_kwargs, overrides, options.conf_file)
+
+    def load(env_kwargs: Mapping[str, Any]) -> Settings:
+        return load_settings(options.algo, options.env, options.size, env_kwargs, overrides, options.conf_file)
+
+    given, of_evaluation = options.env_kwargs, options.eval_env_kwargs
+    return load(given), load({**given, **of_evaluation}) if of_evaluation else None
 
 
 def _fixed(options: argparse.Namespace) -> dict[str, Any]:
-    if options.game_steps is None:
-        return dict(options.hyperparams)
-    return {**options.hyperparams, "game_steps": options.game_steps}
+    return options.hyperparams | ({} if options.game_steps is None else {"game_steps": options.game_steps})
 
 
 def _run_options(options: argparse.Namespace, settings: Settings, **more: Any) -> RunOptions:
@@ -270,9 +271,7 @@ def _run_options(options: argparse.Namespace, settings: Settings, **more: Any) -
 def _train(options: argparse.Namespace, command: str) -> None:
     with user_errors():
         sampled = None if options.trial_id is None else _trial(options)
-        settings, eval_settings = _settings(options, sampled), None
-        if options.eval_env_kwargs:
-            eval_settings = _settings(options, sampled, evaluation=True)
+        settings, eval_settings = _settings(options, sampled)
     if options.verbose > 0:
         print(yaml.safe_dump(settings.as_dict(), sort_keys=False), end="")
     seed = None if options.seed == -1 else options.seed
@@ -363,9 +362,7 @@ def _tune(options: argparse.Namespace, command: str) -> None:
     from sb3_saf.training.tune import Tuning, optimize, sample_overrides
 
     with user_errors():
-        settings, eval_settings = _settings(options), None
-        if options.eval_env_kwargs:
-            eval_settings = _settings(options, evaluation=True)
+        settings, eval_settings = _settings(options)
         run_options = _run_options(options, settings, eval_settings=eval_settings)
     quiet = replace(run_options, eval_freq=0, tensorboard_log=None, progress=False, verbose=0)
     keys = ("storage", "study_name", "n_trials", "max_total_trials", "n_jobs", "sampler", "pruner")
@@ -380,7 +377,9 @@ def _tune(options: argparse.Namespace, command: str) -> None:
     print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
     with user_errors():
         study = optimize(
-            lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options))), tuning, command
+            lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options)))[0],
+            tuning,
+            command,
         )
         folder = options.log_folder / settings.algo
         folder.mkdir(parents=True, exist_ok=True)
@@ -393,9 +392,5 @@ def _tune(options: argparse.Namespace, command: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command.
-
-    :param arguments: of the command line; None for those of this process
-    """
+    """Run the command, with the arguments of this process by default."""
     run_command(PROGRAM, lambda: train(arguments))

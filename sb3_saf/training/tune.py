@@ -68,14 +68,7 @@ _POLICY_SEARCH: Final[dict[str, _Suggest]] = {
 
 
 def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Ask a trial for settings.
-
-    :param trial: the trial
-    :param spec: the algorithm
-    :param fixed: what the user has given, which is not searched
-    :return: overrides for ``load_settings``
-    """
+    """Ask a trial for settings, as overrides for ``load_settings``; what the user has ``fixed`` is not searched."""
     known = set(algorithm_arguments(spec.algorithm))
     if {"n_steps", "batch_size"} <= known and "batch_size" not in fixed:
         known.add("n_minibatches")
@@ -94,12 +87,7 @@ def _open(search: Mapping[str, _Suggest], known: Collection[str], settled: Mappi
 
 
 def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Convert the parameters of a trial to settings.
-
-    :param params: ``trial.params``
-    :return: overrides for ``load_settings``, where those of the policy join the other ``policy_kwargs``
-    """
+    """Convert the parameters of a trial to overrides for ``load_settings``."""
     of_policy = {name: value for name, value in params.items() if name in _POLICY_SEARCH}
     others = {name: value for name, value in params.items() if name not in _POLICY_SEARCH}
     return {**others, "policy_kwargs": of_policy} if of_policy else others
@@ -109,13 +97,7 @@ def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class TrialCallback(SeededEvalCallback):
-    """
-    Evaluation of a trial: reports every evaluation, and stops what the pruner gives up.
-
-    :param args: as ``SeededEvalCallback``
-    :param trial: the trial
-    :param kwargs: as ``SeededEvalCallback``
-    """
+    """Evaluation of a trial: report every evaluation, and stop what the pruner gives up."""
 
     def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -136,7 +118,7 @@ class TrialCallback(SeededEvalCallback):
 @dataclass(frozen=True)
 class Tuning:
     """
-    How a study is carried out.
+    How a study is carried out; see the options of the same names of ``sb3_saf.train``.
 
     :param seed: of the trials' games and models, and of the sampler unless the storage is shared
     :param options: of the trials' runs: device, threads, evaluation
@@ -144,11 +126,6 @@ class Tuning:
     :param study_name: None lets Optuna draw one
     :param n_trials: trials of this process
     :param max_total_trials: trials of all processes together, in place of ``n_trials``
-    :param n_jobs: trials at once, in threads
-    :param sampler: "tpe", "random", or "auto" (which needs optunahub)
-    :param pruner: "median", "halving" or "none"
-    :param n_startup_trials: random trials before the sampler learns and the pruner prunes
-    :param n_evaluations: evaluations of a trial
     :param log_path: folder for the evaluations and the best model of every trial; None for none
     """
 
@@ -167,14 +144,7 @@ class Tuning:
 
 
 def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str) -> optuna.Study:
-    """
-    Run trials.
-
-    :param settings_of: the settings of a trial
-    :param tuning: how
-    :param command: kept with the study
-    :return: the study
-    """
+    """Run trials, whose settings ``settings_of`` gives, and return the study, with which ``command`` is kept."""
     study = optuna.create_study(
         sampler=_make_sampler(tuning),
         pruner=_make_pruner(tuning),
@@ -203,9 +173,8 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
 
 def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
     """
-    Train and evaluate a trial. Trials have seeds of their own, which follow from the tuning's.
+    Train and evaluate a trial with a seed of its own, and return the mean team return of the last evaluation.
 
-    :return: the mean team return of the last evaluation
     :raises optuna.TrialPruned: if the pruner gives it up, training fails, or there is no finite value, which would pass
         for a result
     """
@@ -270,7 +239,6 @@ def open_storage(storage: str, *, must_exist: bool = False) -> BaseStorage:
 
     :param storage: ``sqlite:///study.db``, a journal file ``study.log``, or a database's URL
     :param must_exist: whether a file that is not there is an error, rather than made
-    :raises ValueError: if it cannot be opened
     """
     path = _file_of(storage)
     if path is not None:
@@ -301,15 +269,7 @@ def _file_of(storage: str) -> Path | None:
 
 
 def trial_overrides(storage: str, study_name: str, number: int | None) -> dict[str, Any]:
-    """
-    Read the settings of a trial.
-
-    :param storage: see :func:`open_storage`
-    :param study_name: of the study
-    :param number: of the trial; None for the best
-    :return: overrides for ``load_settings``
-    :raises ValueError: if there is no such trial
-    """
+    """Read the settings of a trial, the best if ``number`` is None, as overrides for ``load_settings``."""
     opened = open_storage(storage, must_exist=True)
     try:
         study = optuna.load_study(study_name=study_name, storage=opened)

@@ -53,13 +53,7 @@ _POLICY_RUN_ARGUMENTS: Final = {"self", "observation_space", "action_space", "lr
 
 
 class Range(NamedTuple):
-    """
-    Values that an argument may have.
-
-    :param low: the lowest
-    :param high: the highest; None for no limit
-    :param above: whether the value must be larger than ``low``
-    """
+    """Values that an argument may have; ``above``: larger than ``low``, not equal to it; ``high`` None: no limit."""
 
     low: float
     high: float | None = None
@@ -90,11 +84,8 @@ RANGES: Final[dict[str, Range]] = {
 
 class Kind(NamedTuple):
     """
-    A kind of value that an argument may have.
-
-    :param accepts: whether a type hint asks for it
-    :param convert: returns the value, or ``_NO`` if it is not of this kind
-    :param words: for the error
+    A kind of value that an argument may have: whether a type hint asks for it, the conversion (``_NO`` for values of
+    another kind), and words for the error.
     """
 
     accepts: Callable[[Any], bool]
@@ -106,7 +97,7 @@ _NO: Final = object()
 
 
 def _number(value: object) -> Any:
-    """A float; YAML 1.1 takes ``7e-4`` for a string."""
+    """Return a float; YAML 1.1 takes ``7e-4`` for a string."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return _NO
     try:
@@ -122,7 +113,7 @@ def _whole_number(value: object) -> Any:
 
 
 def _schedule(value: object) -> Any:
-    """RL-Zoo3's ``lin_0.001``: from 0.001 down to 0."""
+    """Return RL-Zoo3's ``lin_0.001``: from 0.001 down to 0."""
     if not isinstance(value, str) or not value.startswith("lin_"):
         return _NO
     start = _number(value.removeprefix("lin_"))
@@ -152,12 +143,11 @@ _KINDS: Final = (
 
 def resolve(name: str, value: object, hint: object) -> Any:
     """
-    Convert a plain value to what a constructor takes.
+    Convert a plain value to what a constructor takes; a ValueError says what is of the wrong type or out of range.
 
     :param name: the argument, which decides what a class may be called
     :param value: from YAML or a command line; objects that are no plain data stay as they are
     :param hint: the argument's type
-    :raises ValueError: for a value of the wrong type or out of range
     """
     resolved = _resolve_type(name, value, hint)
     number = resolved.start if isinstance(resolved, LinearSchedule) else resolved
@@ -187,11 +177,7 @@ def _resolve_type(name: str, value: object, hint: object) -> Any:
 
 
 def algorithm_arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """
-    Return what an algorithm's settings may name, with types: its constructor's arguments without those of a run.
-
-    :param algorithm: such as PPO
-    """
+    """Return what an algorithm's settings may name, with types: its constructor's arguments without those of a run."""
     return _init_hints(algorithm, _RUN_ARGUMENTS)
 
 
@@ -199,8 +185,6 @@ def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
     """
     Return what ``policy_kwargs`` may name, with types: the arguments of the policy's constructor, of those that it
     passes further arguments to, and the fields of its parts.
-
-    :param policy: a policy's class
     """
     arguments: dict[str, Any] = {}
     for base in reversed(policy.__mro__):

@@ -32,12 +32,7 @@ _DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 
 
 class Screen(NamedTuple):
-    """
-    Where a game is shown.
-
-    :param env: the game; None shows nothing
-    :param file: GIF or MP4 to write; None for window or text
-    """
+    """A game to show (None shows nothing), and the GIF or MP4 to write (None for window or text)."""
 
     env: Any
     file: Path | None
@@ -45,14 +40,7 @@ class Screen(NamedTuple):
 
 @contextmanager
 def open_screen(team: TrainedTeam, options: argparse.Namespace) -> Iterator[Screen]:
-    """
-    Open what the options ask for, the window included: it fails at once where there is no display.
-
-    :param team: whose game is shown
-    :param options: with ``gif``, ``mp4``, ``text``, ``no_render``
-    :raises RuntimeError: if there is no display
-    :raises ValueError: if the file has another ending
-    """
+    """Open what the options ask for, the window included: it fails at once where there is no display."""
     if options.no_render:
         yield Screen(None, None)
         return
@@ -89,19 +77,13 @@ def _open_window(env: Any) -> None:
 
 
 def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool) -> None:
-    """
-    Play the first of the measured games.
-
-    :param screen: where
-    :param team: who; each agent is given its own observation only
-    :param seed: of game and actions
-    :param deterministic: whether to take the most likely actions
-    """
+    """Play the first of the measured games on a screen; each agent is given its own observation only."""
     if screen.env is None:
         return
     frames = play(screen.env, team, seed, deterministic)
     if screen.file is not None:
-        write_video(screen.file, list(frames), _frames_per_second(screen.env))
+        metadata = getattr(screen.env, "metadata", None) or {}
+        write_video(screen.file, list(frames), int(metadata.get("render_fps", FPS)))
         print(screen.file)
     elif screen.env.render_mode == "ansi":
         print_frames(frames, sys.stdout)
@@ -111,15 +93,7 @@ def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool)
 
 
 def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterator[Any]:
-    """
-    Play a game.
-
-    :param env: the game, a ParallelEnv
-    :param team: with memory or without
-    :param seed: of game and actions
-    :param deterministic: whether to take the most likely actions
-    :return: what ``env.render()`` gives, at the start and after every step
-    """
+    """Play a game, a ParallelEnv; yield what ``env.render()`` gives, at the start and after every step."""
     set_random_seed(seed)
     read = _Reader(team)
     observations, infos = env.reset(seed=game_seeds(evaluation_seed(seed), 1)[0])
@@ -136,11 +110,7 @@ def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterato
 
 
 class _Reader:
-    """
-    Makes rows for the policy of what a ParallelEnv gives its agents: one row for each agent, absent ones included.
-
-    :param team: for its policy and its settings
-    """
+    """Make rows for the policy of what a ParallelEnv gives its agents: one row for each agent, absent ones included."""
 
     def __init__(self, team: TrainedTeam) -> None:
         self._spaces = TeamSpaces.from_observation_space(team.policy.observation_space)
@@ -150,13 +120,7 @@ class _Reader:
         self._games.close()
 
     def rows(self, agents: Sequence[Any], observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> dict[str, Any]:
-        """
-        Stack the agents' own observations, and their masks where there are any.
-
-        :param agents: all of the team, in order
-        :param observations: of those that take part
-        :param infos: of those that take part
-        """
+        """Stack the own observations of all agents in order, and their masks where there are any."""
         space, n_actions = self._spaces.own, self._spaces.action_mask
         own = np.zeros((len(agents), *(space.shape or ())), dtype=space.dtype)
         masks = np.ones((len(agents), *(() if n_actions is None else n_actions.shape)), dtype=np.int8)
@@ -183,19 +147,8 @@ class _Reader:
         return layer.normalize_obs(own)
 
 
-def _frames_per_second(env: Any) -> int:
-    return int((env.metadata or {}).get("render_fps", FPS)) if hasattr(env, "metadata") else FPS
-
-
 def write_video(path: Path, frames: list[Frame], fps: int = FPS) -> None:
-    """
-    Write a GIF or MP4.
-
-    :param path: by its ending
-    :param frames: (height, width, 3) each
-    :param fps: game steps per second
-    :raises ValueError: if the game gave no pictures
-    """
+    """Write frames, (height, width, 3) each, as GIF or MP4, by the path's ending."""
     import imageio.v3 as imageio
 
     if not isinstance(frames[0], np.ndarray):
@@ -210,12 +163,7 @@ def write_video(path: Path, frames: list[Frame], fps: int = FPS) -> None:
 
 
 def print_frames(frames: Iterator[str], stdout: TextIO) -> None:
-    """
-    Print a game: in place on a terminal, else one page after the other.
-
-    :param frames: pages
-    :param stdout: where
-    """
+    """Print a game: in place on a terminal, else one page after the other."""
     import time
 
     on_terminal = stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb"

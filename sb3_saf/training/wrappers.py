@@ -31,13 +31,7 @@ NORMALIZATION_FILE: Final = "vecnormalize.npz"
 
 
 def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
-    """
-    Import what a key names, in RL-Zoo3's format: a dotted name, a mapping from one to its arguments, or a list of them.
-
-    :param value: of the key
-    :param key: for errors
-    :raises ValueError: if it has another form or cannot be imported
-    """
+    """Import what a key names in RL-Zoo3's format: a dotted name, a mapping from one to its arguments, or a list."""
     for item in value if isinstance(value, list) else [value] if value is not None else []:
         name, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
         module, _, function = name.rpartition(".") if isinstance(name, str) else ("", "", "")
@@ -49,13 +43,7 @@ def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[st
 
 
 def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
-    """
-    Wrap one game as ``env_wrapper`` and ``frame_stack`` say.
-
-    :param game: a ParallelEnv
-    :param wrapping: keys of ``WRAPPER_KEYS``
-    :raises ValueError: if the result is no ParallelEnv
-    """
+    """Wrap one game, a ParallelEnv, as ``env_wrapper`` and ``frame_stack`` say."""
     for wrapper, arguments in named(wrapping.get("env_wrapper"), "env_wrapper"):
         try:
             game = wrapper(game, **arguments)
@@ -71,7 +59,7 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
 
 
 def wraps_games(wrapping: Mapping[str, Any]) -> bool:
-    """Whether single games are wrapped, which those of HECOGrid's compiled core cannot be."""
+    """Return whether single games are wrapped, which those of HECOGrid's compiled core cannot be."""
     return "env_wrapper" in wrapping or "frame_stack" in wrapping
 
 
@@ -82,7 +70,6 @@ def wrap_rows(
     Wrap vector environments as ``vec_env_wrapper`` and ``normalize`` say.
 
     :param env: from ``make_team_env``
-    :param wrapping: keys of ``WRAPPER_KEYS``
     :param gamma: discount of the algorithm, for the normalisation of rewards
     :param is_training: whether statistics are learned and rewards normalised
     :return: ``env`` itself if there is nothing to do
@@ -104,7 +91,7 @@ def wrap_rows(
 
 
 def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_training: bool) -> VecNormalize:
-    """VecNormalize; pictures and tile codes stay as they are, since encoders scale them."""
+    """Add VecNormalize; pictures and tile codes stay as they are, since encoders scale them."""
     space = rows.observation_space
     own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
     norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
@@ -120,11 +107,7 @@ def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_traini
 
 
 def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
-    """
-    Make the callbacks that ``callback`` names.
-
-    :raises ValueError: for other classes
-    """
+    """Make the callbacks that ``callback`` names."""
     callbacks = []
     for kind, arguments in named(wrapping.get("callback"), "callback"):
         if not isinstance(kind, type) or not issubclass(kind, BaseCallback):
@@ -140,12 +123,7 @@ def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
 
 
 def save_normalization(env: VecEnv, folder: Path) -> None:
-    """
-    Write the statistics of a VecNormalize, if there is one.
-
-    :param env: any vector environment
-    :param folder: where ``vecnormalize.npz`` is written
-    """
+    """Write the statistics of a VecNormalize, if there is one, to ``vecnormalize.npz`` in a folder."""
     layer = unwrap_vec_normalize(env)
     if layer is not None:
         arrays: dict[str, Any] = {key: np.array([one.count, *_flat(one)]) for key, one in _statistics(layer).items()}
@@ -153,13 +131,7 @@ def save_normalization(env: VecEnv, folder: Path) -> None:
 
 
 def load_normalization(env: VecEnv, folder: Path) -> None:
-    """
-    Read statistics, if the environment has a VecNormalize.
-
-    :param env: made with the settings of the run
-    :param folder: of the run
-    :raises ValueError: if they are not there or do not fit
-    """
+    """Read the statistics of a run's folder, if the environment has a VecNormalize."""
     layer = unwrap_vec_normalize(env)
     if layer is None:
         return

@@ -47,10 +47,8 @@ class _StrictLoader(yaml.SafeLoader):
 
 def load_yaml(text: str, source: str) -> Any:
     """
-    Read plain data from YAML.
+    Read plain data from YAML; ``source`` says in errors where it came from.
 
-    :param text: the YAML
-    :param source: where it came from, for errors
     :raises ValueError: for invalid YAML, and for what is no plain data or unfolds to more than a person would write
     """
     try:
@@ -70,9 +68,8 @@ def load_yaml(text: str, source: str) -> Any:
 
 def _size(content: object, known: dict[int, int]) -> int:
     """
-    Count the values when all aliases are unfolded.
+    Count the values when all aliases are unfolded; ``known`` has the sizes of containers by identity.
 
-    :param known: sizes of containers by identity, so that none is counted twice
     :raises ValueError: for dates, sets and other values that settings do not have
     """
     if not isinstance(content, (dict, list)):
@@ -86,20 +83,12 @@ def _size(content: object, known: dict[int, int]) -> int:
 
 
 def parse_value(text: str) -> Any:
-    """
-    Read a value typed on a command line: plain YAML, never Python.
-
-    :raises ValueError: for invalid YAML
-    """
+    """Read a value typed on a command line: plain YAML, never Python."""
     return load_yaml(text, f"the value {_short(text)}")
 
 
 def read_plain_file(path: Path) -> Any:
-    """
-    Read the plain data in a YAML file.
-
-    :raises ValueError: if it cannot be read or is too large
-    """
+    """Read the plain data in a YAML file; a ValueError says that it cannot be read or is too large."""
     try:
         with path.open("rb") as file:
             data = file.read(_MAX_BYTES + 1)
@@ -112,12 +101,7 @@ def read_plain_file(path: Path) -> Any:
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """
-    Read a file of settings, and the files that it refines.
-
-    :param path: a YAML file
-    :raises ValueError: if it cannot be read or is no mapping of environment ids
-    """
+    """Read a file of settings, and the files that it refines."""
     return _with_base(read_plain_file(path), str(path), ())
 
 
@@ -134,12 +118,12 @@ def read_config(name: str, refined_by: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def config_names() -> list[str]:
-    """Names of the files of ``zoo_configs``, without ``.yml``."""
+    """Return the names of the files of ``zoo_configs``, without ``.yml``."""
     return sorted(file.name[:-4] for file in files("zoo_configs").iterdir() if file.name.endswith(".yml"))
 
 
 def _with_base(content: object, source: str, refined_by: Sequence[str]) -> dict[str, Any]:
-    """A mapping from environment ids to settings, merged into that of its base."""
+    """Return a mapping from environment ids to settings, merged into that of its base."""
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{source} must map 'default' and environment ids to settings, got {_short(content)}")
     base = content.pop(BASE, None)
@@ -176,7 +160,7 @@ def _short(value: object) -> str:
 
 
 def _refined(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """An entry of a base with what a file adds, inside its sizes, too."""
+    """Return an entry of a base with what a file adds, inside its sizes, too."""
     result = merge(entry, own)
     sections = [one.get(SIZES_KEY, {}) for one in (entry, own)]
     if any(sections):
@@ -186,13 +170,9 @@ def _refined(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dict[str, Any]:
     """
-    Merge entries of a file: the entries in turn, then their sections of the size.
+    Merge entries of a file, the most general first, then their sections of the size; entries may be missing.
 
     Sections of sizes come last because they are the most specific; ``paper`` is what stands outside of them.
-
-    :param content: of a file
-    :param keys: names of entries, from the most general to the most specific; those that are not there are left out
-    :param size: one of ``SIZES``
     """
     entries = [dict(content.get(key) or {}) for key in keys]
     sections = [entry.pop(SIZES_KEY, {}).get(size, {}) for entry in entries]
@@ -200,11 +180,7 @@ def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dic
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Merge mappings; later values win, and mappings under the keys of ``MERGED`` are merged in turn.
-
-    :param layers: from the most general to the most specific
-    """
+    """Merge mappings; later values win, and mappings under the keys of ``MERGED`` are merged in turn."""
     result: dict[str, Any] = {}
     for layer in layers:
         for key, value in layer.items():
