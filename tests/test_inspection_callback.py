@@ -442,7 +442,7 @@ class TestZones:
 class TestMessages:
     def test_a_critic_that_needs_messages_is_wrong_without(self) -> None:
         """The value is what the next agent sees, -1 or 1: no guess without the message has an error below 1."""
-        policy = train_on_probe("SAFPolicy", Message(n_agents=3), n_updates=25)
+        policy = train_on_probe("SAFPolicy", Message(n_agents=3), n_updates=15)
         scalars = message_scalars(play(make_team_env(Message(n_agents=3), n_envs=64), policy, 128, gamma=0.9))
         assert scalars["message/value_error"] < 0.3
         assert scalars["message/value_error_zeroed"] > 0.9
