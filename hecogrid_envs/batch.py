@@ -31,7 +31,7 @@ U8 = npt.NDArray[np.uint8]
 
 #: In place of views that are not wanted.
 _NO_VIEWS: Final[U8] = np.zeros(0, dtype=np.uint8)
-_SECONDS_WITHOUT_A_WORD: Final = 2.0
+_SECONDS_WITHOUT_A_WORD: Final = 4.0
 
 
 class GameBatch:

@@ -27,12 +27,11 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
-from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import MixerName
 from tests.matrix_games import ONE_STEP, MatrixGame, TwoStates
-from tests.toy_envs import DictEnv, TellingEnv
+from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams
 
 POLICIES = ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXLstmPolicy"]
@@ -452,8 +451,6 @@ def test_bad_environments() -> None:
         make_model(VecNormalize(toy_env(), norm_obs=False))
     with pytest.raises(ValueError, match="unknown"):
         make_model(policy="QPLEXPolice")
-    with pytest.raises(ValueError, match="flatten"):
-        CentralizedValueWrapper(TeamMonitor(make_team_env(DictEnv()).venv))
 
 
 def test_verbose_tells_the_memory(capsys: pytest.CaptureFixture[str]) -> None:
