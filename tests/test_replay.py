@@ -197,6 +197,8 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
         ("strength", zeroed - value),
     ):
         assert float(shown[name].get_attribute("data-number")) == pytest.approx(number, abs=1e-5)
+    change = (recording.values_without["zero"] - recording.values)[4, :3].mean()
+    assert f"without messages the mean value changes by {change:.3f}" in browser.find_element("id", "team-value").text
     score = recording.rewards[:4, :3].sum()
     assert browser.find_element("id", "score-1").text.startswith(f"b: return {score:.2f}, {round(score)} of 12")
     browser.find_element("id", "play").click()

@@ -250,7 +250,8 @@ function drawTeam(run) {
   if (run.values) {
     const mean = (array, t) => range(data.n_agents).reduce((sum, i) => sum + array.at(t, i), 0) / data.n_agents;
     const t = row(state.t, run);
-    $("team-value").textContent = `Mean value ${show(mean(run.values, t))}, mean return that came ${show(mean(run.returns, t))} (${run.name})`;
+    const without = run.message ? `; without messages the mean value changes by ${show(mean(run.message, t), 3)}` : "";
+    $("team-value").textContent = `Mean value ${show(mean(run.values, t))}, mean return that came ${show(mean(run.returns, t))}${without} (${run.name})`;
     lines($("team-chart"), run, [
       [range(run.steps).map((i) => mean(run.values, i)), css("--mark"), "value"],
       [range(run.steps).map((i) => mean(run.returns, i)), css("--soft"), "return"],
