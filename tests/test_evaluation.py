@@ -66,7 +66,8 @@ class TestEvaluatePolicy:
     def test_sb3_alone_counts_agents(self) -> None:
         """The failing baseline: with 3 agents, 2 "episodes" are two agents of one game."""
         env = teams(lengths=(3, 2), n_agents=3, reward=constant(1, 10))
-        returns, _ = evaluate_rows(StillPolicy(), env, 2, return_episode_rewards=True, warn=False)
+        with pytest.warns(UserWarning, match="one agent of a team of 3"):
+            returns, _ = evaluate_rows(StillPolicy(), env, 2, return_episode_rewards=True, warn=False)
         assert returns == [20, 20]
 
     def test_short_episodes_are_not_favoured(self) -> None:

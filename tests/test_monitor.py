@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -226,14 +227,32 @@ def test_sb3_alone_counts_every_agent_as_an_episode() -> None:
     assert len(model.ep_info_buffer) == 15
 
 
+OURS = r"take each of these 6 rows .* team of 3: .* sb3_saf.evaluate_policy .*TeamEvalCallback, and sb3_saf.TeamMonitor"
+
+
 def test_sb3s_own_evaluation_returns_though_it_counts_agents() -> None:
     """What its users get who have not read on: a warning, and agents for episodes, but no endless loop."""
     env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(2, 2))))
-    with pytest.warns(UserWarning, match="Evaluation environment is not wrapped with a ``Monitor`` wrapper"):
-        returns, lengths = evaluate_rows(RandomPolicy(env.action_space, 0), env, 6, return_episode_rewards=True)
+    with pytest.warns(UserWarning, match=OURS):
+        returns, lengths = evaluate_rows(
+            RandomPolicy(env.action_space, 0), env, 6, return_episode_rewards=True, warn=False
+        )
     assert isinstance(returns, list)
     assert sorted(returns) == [3, 23, 43, 203, 223, 243]
     assert lengths == [2] * 6
+    evaluate_rows(RandomPolicy(env.action_space, 0), env, 6, warn=False)  # not a second time
+
+
+def test_sb3s_own_monitor_around_teams_or_below_is_warned_of() -> None:
+    with pytest.warns(UserWarning, match=OURS) as told:
+        VecMonitor(VecNormalize(CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(2, 2)))), norm_obs=False))
+    assert len(told) == 1
+    with pytest.warns(UserWarning, match=OURS) as told:
+        CentralizedValueWrapper(TeamMonitor(VecMonitor(TeamVenv(lengths=(2, 2)))))
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        VecMonitor(CentralizedValueWrapper(TeamVenv(lengths=(2, 2), n_agents=1)))  # an agent alone is an environment
 
 
 def logged(model: BaseAlgorithm, folder: Path, n_steps: int) -> list[dict[str, str]]:

@@ -30,8 +30,8 @@ class TeamMonitor(TeamVecEnvWrapper):
     ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
 
     It is no VecMonitor: SB3's own ``evaluate_policy`` would wait for an ``"episode"`` entry in every row and never
-    return. With a TeamMonitor it does return, but takes every agent for an episode and warns that there is no monitor;
-    use ``sb3_saf.evaluate_policy``, which counts teams.
+    return. With a TeamMonitor it does return, but takes every agent for an episode, with a warning; use
+    ``sb3_saf.evaluate_policy``, which counts teams.
 
     Agents whose rewards oppose each other (one gains what another loses) are no team: a warning says so.
 

@@ -7,13 +7,16 @@ Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row
 
 from __future__ import annotations
 
+import warnings
 from numbers import Integral
 from typing import Any, Final, Literal, NamedTuple, get_args
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_saf.errors import NonFiniteError
@@ -357,6 +360,9 @@ class TeamVecEnvWrapper(VecEnvWrapper):
     ``n_agents`` and ``n_games`` are attributes here and may be attributes of the layers below, too. SB3 calls that
     ambiguous when a further wrapper (such as VecNormalize) is asked for them; here the answers are always equal.
 
+    SB3's ``evaluate_policy``, ``EvalCallback`` and ``VecMonitor`` would take every agent for an environment: who puts
+    them around teams, or VecMonitor below, is warned once, with the names of what counts team episodes.
+
     :param venv: vector environment with B rows
     :param n_agents: N; None asks ``venv``
     :param observation_space: observation space of a row if the wrapper changes it
@@ -369,6 +375,9 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         super().__init__(venv, observation_space=observation_space)
         self.n_agents = require_n_agents(venv, n_agents)
         self.n_games = venv.num_envs // self.n_agents
+        self._warned_of_rows: bool = isinstance(venv, TeamVecEnvWrapper) and venv._warned_of_rows
+        if is_vecenv_wrapped(venv, VecMonitor):
+            self._warn_of_rows()
 
     def getattr_depth_check(self, name: str, already_found: bool) -> str | None:
         """See the base class; the team's shape is never ambiguous."""
@@ -383,3 +392,25 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         if attr_name in _TEAM_ATTRIBUTES and attr_name in vars(self):
             return [vars(self)[attr_name] for _ in self._get_indices(indices)]
         return super().get_attr(attr_name, indices)
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """See the base class; who asks for SB3's ``Monitor`` is about to count rows for episodes, and is warned."""
+        if wrapper_class is not Monitor:
+            return super().env_is_wrapped(wrapper_class, indices)
+        self._warn_of_rows()
+        return [False for _ in self._get_indices(indices)]
+
+    def _warn_of_rows(self) -> None:
+        if self._warned_of_rows or self.n_agents == 1:
+            return
+        self._warned_of_rows = True
+        warnings.warn(
+            f"Stable-Baselines3's evaluate_policy, EvalCallback and VecMonitor take each of these {self.num_envs} rows "
+            f"for an environment, but a row is one agent of a team of {self.n_agents}: they count agents for episodes, "
+            "and returns of single agents. For team episodes use sb3_saf.evaluate_policy or evaluate_team, "
+            "sb3_saf.TeamEvalCallback, and sb3_saf.TeamMonitor, which make_team_env has built in",
+            UserWarning,
+            stacklevel=4,
+        )
