@@ -30,6 +30,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
+    from sb3_saf.envs.curriculum import Curriculum, Stage
     from sb3_saf.envs.joint_observation import CentralizedValueWrapper
     from sb3_saf.envs.make import make_team_env
     from sb3_saf.envs.monitor import TeamMonitor
@@ -75,6 +76,7 @@ __all__ = [
     "Actor",
     "CentralizedValueWrapper",
     "CheckpointError",
+    "Curriculum",
     "EvaluationResult",
     "ExportError",
     "FiniteCallback",
@@ -100,6 +102,7 @@ __all__ = [
     "SAFLstmPolicy",
     "SAFMaskablePolicy",
     "SAFPolicy",
+    "Stage",
     "TeamCheckpointCallback",
     "TeamEvalCallback",
     "TeamMonitor",

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_observations, check_real
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.envs.curriculum import Curriculum
 
 
 @runtime_checkable
@@ -64,11 +65,16 @@ def check_environment_state(venv: VecEnv, states: Tree) -> None:
             f"the checkpoint's environment is {' of '.join(map(str, saved))}, got {' of '.join(found)}; make it the "
             "same way"
         )
-    for layer, state in zip(layers(venv), states, strict=True):
+    layer = venv
+    for state in states:
         if is_stateful(layer):
             check_stateful(layer, state["state"], f"the environment's {type(layer).__name__}")
         elif isinstance(layer, VecNormalize):
             _check_normalize_state(layer, state["state"])
+        if isinstance(layer, Curriculum):
+            layer = layer.venv_in(state["state"])  # the saved stage, which need not be the present one
+        elif isinstance(layer, VecEnvWrapper):
+            layer = layer.venv
 
 
 def load_environment_state(venv: VecEnv, states: list[Tree]) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final, Literal, TypeAlias, get_args
 
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_saf.envs.curriculum import Curriculum, Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.teams import check_count, check_seed
@@ -35,6 +36,7 @@ def make_team_env(
     active: bool | None = None,
     action_masks: AskMasks = "auto",
     state: bool = False,
+    curriculum: Sequence[Stage] = (),
     **params: Any,
 ) -> CentralizedValueWrapper:
     """
@@ -69,6 +71,7 @@ def make_team_env(
     :param action_masks: ``"auto"`` for masks where the environment gives any (for infos, those of its first reset
         decide), True to insist on them, False for none
     :param state: whether observations have the environment's ``state()``
+    :param curriculum: levels to train on first, see :class:`~sb3_saf.Curriculum`; then come games with ``params``
     :param params: of the task or the factory, for instance ``n_agents=5``
     :raises ValueError: if the arguments do not fit together, with what to do
     """
@@ -78,10 +81,11 @@ def make_team_env(
     _check_backend(backend)
     if isinstance(env, str):
         _refuse_signals(active, action_masks, state)
-        venv = _hecogrid(env, n_envs, seed, backend or "native", n_cpus, params)
+        make = partial(_hecogrid, env, n_envs, backend=backend or "native", n_cpus=n_cpus)
     else:
         signals = {"active": active is not False, "action_masks": action_masks, "state": state}
-        venv = _foreign(env, n_envs, seed, backend or "supersuit", n_cpus, params, signals)
+        make = partial(_foreign, env, n_envs, backend=backend or "supersuit", n_cpus=n_cpus, signals=signals)
+    venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
         os.makedirs(monitor_dir, exist_ok=True)
     return CentralizedValueWrapper(TeamMonitor(venv, filename=monitor_dir), time_limit=time_limit)
@@ -103,8 +107,28 @@ def _refuse_signals(active: bool | None, action_masks: AskMasks, state: bool) ->
             )
 
 
+def _in_stages(
+    make: Callable[[int | None, dict[str, Any]], VecEnv],
+    seed: int | None,
+    params: dict[str, Any],
+    curriculum: Sequence[Stage],
+) -> Curriculum:
+    """Make the games of all stages and put them one after the other."""
+    games: list[VecEnv] = []
+    try:
+        for of_stage in [*(stage.params for stage in curriculum), {}]:
+            games.append(make(None, {**params, **of_stage}))
+        staged = Curriculum(games, [stage.game_steps for stage in curriculum])
+    except BaseException:
+        for made in games:
+            made.close()
+        raise
+    staged.seed(seed)
+    return staged
+
+
 def _hecogrid(
-    task: str, n_envs: int, seed: int | None, backend: Backend, n_cpus: int, params: dict[str, Any]
+    task: str, n_envs: int, seed: int | None, params: dict[str, Any], backend: Backend, n_cpus: int
 ) -> VecEnv:
     """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
     from hecogrid_envs import make_vec_env
@@ -131,9 +155,9 @@ def _foreign(
     env: AnyParallelEnv | EnvFactory,
     n_envs: int,
     seed: int | None,
+    params: dict[str, Any],
     backend: Backend,
     n_cpus: int,
-    params: dict[str, Any],
     signals: dict[str, Any],
 ) -> VecEnv:
     """Any ParallelEnv, through SuperSuit."""

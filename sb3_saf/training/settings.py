@@ -25,7 +25,7 @@ from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, fi
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.seeds import check_seed, evaluation_seed
 from sb3_saf.training.values import algorithm_arguments, policy_arguments, resolve
-from sb3_saf.training.wrappers import WRAPPER_KEYS, wrap_game, wrap_rows, wraps_games
+from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows, wraps_games
 from sb3_saf.training.yaml_files import DEFAULT, MERGED, SIZES, Size, entry_of, merge, read_config, read_file
 
 #: Types of the keys that are ours, beside the arguments of the algorithm's constructor.
@@ -41,6 +41,7 @@ _OWN_KEYS: Final[dict[str, Any]] = {
     "callback": str | list[Any] | dict[str, Any] | None,
     "normalize": bool | dict[str, Any],
     "frame_stack": int,
+    "curriculum": list[Any],
 }
 #: RL-Zoo3's name for game steps.
 _N_TIMESTEPS: Final = "n_timesteps"
@@ -136,13 +137,19 @@ class Settings:
             time_limit=self.time_limit,
             monitor_dir=None if monitor_dir is None else str(monitor_dir),
             n_cpus=n_cpus,
+            curriculum=() if evaluation else stages_of(self.wrapping, self.game_steps),
             **params,
         )
         return wrap_rows(env, self.wrapping, float(self.plain.get("gamma", 0.99)), is_training=not evaluation)
 
-    def make_game(self, render_mode: str | None = None) -> Any:
-        """Make one game, a PettingZoo ParallelEnv with the wrappers of the settings."""
-        return wrap_game(self.environment.make_game(self.env_kwargs, render_mode), self.wrapping)
+    def make_game(self, render_mode: str | None = None, **changes: Any) -> Any:
+        """
+        Make one game, a PettingZoo ParallelEnv with the wrappers of the settings.
+
+        :param render_mode: how the game can be drawn; None for not at all
+        :param changes: parameters that differ from ``env_kwargs``
+        """
+        return wrap_game(self.environment.make_game({**self.env_kwargs, **changes}, render_mode), self.wrapping)
 
     def make_model(
         self,
@@ -311,6 +318,8 @@ def _build(
         if own[key] is not None and own[key] is not False
     }
     _check_wrapping(wrapping, environment, env_kwargs, spec)
+    for stage in stages_of(wrapping, game_steps):
+        environment.complete({**env_kwargs, **stage.params})
     if n_agents is None:
         n_agents = environment.count_agents(env_kwargs)
     plain = dict(entry)

@@ -1,5 +1,6 @@
 """
-RL-Zoo3's ``env_wrapper``, ``vec_env_wrapper``, ``frame_stack``, ``normalize`` and ``callback``, for teams.
+RL-Zoo3's ``env_wrapper``, ``vec_env_wrapper``, ``frame_stack``, ``normalize`` and ``callback``, for teams, and
+``curriculum``.
 
 Wrappers are imported by name, so a file of settings that has them can run code: take such files from people whom you
 trust. Wrappers of games are PettingZoo's and SuperSuit's, those of vector environments SB3's; the latter sit between
@@ -20,13 +21,14 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
+from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.teams import OBS_KEY
 from sb3_saf.training.environments import import_by_name
 
 #: Keys of settings that name wrappers; each may be left out.
-WRAPPER_KEYS: Final = ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize", "callback")
+WRAPPER_KEYS: Final = ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize", "callback", "curriculum")
 NORMALIZATION_FILE: Final = "vecnormalize.npz"
 
 
@@ -104,6 +106,32 @@ def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_traini
         return VecNormalize(rows, **arguments)
     except (TypeError, ValueError, AssertionError) as error:
         raise ValueError(f"normalize: {error}") from error
+
+
+def stages_of(wrapping: Mapping[str, Any], game_steps: int) -> list[Stage]:
+    """
+    Read ``curriculum``: a list of levels to train on first, each a mapping of ``share``, its share of the run, and of
+    the parameters of the game that differ, ``[{share: 0.2, coordination: 1}, {share: 0.4, coordination: 2}]``.
+
+    :param game_steps: of the run
+    :raises ValueError: for anything else
+    """
+    stages, total = [], 0.0
+    for entry in wrapping.get("curriculum") or []:
+        share = entry.get("share") if isinstance(entry, Mapping) else None
+        if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 < share < 1 or len(entry) < 2:
+            raise ValueError(
+                "curriculum must list levels with share, between 0 and 1, and what differs in them, such as "
+                f"{{share: 0.2, coordination: 1}}, got {entry!r}"
+            )
+        total += share
+        params = {name: value for name, value in entry.items() if name != "share"}
+        stages.append(Stage(max(1, round(game_steps * share)), params))
+    if total >= 1:
+        raise ValueError(
+            f"the shares of a curriculum must leave game steps for the level itself, got {total:g} of the run"
+        )
+    return stages
 
 
 def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:

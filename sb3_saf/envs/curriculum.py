@@ -1,0 +1,164 @@
+"""Train on one level of a game after another: games of the next stage take the place of those of the last one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_saf.envs.teams import TeamVecEnvWrapper, check_count
+
+
+class Stage(NamedTuple):
+    """
+    A level to train on for a while.
+
+    :param game_steps: how long, in game steps summed over all parallel games
+    :param params: parameters of the game that differ from those that it has at last, ``{"coordination": 1}``
+    """
+
+    game_steps: int
+    params: Mapping[str, Any]
+
+
+class Curriculum(TeamVecEnvWrapper):
+    """
+    Games of several stages, one stage after the other; the last stage goes on to the end.
+
+    Where a stage ends, episodes that are not over are truncated as by a time limit, with ``TimeLimit.truncated`` and
+    ``terminal_observation`` in their infos; so a rollout may begin in one stage and end in the next. Attributes,
+    methods and seeds are those of the games of the present stage.
+
+    :param stages: vector environments with equal spaces and rows; closed with this one
+    :param game_steps: of every stage but the last, in game steps summed over all parallel games
+    :raises ValueError: if the stages do not fit together
+    """
+
+    def __init__(self, stages: Sequence[VecEnv], game_steps: Sequence[int]) -> None:
+        if len(stages) != len(game_steps) + 1:
+            raise ValueError(
+                f"expected the game steps of every stage but the last, {len(stages) - 1} numbers, got {len(game_steps)}"
+            )
+        super().__init__(stages[0])
+        self.stages = tuple(stages)
+        #: Game steps at which each stage but the last ends.
+        self.ends = tuple(accumulate(check_count("game_steps", steps) for steps in game_steps))
+        self.stage = 0
+        self.game_steps = 0
+        for number, stage in enumerate(stages):
+            self._check_fits(stage, number)
+
+    def _check_fits(self, stage: VecEnv, number: int) -> None:
+        for name in ("num_envs", "observation_space", "action_space"):
+            own, first = getattr(stage, name), getattr(self.stages[0], name)
+            if own != first:
+                raise ValueError(
+                    f"the games of all stages of a curriculum need the same {name}: stage 0 has {first}, stage "
+                    f"{number} {own}; let stages differ in what the policy does not depend on, such as coordination"
+                )
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Choose the seeds of the games of all stages; each stage has its own, the first one those of ``seed``.
+
+        :return: (B,) the seed of each row's game in the present stage
+        """
+        chosen = [stage.seed(_seed_of_stage(seed, number)) for number, stage in enumerate(self.stages)]
+        return chosen[self.stage]
+
+    def reset(self) -> VecEnvObs:
+        """
+        Start new episodes in the present stage.
+
+        :return: observations of the B rows
+        """
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Play one game step; if the stage ends with it, begin the next one.
+
+        :return: observations, rewards, dones and infos of the B rows
+        """
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.game_steps += self.n_games
+        if self._present_stage() == self.stage:
+            return obs, rewards, dones, infos
+        infos = _truncated(obs, dones, infos)
+        self._enter(self._present_stage())
+        return self.venv.reset(), rewards, np.ones_like(dones), infos
+
+    def _present_stage(self) -> int:
+        return int(np.searchsorted(self.ends, self.game_steps, side="right"))
+
+    def _enter(self, stage: int) -> None:
+        self.stage = stage
+        self.venv = self.stages[stage]
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        How far the curriculum is; the state of the games is theirs to give.
+
+        :return: plain data for :meth:`load_checkpoint_state`
+        """
+        return {"ends": list(self.ends), "game_steps": self.game_steps}
+
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that this curriculum could be there.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: naming the difference
+        """
+        if state["ends"] != list(self.ends):
+            raise ValueError(f"expected stages that end at game steps {list(self.ends)}, got {state['ends']!r:.80}")
+        steps = state["game_steps"]
+        if isinstance(steps, bool) or not isinstance(steps, int) or not 0 <= steps < 2**63 or steps % self.n_games:
+            raise ValueError(f"expected game_steps to be a multiple of {self.n_games}, got {steps!r}")
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there.
+
+        :param state: what :meth:`checkpoint_state` gave
+        """
+        self.game_steps = state["game_steps"]
+        self._enter(self._present_stage())
+
+    def venv_in(self, state: Mapping[str, Any]) -> VecEnv:
+        """
+        Find the games that a state belongs to.
+
+        :param state: what :meth:`checkpoint_state` gave
+        """
+        return self.stages[int(np.searchsorted(self.ends, state["game_steps"], side="right"))]
+
+    def close(self) -> None:
+        """Close the games of all stages."""
+        for stage in self.stages:
+            stage.close()
+
+
+def _seed_of_stage(seed: int | None, number: int) -> int | None:
+    """Return a seed for each stage, so that a stage does not begin on the levels of the one before."""
+    if seed is None or number == 0:
+        return seed
+    return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0])
+
+
+def _truncated(obs: VecEnvObs, dones: npt.NDArray[np.bool_], infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return infos in which every episode ends, those that were not over by truncation."""
+    ended = []
+    for row, (done, info) in enumerate(zip(dones, infos, strict=True)):
+        if done:
+            ended.append(info)
+            continue
+        last = {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
+        takes_part = info.get("active", True)
+        ended.append({**info, "terminal_observation": last, "TimeLimit.truncated": bool(takes_part)})
+    return ended

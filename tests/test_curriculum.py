@@ -1,0 +1,131 @@
+"""Training on one level after another: sb3_saf.Curriculum, make_team_env(curriculum=), and the key of settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+
+import sb3_saf
+from sb3_saf import Stage, make_team_env
+from sb3_saf.training.environments import find_environment
+from sb3_saf.training.settings import load_settings
+
+SMALL: Final[dict[str, Any]] = {"n_agents": 3, "grid_size": 8, "n_treasures": 6}
+
+
+def _staged(**kwargs: Any) -> sb3_saf.CentralizedValueWrapper:
+    stages = [Stage(20, {"coordination": 1}), Stage(12, {"coordination": 2})]
+    return make_team_env("TeamSupport", 2, seed=0, coordination=3, max_cycles=5, curriculum=stages, **SMALL, **kwargs)
+
+
+class Played(NamedTuple):
+    """What a step of the vector environment gave, and the coordination after it."""
+
+    coordination: int
+    obs: dict[str, np.ndarray]
+    rewards: np.ndarray
+    dones: np.ndarray
+    infos: list[dict[str, Any]]
+
+
+def _play(env: VecEnv, steps: int, seed: int = 0) -> list[Played]:
+    rng, seen = np.random.default_rng(seed), []
+    for _ in range(steps):
+        obs, rewards, dones, infos = env.step(rng.integers(5, size=env.num_envs))
+        assert isinstance(obs, dict)
+        params = getattr(env, "params", None)
+        seen.append(Played(getattr(params, "coordination", 0), obs, rewards, dones, infos))
+    return seen
+
+
+def test_levels_follow_each_other_after_their_game_steps() -> None:
+    env = _staged()
+    env.reset()
+    seen = _play(env, 20)
+    # 2 games: 20 game steps are 10 steps of the vector environment, then 12 are 6.
+    assert [played.coordination for played in seen] == [1] * 9 + [2] * 6 + [3] * 5
+    env.close()
+
+
+def test_the_end_of_a_stage_truncates_what_is_not_over() -> None:
+    env = _staged(time_limit="bootstrap")
+    env.reset()
+    seen = _play(env, 20)
+    # Episodes of 5 steps: the first stage ends with two whole ones, the second, of 6 steps, in the first step of one.
+    assert [step for step, played in enumerate(seen) if played.dones.all()] == [4, 9, 14, 15]
+    infos = seen[15].infos
+    assert all(info["TimeLimit.truncated"] for info in infos)
+    assert [info["episode"]["l"] for info in infos if "episode" in info] == [1, 1]
+    env.close()
+
+
+def test_the_last_stage_plays_the_games_of_an_environment_of_that_level() -> None:
+    stages = [Stage(2, {"coordination": 1})]
+    staged = make_team_env("TeamSupport", 2, seed=0, coordination=3, curriculum=stages, **SMALL)
+    staged.reset()
+    assert _play(staged, 1)[0].coordination == 3
+    plain = make_team_env("TeamSupport", 2, coordination=3, **SMALL)
+    plain.seed(int(np.random.SeedSequence(0, spawn_key=(1,)).generate_state(1)[0]))
+    plain.reset()
+    for ours, theirs in zip(_play(staged, 60), _play(plain, 60), strict=True):
+        np.testing.assert_array_equal(ours.obs["obs"], theirs.obs["obs"])
+        np.testing.assert_array_equal(ours.rewards, theirs.rewards)
+
+
+def test_a_run_that_is_resumed_in_a_later_stage_equals_an_undisturbed_one(tmp_path: Path) -> None:
+    def model(folder: str) -> PPO:
+        env = _staged(monitor_dir=str(tmp_path / folder))
+        return PPO("MAPPOPolicy", env, n_steps=5, batch_size=30, rollout_buffer_class=sb3_saf.TeamRolloutBuffer, seed=0)
+
+    whole = sb3_saf.resumable_learn(model("whole"), 180, tmp_path / "whole/ck")
+    sb3_saf.resumable_learn(model("cut"), 90, tmp_path / "cut/ck")  # 30 game steps: in the second stage
+    resumed = sb3_saf.resumable_learn(model("cut"), 180, tmp_path / "cut/ck")
+    for name, weights in whole.policy.state_dict().items():
+        np.testing.assert_array_equal(weights, resumed.policy.state_dict()[name])
+    files = [(tmp_path / folder / "monitor.csv").read_text().splitlines()[2:] for folder in ("whole", "cut")]
+    assert [line.rsplit(",", 1)[0] for line in files[0]] == [line.rsplit(",", 1)[0] for line in files[1]]
+
+
+def test_any_environment_has_stages() -> None:
+    make = find_environment("mpe2.simple_spread_v3").make
+    assert make is not None
+    env = make_team_env(make, 2, max_cycles=6, local_ratio=0.0, curriculum=[Stage(8, {"local_ratio": 1.0})])
+    env.reset()
+    assert [step for step, played in enumerate(_play(env, 12)) if played.dones.all()] == [3, 9]
+    env.close()
+
+
+def test_stages_with_other_spaces_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"need the same observation_space: stage 0 .* such as coordination"):
+        make_team_env("TeamSupport", 2, view_size=7, curriculum=[Stage(10, {"view_size": 5})], **SMALL)
+
+
+def test_settings_give_shares_of_the_run() -> None:
+    stages = [{"share": 0.25, "coordination": 1}, {"share": 0.5, "coordination": 2}]
+    settings = load_settings("saf", "TeamTogether-v0", "smoke", {"coordination": 3}, {"curriculum": stages})
+    env = settings.make_env(0)
+    assert env.params.coordination == 1
+    assert env.ends == (round(settings.game_steps / 4), round(settings.game_steps * 0.75))
+    evaluation = settings.make_env(0, evaluation=True)
+    assert evaluation.params.coordination == 3
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ([{"coordination": 1}], "share, between 0 and 1"),
+        ([{"share": 0.5}], "share, between 0 and 1"),
+        ([{"share": 2, "coordination": 1}], "share, between 0 and 1"),
+        ([{"share": 0.6, "coordination": 1}, {"share": 0.4, "coordination": 2}], "must leave game steps"),
+        ([{"share": 0.5, "coordination": 9}], "coordination"),
+        ([{"share": 0.5, "cordination": 1}], "cordination"),
+    ],
+)
+def test_bad_curricula_are_refused(stages: list[dict[str, object]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_settings("saf", "TeamTogether-v0", "smoke", {"coordination": 3}, {"curriculum": stages})
