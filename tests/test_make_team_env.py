@@ -165,8 +165,8 @@ class Walk(gym.Env[Array, int]):
         (
             lambda: make_team_env("TeamTogeter"),
             r"unknown task 'TeamTogeter' \(did you mean 'TeamTogether'\?\); the tasks are .*\. For any other "
-            r"environment pass a PettingZoo ParallelEnv or a factory that returns one, for instance "
-            r"simple_spread_v3.parallel_env",
+            r"environment pass a task of a suite .*, a PettingZoo ParallelEnv, or a factory that returns one, for "
+            r"instance simple_spread_v3.parallel_env",
         ),
         (lambda: make_team_env("TeamTogether-v1"), "unknown task 'TeamTogether-v1'"),
         (

@@ -208,6 +208,8 @@ class UnequalEnv(CounterEnv):
     def action_space(self, agent: str) -> spaces.Space[Any]:
         if self.kind == "action" and agent == "agent_1":
             return spaces.Discrete(7)
+        if self.kind == "kind of action" and agent == "agent_1":
+            return spaces.MultiDiscrete([2, 3])
         return self._action_space
 
 

@@ -82,7 +82,7 @@ def game_form(
     agents = tuple(example.possible_agents)
     observation_space = _common_space("observation", agents, example.observation_space)
     action_space = _common_space("action", agents, example.action_space)
-    own, inside = observation_space, action_masks is not None and _has_masks_inside(observation_space)
+    own, inside = observation_space, action_masks is not None and has_masks_inside(observation_space)
     if inside:
         own = observation_space[OBSERVATION]  # type: ignore[index]
     masks = _mask_source(inside, action_masks, action_space, first_infos)
@@ -160,7 +160,7 @@ def _common_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], sp
     return first
 
 
-def _has_masks_inside(space: spaces.Space[Any]) -> bool:
+def has_masks_inside(space: spaces.Space[Any]) -> bool:
     """Return whether observations have PettingZoo's form for masks."""
     return isinstance(space, spaces.Dict) and set(space.spaces) == {OBSERVATION, ACTION_MASK_KEY}
 

@@ -7,13 +7,17 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final, Literal, TypeAlias, get_args
 
+import gymnasium as gym
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.curriculum import Curriculum, Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.row_spaces import RowSpaces
+from sb3_saf.envs.team_game import make_team_game, team_game
 from sb3_saf.envs.teams import check_count, check_seed
+from sb3_saf.suites.registry import SuiteTask, find_task
 
 Backend = Literal["native", "supersuit"]
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
@@ -55,9 +59,10 @@ def make_team_env(
       ``infos[agent]["action_mask"]``. Policies of this package take legal actions only.
     - The environment's ``state()`` can be the input of MAPPO's critic, ``policy_kwargs={"critic_input": "state"}``.
 
-    :param env: a HECOGrid task ("TeamTogether", or its id "hecogrid/TeamTogether-v0"), a PettingZoo ParallelEnv whose
-        agents have equal spaces, or a factory that returns one (``simple_spread_v3.parallel_env``). Of a ParallelEnv,
-        copies are used
+    :param env: a HECOGrid task ("TeamTogether", or its id "hecogrid/TeamTogether-v0"); a task of a suite
+        ("lbf/Foraging-8x8-2p-3f-v3", see :mod:`sb3_saf.suites`); a PettingZoo ParallelEnv, a Gymnasium environment of
+        several agents (:class:`GymnasiumTeam`), or a factory that returns one (``simple_spread_v3.parallel_env``). Of
+        an environment, copies are used. Agents that differ in their spaces get equal ones (:class:`EqualSpaces`)
     :param n_envs: E, parallel games
     :param seed: the run's seed, from which each game gets its own; None for fresh ones. An algorithm that is given a
         ``seed`` replaces it with its own
@@ -79,11 +84,16 @@ def make_team_env(
     check_count("n_cpus", n_cpus)
     check_seed(seed)
     _check_backend(backend)
-    if isinstance(env, str):
+    signals = {"active": active is not False, "action_masks": action_masks, "state": state}
+    task = find_task(env) if isinstance(env, str) else None
+    make: Callable[[int | None, dict[str, Any]], VecEnv]
+    if task is not None:
+        task.warn_if_competitive()
+        make = partial(_suite, task, n_envs, backend=backend or "supersuit", n_cpus=n_cpus, signals=signals)
+    elif isinstance(env, str):
         _refuse_signals(active, action_masks, state)
         make = partial(_hecogrid, env, n_envs, backend=backend or "native", n_cpus=n_cpus)
     else:
-        signals = {"active": active is not False, "action_masks": action_masks, "state": state}
         make = partial(_foreign, env, n_envs, backend=backend or "supersuit", n_cpus=n_cpus, signals=signals)
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
@@ -138,8 +148,8 @@ def _hecogrid(
         name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))
     except ValueError as error:
         raise ValueError(
-            f"{error}. For any other environment pass a PettingZoo ParallelEnv or a factory that returns one, for "
-            "instance simple_spread_v3.parallel_env"
+            f"{error}. For any other environment pass a task of a suite (python -m sb3_saf.suites lists them), a "
+            "PettingZoo ParallelEnv, or a factory that returns one, for instance simple_spread_v3.parallel_env"
         ) from None
     if n_cpus != 1:
         if backend == "native":
@@ -149,6 +159,57 @@ def _hecogrid(
             )
         params = {**params, "n_cpus": n_cpus}
     return make_vec_env(name, n_envs, seed=seed, backend=backend, **{"observation": "tiles", **params})
+
+
+def _suite(
+    one: SuiteTask,
+    n_envs: int,
+    seed: int | None,
+    params: dict[str, Any],
+    backend: Backend,
+    n_cpus: int,
+    signals: dict[str, Any],
+) -> VecEnv:
+    """A task of a suite: its own engine, or games through SuperSuit."""
+    suite = one.suite
+    if suite.vec_env is None:
+        assert suite.game is not None
+        return _foreign(_Named(one.id, partial(suite.game, one.task)), n_envs, seed, params, backend, n_cpus, signals)
+    if backend == "native" or n_cpus != 1:
+        raise ValueError(
+            f"{one.id} has an engine of its own, which steps all games at once; leave backend and n_cpus out"
+        )
+    try:
+        venv = suite.vec_env(one.task, n_envs, seed, state=signals["state"], **params)
+    except TypeError as error:  # most often an argument that it does not have
+        raise ValueError(f"{one.id} cannot be made with {params}: {error}") from error
+    _check_signals(one.id, RowSpaces.of(venv.observation_space, venv.action_space), signals)
+    return venv
+
+
+def _check_signals(name: str, rows: RowSpaces, signals: dict[str, Any]) -> None:
+    has_masks = rows.n_masked_actions is not None
+    if signals["action_masks"] != "auto" and signals["action_masks"] != has_masks:
+        raise ValueError(
+            f"{name} {'gives' if has_masks else 'has no'} action masks, got action_masks={signals['action_masks']}; "
+            "leave it out"
+        )
+    if signals["state"] and rows.state is None:
+        raise ValueError(f"{name} has no state, got state=True; leave it out")
+
+
+class _Named:
+    """A factory with a name for messages."""
+
+    def __init__(self, name: str, make: Callable[..., Any]) -> None:
+        self.__qualname__ = name
+        self._make = make
+
+    def __call__(self, **params: Any) -> Any:
+        try:
+            return self._make(**params)
+        except TypeError as error:  # most often an argument that it does not have
+            raise ValueError(f"{self.__qualname__} cannot be made with {params}: {error}") from error
 
 
 def _foreign(
@@ -178,14 +239,15 @@ def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParal
             f"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv {_name(env)}; wrap it "
             "yourself: sb3_saf.CentralizedValueWrapper(sb3_saf.TeamMonitor(venv))"
         )
+    is_factory = callable(env) and not isinstance(env, (ParallelEnv, AECEnv, gym.Env))
     if not params:
-        return env
-    if isinstance(env, (ParallelEnv, AECEnv)) or not callable(env):
+        return partial(make_team_game, env) if is_factory else team_game(env)
+    if not is_factory:
         raise ValueError(
             f"parameters {sorted(params)} go to a factory, got them with {_name(env)}; give them to the environment "
             "when you make it, or pass its factory (such as simple_spread_v3.parallel_env) instead"
         )
-    return partial(env, **params)
+    return partial(make_team_game, partial(env, **params))
 
 
 def _name(env: object) -> str:

@@ -1,4 +1,4 @@
-"""From the name of an environment to its games: HECOGrid tasks, modules, functions, and PettingZoo's registry."""
+"""From the name of an environment to its games: HECOGrid tasks, suites, modules, functions, PettingZoo's registry."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ import hecogrid_envs
 from hecogrid_envs import TASK_NAMES
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.task import TaskName
+from sb3_saf.envs.team_game import team_game
+from sb3_saf.envs.vec_game import VecGame
+from sb3_saf.suites.registry import SuiteTask, find_task
 from sb3_saf.training.names import unknown_name
 
 #: HECOGrid's environments, as RL-Zoo3 and Gymnasium write names.
@@ -24,7 +27,8 @@ HECOGRID: Final = "hecogrid"
 #: Here tile codes are the default: the same views as the paper's pictures in 49 bytes.
 _HECOGRID_DEFAULTS: Final = {"observation": "tiles"}
 HOW_TO_NAME: Final = (
-    f"{', '.join(ENV_IDS)}, a module with parallel_env (mpe2.simple_spread_v3), a function that makes a ParallelEnv "
+    f"{', '.join(ENV_IDS)}, a task of a suite (lbf/Foraging-8x8-2p-3f-v3; python -m sb3_saf.suites lists them), a "
+    "module with parallel_env (mpe2.simple_spread_v3), a function that makes a ParallelEnv "
     "(my_package.my_module:make_env), or an id registered with PettingZoo"
 )
 
@@ -36,10 +40,12 @@ class TeamEnvironment:
 
     :param id: its name
     :param make: makes a game from ``render_mode`` and parameters; None for HECOGrid
+    :param suite_task: the task of a suite, None for others
     """
 
     id: str
     make: Callable[..., Any] | None = None
+    suite_task: SuiteTask | None = None
 
     @property
     def task(self) -> TaskName | None:
@@ -49,6 +55,8 @@ class TeamEnvironment:
     @property
     def yaml_keys(self) -> tuple[str, ...]:
         """Entries of YAML files that are for this environment, from general to specific."""
+        if self.suite_task is not None:
+            return ("default", self.suite_task.suite.name, self.id)
         return ("default", HECOGRID, self.id) if self.task else ("default", self.id)
 
     @property
@@ -81,13 +89,17 @@ class TeamEnvironment:
         return len(agents)
 
     def make_game(self, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> Any:
-        """Make one game; a ValueError says that it refuses its parameters, or is no ParallelEnv."""
+        """
+        Make one game, whose agents have equal spaces.
+
+        :raises ValueError: if it refuses its parameters, or is no ParallelEnv
+        """
         kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
         if self.make is None:
             assert self.task is not None
             return hecogrid_envs.parallel_env(self.task, **kwargs)
         try:
-            game = self.make(**kwargs)
+            game = team_game(self.make(**kwargs))
         except TypeError as error:  # most often an argument that it does not have
             raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}") from error
         if not isinstance(game, pettingzoo.ParallelEnv):
@@ -107,10 +119,25 @@ def find_environment(env_id: str) -> TeamEnvironment:
         return TeamEnvironment(name)
     if name in pettingzoo.parallel_registry:
         return TeamEnvironment(name, partial(pettingzoo.make, "parallel", name))
+    suite_task = find_task(name)
+    if suite_task is not None:
+        return TeamEnvironment(name, _maker(suite_task), suite_task)
     if ":" in name or "." in name or _is_module(name):
         module, _, function = name.partition(":")
         return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"--env {name}"))
     raise ValueError(f"{unknown_name('environment', env_id, ENV_IDS)}; others are named {HOW_TO_NAME}")
+
+
+def _maker(one: SuiteTask) -> Callable[..., Any]:
+    """Return what makes one game of a suite's task."""
+    if one.suite.vec_env is None:
+        assert one.suite.game is not None
+        return partial(one.suite.game, one.task)
+    return partial(_vec_game, one.suite.vec_env, one.task)
+
+
+def _vec_game(make: Callable[..., Any], task: str, **params: Any) -> VecGame:
+    return VecGame(make(task, 1, None, **params))
 
 
 def _is_module(name: str) -> bool:

@@ -20,6 +20,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.make import make_team_env
+from sb3_saf.suites.registry import suites
 from sb3_saf.training.algorithms import ALGOS, AlgorithmSpec, find_algorithm
 from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
 from sb3_saf.training.names import unknown_name
@@ -96,8 +97,10 @@ class Settings:
     @property
     def is_exactly_resumable(self) -> bool:
         """Whether checkpoints hold the state of the games; others begin new episodes on resuming."""
-        wrapped = wraps_games(self.wrapping) or "vec_env_wrapper" in self.wrapping
-        return self.environment.task is not None and not wrapped
+        if wraps_games(self.wrapping) or "vec_env_wrapper" in self.wrapping:
+            return False
+        task = self.environment.suite_task
+        return self.environment.task is not None if task is None else task.suite.exact_resume
 
     @property
     def total_timesteps(self) -> int:
@@ -126,9 +129,11 @@ class Settings:
         """
         task, params = self.environment.task, dict(self.env_kwargs)
         source: Any = task
-        if task is None or wraps_games(self.wrapping):
+        if self.environment.suite_task is not None and not wraps_games(self.wrapping):
+            source = self.env_id
+        elif task is None or wraps_games(self.wrapping):
             source, params = partial(self.make_game, render_mode), {}
-        elif render_mode is not None:
+        if not callable(source) and render_mode is not None:
             params["render_mode"] = render_mode
         env = make_team_env(
             source,
@@ -260,9 +265,9 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
 
 def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment, source: str) -> None:
     """Refuse entries that no environment would read."""
-    known = (DEFAULT, HECOGRID, *ENV_IDS, environment.id)
+    known = (DEFAULT, HECOGRID, *ENV_IDS, *suites(), environment.id)
     for key in content:
-        if key not in known and not {".", ":"} & set(str(key)):
+        if key not in known and not {".", ":", "/"} & set(str(key)):
             raise ValueError(f"{source}: {unknown_name('environment', key, known)}")
 
 

@@ -1,0 +1,68 @@
+"""All suites, found by their files, and tasks by id."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import warnings
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import sb3_saf.suites
+from sb3_saf.suites.suite import Suite
+
+
+class SuiteTask(NamedTuple):
+    """
+    A task of a suite that is installed.
+
+    :param suite: its declaration
+    :param task: its name, what stands after the slash
+    """
+
+    suite: Suite
+    task: str
+
+    @property
+    def id(self) -> str:
+        """Return the name by which users ask for it."""
+        return f"{self.suite.name}/{self.task}"
+
+    def warn_if_competitive(self) -> None:
+        """Say once for each caller what training its agents as one team means."""
+        if self.suite.is_competitive(self.task):
+            warnings.warn(
+                f"agents of {self.id} play against each other; here all agents of a game are one team that shares one "
+                "policy, so both sides are trained as one",
+                UserWarning,
+                stacklevel=3,
+            )
+
+
+@cache
+def suites() -> dict[str, Suite]:
+    """Return the declarations of all suites by name."""
+    return {suite.name: suite for suite in _declared()}
+
+
+def _declared() -> Iterator[Suite]:
+    for module in pkgutil.iter_modules(sb3_saf.suites.__path__, f"{sb3_saf.suites.__name__}."):
+        if module.name.endswith("__main__"):
+            continue
+        found: Any = getattr(importlib.import_module(module.name), "SUITE", None)
+        for one in found if isinstance(found, tuple) else (found,):
+            if isinstance(one, Suite):
+                yield one
+
+
+def find_task(env_id: str) -> SuiteTask | None:
+    """
+    Look a task up by an id such as ``"lbf/Foraging-8x8-2p-3f-v3"``.
+
+    :return: None if no suite has the part before the slash as its name
+    :raises ValueError: if the suite's package is missing or of another version, or has no such task
+    """
+    name, slash, task = env_id.partition("/")
+    suite = suites().get(name) if slash else None
+    return None if suite is None else SuiteTask(suite, suite.check_task(task))

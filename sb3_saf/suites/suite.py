@@ -1,0 +1,129 @@
+"""What a suite declares, and how it says that its package is not there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final, Literal
+
+from packaging.requirements import Requirement
+
+#: How the rewards of a team's agents become one number.
+Reduction = Literal["sum", "mean"]
+
+#: Nearest names that a message shows.
+_N_NEAREST: Final = 3
+
+
+@dataclass(frozen=True)
+class Suite:
+    """
+    A package of games for teams. Exactly one of ``game`` and ``vec_env`` is given; see :mod:`sb3_saf.suites`.
+
+    :param name: what stands before the slash of an id
+    :param title: one line
+    :param requires: what is installed from a package index, as pip writes it, the suite's own package first; the same
+        lines as the extra of ``setup.cfg``
+    :param extra: of ``setup.cfg``, which installs it
+    :param page: address of the package's documentation
+    :param list_tasks: returns the names after the slash; called when the package is installed, which it may import
+    :param examples: tasks that ``python -m sb3_saf.suites`` shows with agents and spaces
+    :param game: makes one game: ``game(task, *, render_mode=None, **params)``
+    :param vec_env: makes all games: ``vec_env(task, n_envs, seed, *, state=False, render_mode=None, **params)``
+    :param competitive: patterns of tasks whose agents play against each other
+    :param team_return: the suite's own unit of an episode's return: the sum over agents of their rewards, or the mean
+        (where every agent is given the team's whole reward)
+    :param team_reward: what agents are given to learn from, see ``make_team_env``
+    :param has_state: whether ``state=True`` can be asked for
+    :param exact_resume: whether the VecEnv gives its state to checkpoints
+    """
+
+    name: str
+    title: str
+    requires: tuple[str, ...]
+    extra: str
+    page: str
+    list_tasks: Callable[[], Sequence[str]]
+    examples: tuple[str, ...]
+    game: Callable[..., Any] | None = None
+    vec_env: Callable[..., Any] | None = None
+    competitive: tuple[str, ...] = ()
+    team_return: Reduction = "sum"
+    team_reward: Literal["given"] | Reduction = "given"
+    has_state: bool = False
+    exact_resume: bool = False
+
+    def __post_init__(self) -> None:
+        assert (self.game is None) != (self.vec_env is None), f"{self.name}: exactly one of game and vec_env"
+
+    @property
+    def requirements(self) -> tuple[Requirement, ...]:
+        """What this interpreter needs, parsed."""
+        parsed = (Requirement(line) for line in self.requires)
+        return tuple(one for one in parsed if one.marker is None or one.marker.evaluate())
+
+    @property
+    def pip_line(self) -> str:
+        """The command that installs the suite."""
+        return f"pip install 'sb3-saf[{self.extra}]'"
+
+    def installed_version(self) -> str | None:
+        """Return the version of the suite's own package, None if it is not installed."""
+        return _version(Requirement(self.requires[0]).name)
+
+    def problem(self) -> str | None:
+        """Return why no game can be made, None if all that is needed is installed."""
+        if not self.requirements:
+            return f"needs another version of Python: {'; '.join(self.requires)}"
+        for requirement in self.requirements:
+            found = _version(requirement.name)
+            if found is None:
+                return f"needs {requirement.name}, which is not installed: {self.pip_line}"
+            if not requirement.specifier.contains(found, prereleases=True):
+                return (
+                    f"works with {requirement.name}{requirement.specifier}, got version {found}: "
+                    f"pip install '{requirement.name}{requirement.specifier}'"
+                )
+        return None
+
+    @cached_property
+    def tasks(self) -> tuple[str, ...]:
+        """
+        Names after the slash.
+
+        :raises ValueError: if the package is missing or of a version that cannot work, with what to install
+        """
+        if (problem := self.problem()) is not None:
+            raise ValueError(f"{self.name}/... {problem}")
+        return tuple(self.list_tasks())
+
+    def is_competitive(self, task: str) -> bool:
+        """Return whether the agents of a task play against each other."""
+        return any(fnmatchcase(task, pattern) for pattern in self.competitive)
+
+    def check_task(self, task: str) -> str:
+        """
+        Return the name of a task.
+
+        :raises ValueError: if there is no such task, naming the nearest and the command that lists all
+        """
+        if task in self.tasks:
+            return task
+        near = get_close_matches(task, self.tasks, n=_N_NEAREST)
+        shown = [f"{self.name}/{name}" for name in near or self.examples]
+        raise ValueError(
+            f"unknown task {f'{self.name}/{task}'!r}; "
+            f"{'did you mean' if near else 'there are'} {', '.join(shown)}{'?' if near else ', ...'} "
+            f"(python -m sb3_saf.suites {self.name} lists all {len(self.tasks)})"
+        )
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

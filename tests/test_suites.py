@@ -1,0 +1,204 @@
+"""Suites of others' games: what they declare, how they are found, and the real games as rows of teams."""
+
+from __future__ import annotations
+
+import configparser
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+
+from sb3_saf import RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf.envs.gymnasium_team import GymnasiumTeam
+from sb3_saf.envs.team_game import EqualSpaces
+from sb3_saf.suites.__main__ import main
+from sb3_saf.suites.registry import find_task, suites
+from sb3_saf.suites.suite import Suite
+from sb3_saf.training.environments import find_environment
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _examples() -> list[Any]:
+    return [
+        pytest.param(f"{suite.name}/{task}", marks=[_needs(suite.name)])
+        for suite in suites().values()
+        for task in suite.examples
+    ]
+
+
+def _needs(name: str) -> pytest.MarkDecorator:
+    problem = suites()[name].problem()
+    return pytest.mark.skipif(problem is not None, reason=str(problem))
+
+
+def _random_episodes(env_id: str, seed: int, n_steps: int = 12) -> list[Any]:
+    """Return observations, rewards and dones of random actions in two games."""
+    env = make_team_env(env_id, n_envs=2, seed=seed)
+    policy = RandomPolicy(env, seed=1)
+    obs: Any = env.reset()
+    found: list[Any] = []
+    for _ in range(n_steps):
+        actions, _ = policy.predict(obs)
+        obs, rewards, dones, _ = env.step(actions)
+        found.append({**obs, "reward": rewards, "done": dones})
+    env.close()
+    return found
+
+
+# --- declarations -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suite", suites().values(), ids=list(suites()))
+def test_the_extra_of_a_suite_installs_what_it_requires(suite: Suite) -> None:
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg", encoding="utf-8")
+    lines = config["options.extras_require"][suite.extra].strip().splitlines()
+    assert [line for line in lines if not line.startswith("#")] == list(suite.requires)
+
+
+def test_what_is_said_of_packages_that_are_missing_or_of_another_version() -> None:
+    one: dict[str, Any] = {"title": "", "extra": "x", "page": "", "list_tasks": list, "examples": (), "game": print}
+    assert Suite("x", requires=("no-such-package>=2",), **one).problem() == (
+        "needs no-such-package, which is not installed: pip install 'sb3-saf[x]'"
+    )
+    old = Suite("x", requires=("gymnasium<0.1",), **one)
+    assert f"works with gymnasium<0.1, got version {gym.__version__}: pip install 'gymnasium<0.1'" == old.problem()
+    with pytest.raises(ValueError, match=r"x/\.\.\. works with gymnasium<0.1"):
+        old.check_task("y")
+    assert "another version of Python" in str(Suite("x", requires=('a; python_version < "3"',), **one).problem())
+
+
+@_needs("lbf")
+def test_unknown_ids_name_the_nearest() -> None:
+    for name, expected in (
+        ("lbf/Foraging-8x8-2p-3f", "did you mean lbf/Foraging-8x8-2p-3f-v3, .*sb3_saf.suites lbf lists all 1920"),
+        ("lbf/zzz", "there are lbf/Foraging-8x8-2p-3f-v3, "),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            make_team_env(name)
+        with pytest.raises(ValueError, match=expected):
+            find_environment(name)
+    with pytest.raises(ValueError, match=r"cannot be made with \{'colour': 1\}"):
+        make_team_env("lbf/Foraging-8x8-2p-3f-v3", colour=1)
+
+
+@_needs("mpe")
+def test_competitive_games_are_said_to_be_trained_as_one_team() -> None:
+    with pytest.warns(UserWarning, match="simple_tag_v3 play against each other; .* one team"):
+        make_team_env("mpe/simple_tag_v3")
+
+
+def test_the_listing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    listed = capsys.readouterr().out
+    for suite in suites().values():
+        assert suite.title in listed
+        assert suite.pip_line in listed or f"{suite.name}/{suite.examples[0]}: " in listed
+    assert main(["lbff"]) == 2
+    assert "did you mean 'lbf'" in capsys.readouterr().err
+
+
+# --- every task -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", _examples())
+def test_a_task_is_trained_on_and_played(env_id: str) -> None:
+    env = make_team_env(env_id, n_envs=2, seed=0)
+    model = PPO(
+        "SAFPolicy",
+        env,
+        n_steps=8,
+        batch_size=16 * env.n_agents,
+        n_epochs=1,
+        rollout_buffer_class=TeamRolloutBuffer,
+        seed=0,
+    )
+    model.learn(8 * env.num_envs)
+    assert env.observation_space.contains({key: value[0] for key, value in env.reset().items()})
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", _examples())
+def test_seeds_decide_what_happens(env_id: str) -> None:
+    first, again, other = (_random_episodes(env_id, seed) for seed in (3, 3, 4))
+    for step, same in zip(first, again, strict=True):
+        for key, value in step.items():
+            np.testing.assert_array_equal(value, same[key], err_msg=key)
+    assert any((step["obs"] != different["obs"]).any() for step, different in zip(first, other, strict=True))
+
+
+# --- suites of their own kind -----------------------------------------------------------------------------------------
+
+
+class PickUp(gym.Env[Any, Any]):
+    """Two agents, lists of observations, masks, an end that is a time limit unless both chose 1."""
+
+    observation_space = spaces.Tuple([spaces.Box(0, 9, (2,))] * 2)
+    action_space = spaces.Tuple([spaces.Discrete(3)] * 2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.count = 0
+        return self._seen()
+
+    def step(self, actions: Any) -> Any:
+        self.count += 1
+        self.done = list(actions) == [1, 1]
+        observations, info = self._seen()
+        return observations, [1.0, 2.0], self.done or self.count == 3, False, info
+
+    def _seen(self) -> Any:
+        seen = np.array([self.count, 0], dtype=np.float32)
+        return (seen, seen + 1), {"action_mask": [[1, 1, 0], [0, 1, 1]]}
+
+
+def test_a_gymnasium_environment_of_several_agents_is_taken_as_it_is() -> None:
+    env = make_team_env(PickUp(), n_envs=2, seed=0)
+    obs = env.reset()
+    assert obs["action_mask"].tolist() == [[1, 1, 0], [0, 1, 1]] * 2
+    _, rewards, dones, _ = env.step(np.array([1, 1, 0, 1]))
+    assert rewards.tolist() == [1, 2, 1, 2] and dones.tolist() == [True, True, False, False]
+    with pytest.raises(ValueError, match=r"Tuples with one entry per agent.*for one agent use Stable-Baselines3"):
+        GymnasiumTeam(gym.make("CartPole-v1"))
+
+
+@_needs("lbf")
+def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
+    env: Any = find_environment("lbf/Foraging-8x8-2p-3f-v3").make_game({})
+    env.reset(seed=0)
+    for _ in range(50):
+        *_, terminations, truncations, infos = env.step(dict.fromkeys(env.possible_agents, 0))
+    assert set(terminations.values()) == {False} and set(truncations.values()) == {True} and not env.agents
+    assert infos["agent_0"]["is_success"] is False
+    env.reset(seed=0)
+    env.unwrapped.env.unwrapped.field[:] = 0
+    *_, terminations, truncations, infos = env.step(dict.fromkeys(env.possible_agents, 0))
+    assert set(terminations.values()) == {True} and set(truncations.values()) == {False}
+    assert infos["agent_0"]["is_success"] is True
+
+
+@_needs("mpe")
+def test_agents_with_other_spaces_are_padded_and_masked() -> None:
+    game = find_environment("mpe/simple_speaker_listener_v4").make_game({})
+    assert isinstance(game, EqualSpaces)
+    observations, infos = game.reset(seed=0)
+    own, _ = game.env.reset(seed=0)
+    for agent, n_actions in (("speaker_0", 3), ("listener_0", 5)):
+        size = len(own[agent])
+        np.testing.assert_array_equal(observations[agent][:size], own[agent])
+        assert not observations[agent][size:].any() and len(observations[agent]) == 11
+        assert infos[agent]["action_mask"].tolist() == [1] * n_actions + [0] * (5 - n_actions)
+    with pytest.raises(ValueError, match="speaker_0 has 3 actions, got action 4, which is masked"):
+        game.step({"speaker_0": 4, "listener_0": 0})
+    env = make_team_env("mpe/simple_speaker_listener_v4", n_envs=2, seed=0)
+    evaluate_team(RandomPolicy(env, seed=0), env, 4)  # would raise at a masked action
+
+
+def test_ids_of_no_suite_are_left_to_others() -> None:
+    assert find_task("TeamTogether") is None
+    assert find_task("hecogrid/TeamTogether-v0") is None
