@@ -41,6 +41,7 @@ def _names(declaration: Declaration) -> Iterator[tuple[type[BaseAlgorithm], str,
         yield from ((algorithm, policy.__name__, policy) for policy in policies)
         yield algorithm, f"{declaration.name}Policy", policies[0]
         yield algorithm, declaration.name, policies[0]
+        yield algorithm, declaration.name.lower(), policies[0]
 
 
 def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:

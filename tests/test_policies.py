@@ -15,7 +15,7 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
@@ -114,6 +114,7 @@ def equal_weights(one: th.nn.Module, other: th.nn.Module) -> bool:
 def test_names_are_registered(algorithm: type[PPO] | type[A2C]) -> None:
     aliases = algorithm.policy_aliases
     assert [aliases[name] for name in NAMES] == POLICIES
+    assert aliases["saf"] is aliases["SAF"] is aliases["SAFPolicy"]
     assert issubclass(aliases["MlpPolicy"], ActorCriticPolicy)
 
 
@@ -426,6 +427,16 @@ def test_any_features_extractor_gets_the_own_space_and_what_sb3_prepares() -> No
     th.testing.assert_close(raw.extract_features(obs), raw.features_extractor(obs["obs"].float()), rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="encodes with its own features_extractor"):
         policy.extract_features(obs, raw.features_extractor)
+
+
+@pytest.mark.parametrize(
+    ("extractor", "own"), [(CombinedExtractor, VECTOR), (NatureCNN, CodeSpace()), (NatureCNN, PICTURE)]
+)
+def test_an_extractor_for_another_space_is_refused_with_those_that_fit(
+    extractor: type[BaseFeaturesExtractor], own: spaces.Space[Any]
+) -> None:
+    with pytest.raises(ValueError, match=rf"{extractor.__name__} does not take it \(.+\); leave it out \(Observ"):
+        make_policy(MAPPOPolicy, own, features_extractor_class=extractor, features_extractor_kwargs={})
 
 
 @pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW])

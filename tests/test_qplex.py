@@ -387,6 +387,11 @@ def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], onnx:
                 actor.probabilities(own)
 
 
+def test_a_policy_of_ppo_is_refused_with_those_that_fit() -> None:
+    with pytest.raises(ValueError, match=r"expected one of QPLEX's policies, 'QPLEXPolicy', .*, got 'SAFPolicy'"):
+        QPLEX("SAFPolicy", toy_env())
+
+
 def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"its memory reads the agent's last action, too; act with model\.predict"):
         export_actors(make_model(policy="QPLEXLstmPolicy"), tmp_path / "actor", onnx=False)

@@ -61,3 +61,17 @@ def test_roles_are_learned_by_actors_that_read_who_acts(actor_identity: bool, le
     rows: dict[str, np.ndarray] = {"obs": np.tile(SEEN, (900, 1)), "agent": np.arange(900) % 3}
     actions, _ = model.predict(rows, deterministic=False)
     assert least < (actions == rows["agent"]).mean() <= most
+
+
+def test_one_agent_alone_must_say_who_it_is() -> None:
+    model = PPO(
+        "MAPPOPolicy",
+        make_team_env(Buttons, seed=0),
+        policy_kwargs={"actor_identity": True, "net_arch": [8]},
+        device="cpu",
+    )
+    with pytest.raises(
+        ValueError, match=r"\{'obs': \.\.\., 'agent': its index\}, or the observations of all agents by"
+    ):
+        model.predict(SEEN)
+    model.predict({"obs": SEEN, "agent": np.array(1)})

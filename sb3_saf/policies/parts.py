@@ -120,7 +120,7 @@ class Declaration:
 
     :param name: what it is called, such as ``"SAF"``
     :param policies: its policy classes, by the algorithms of SB3 and sb3-contrib that train them; the first of each is
-        also known as ``f"{name}Policy"`` and as ``name``
+        also known as ``f"{name}Policy"``, as ``name`` and as that in lower case
     :param commands: its names on command lines, in log folders and results
     :param paper_table: None for an algorithm that is not in it
     """

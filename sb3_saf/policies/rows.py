@@ -63,8 +63,21 @@ class TeamRowsPolicy(BasePolicy):
         self.row_encoder = RowEncoder(self._encode, encode_once)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Make the encoder, for the observations of one agent."""
-        return self.features_extractor_class(self.team_spaces.own, **self.features_extractor_kwargs)
+        """
+        Make the encoder, for the observations of one agent.
+
+        :raises ValueError: if its class does not take their space
+        """
+        own, kind = self.team_spaces.own, self.features_extractor_class
+        try:
+            return kind(own, **self.features_extractor_kwargs)
+        except (AssertionError, AttributeError, RuntimeError) as error:
+            raise ValueError(
+                f"expected a features_extractor_class that encodes one agent's own observation, {own}, but "
+                f"{kind.__name__} does not take it ({str(error).splitlines()[0]}); leave it out (ObservationEncoder "
+                "chooses by the space), or pass sb3_saf.LightEncoder, MLPEncoder, or a BaseFeaturesExtractor for that "
+                "space. SB3's CombinedExtractor is for Dict observations, whose entries policies of teams take apart"
+            ) from error
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor | None = None) -> th.Tensor:
         """
@@ -165,7 +178,7 @@ class TeamRowsPolicy(BasePolicy):
 
     def _agent(self, obs: PyTorchObs) -> th.Tensor:
         """(B,) agents' indices; buffers give them as (B, 1), some as floats."""
-        return entry_of(obs, AGENT_KEY, "a critic or head that depends on the agent").reshape(-1).long()
+        return entry_of(obs, AGENT_KEY, "an actor or critic that depends on the agent").reshape(-1).long()
 
     def _active(self, obs: PyTorchObs) -> th.Tensor | None:
         """(B, N) bool, agents of the rows' teams that take part; None if all always do."""
@@ -282,10 +295,11 @@ def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
     """Return an entry of rows, or raise the error that ``reader`` needs it."""
     if isinstance(obs, th.Tensor) or (key not in obs and not isinstance(obs, TeamMinibatch)):
+        index = f", {{{OBS_KEY!r}: ..., {AGENT_KEY!r}: its index}}, or the observations of all agents by name"
         raise ValueError(
             f"expected the observation to have {key!r}, which {reader} reads, got "
             f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs))}; pass whole rows of "
-            "sb3_saf.CentralizedValueWrapper"
+            f"sb3_saf.CentralizedValueWrapper{index if key == AGENT_KEY else ''}"
         )
     return obs[key]
 

@@ -125,6 +125,9 @@ class QPLEX(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            names = ", ".join(repr(name) for name, kind in self.policy_aliases.items() if name == kind.__name__)
+            raise ValueError(f"expected one of QPLEX's policies, {names}, got {policy!r}; PPO trains the others")
         if mixer is not None:
             check_mixer(mixer)
             policy_kwargs = {**(policy_kwargs or {}), "mixer": mixer}
