@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import sys
+import tempfile
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ for variable, value in {
     "PYGAME_HIDE_SUPPORT_PROMPT": "1",
     "SDL_AUDIODRIVER": "dummy",
     "SDL_VIDEODRIVER": "dummy",
+    # Where the key is kept that signs games in checkpoints.
+    "XDG_STATE_HOME": os.path.join(tempfile.gettempdir(), "sb3_saf_tests"),
 }.items():
     os.environ.setdefault(variable, value)
 

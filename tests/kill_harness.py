@@ -42,7 +42,7 @@ import torch as th
 import sb3_saf
 from sb3_saf.checkpoints.callback import TeamCheckpointCallback
 from sb3_saf.checkpoints.store import CheckpointFolder
-from tests.killed_runs import ALGOS, ROLLOUT, Run, make_run
+from tests.killed_runs import ALGOS, GAMES, ROLLOUT, Games, Run, make_run
 
 #: What is counted in a run.
 KINDS: Final = ("rollout", "update", "writing")
@@ -159,10 +159,10 @@ def _halve(file: int) -> None:
 # --- one run ----------------------------------------------------------------------------------------------------------
 
 
-def train(algo: str, folder: Path, rollouts: int, watch: Watch) -> None:
+def train(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) -> None:
     """The run: started again in the same folder, it goes on."""
     th.set_num_threads(1)
-    run = make_run(algo, folder)
+    run = make_run(algo, folder, games)
     with watch.on(run):
         sb3_saf.resumable_learn(
             run.model, rollouts * ROLLOUT, folder / "checkpoints", run.evaluation, every_game_steps=run.every
@@ -170,35 +170,35 @@ def train(algo: str, folder: Path, rollouts: int, watch: Watch) -> None:
     np.savez(folder / "weights.npz", allow_pickle=False, **run.arrays())
 
 
-def start(algo: str, folder: Path, rollouts: int, watch: Watch) -> BaseProcess:
+def start(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) -> BaseProcess:
     """Start the run in a process of its own, which has all imports already."""
-    process = mp.get_context("fork").Process(target=train, args=(algo, folder, rollouts, watch))
+    process = mp.get_context("fork").Process(target=train, args=(algo, games, folder, rollouts, watch))
     process.start()
     return process
 
 
-def finish(algo: str, folder: Path, rollouts: int) -> Watch:
+def finish(algo: str, games: Games, folder: Path, rollouts: int) -> Watch:
     """
     Start the run and wait for its end.
 
     :raises RuntimeError: if it fails
     """
     watch = Watch()
-    process = start(algo, folder, rollouts, watch)
+    process = start(algo, games, folder, rollouts, watch)
     process.join()
     if process.exitcode:
         raise RuntimeError(f"the run in {folder} failed with exit code {process.exitcode}")
     return watch
 
 
-def kill(algo: str, folder: Path, rollouts: int, moment: Moment) -> str | None:
+def kill(algo: str, games: Games, folder: Path, rollouts: int, moment: Moment) -> str | None:
     """
     Start the run and kill it.
 
     :return: what it was doing; None if it was done before its moment came
     """
     watch = Watch(None if moment.kind == CLOCK else moment)
-    process = start(algo, folder, rollouts, watch)
+    process = start(algo, games, folder, rollouts, watch)
     if moment.kind == CLOCK:
         time.sleep(moment.when)
         process.kill()
@@ -226,7 +226,7 @@ def _episodes(folder: Path) -> list[str]:
 # --- many kills -------------------------------------------------------------------------------------------------------
 
 
-def kill_in_a_row(algo: str, rollouts: int, moments: Sequence[Moment]) -> tuple[list[str | None], bool]:
+def kill_in_a_row(algo: str, games: Games, rollouts: int, moments: Sequence[Moment]) -> tuple[list[str | None], bool]:
     """
     Kill one run several times, then let it finish.
 
@@ -234,13 +234,13 @@ def kill_in_a_row(algo: str, rollouts: int, moments: Sequence[Moment]) -> tuple[
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        finish(algo, folder / "undisturbed", rollouts)
-        doing = [kill(algo, folder / "killed", rollouts, moment) for moment in moments]
-        finish(algo, folder / "killed", rollouts)
+        finish(algo, games, folder / "undisturbed", rollouts)
+        doing = [kill(algo, games, folder / "killed", rollouts, moment) for moment in moments]
+        finish(algo, games, folder / "killed", rollouts)
         return doing, same(folder / "undisturbed", folder / "killed")
 
 
-def kill_one_by_one(algo: str, rollouts: int, kills: int, seed: int) -> tuple[Counter[str], Counter[str]]:
+def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: int) -> tuple[Counter[str], Counter[str]]:
     """
     Kill as many runs, each once, at drawn moments; resume and compare each.
 
@@ -251,15 +251,15 @@ def kill_one_by_one(algo: str, rollouts: int, kills: int, seed: int) -> tuple[Co
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         began = time.monotonic()
-        counts = finish(algo, folder / "undisturbed", rollouts).counts
+        counts = finish(algo, games, folder / "undisturbed", rollouts).counts
         seconds = time.monotonic() - began
         print(f"{algo}, undisturbed: {seconds:.1f} s, {counts}", flush=True)
         while sum(done.values()) < kills:
             kind = (*KINDS, CLOCK)[sum(done.values()) % 4]
             when = rng.uniform(0, seconds) if kind == CLOCK else rng.randint(1, counts[kind])
-            doing = kill(algo, folder / "killed", rollouts, Moment(kind, when))
+            doing = kill(algo, games, folder / "killed", rollouts, Moment(kind, when))
             newest = sorted(folder.glob("killed/checkpoints/checkpoint-*"))[-1:]
-            finish(algo, folder / "killed", rollouts)
+            finish(algo, games, folder / "killed", rollouts)
             is_equal = same(folder / "undisturbed", folder / "killed")
             if doing is not None:
                 done[kind] += 1
@@ -278,22 +278,25 @@ def main() -> None:
     """Run the harness, or one run alone."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
     parser.add_argument("--algo", choices=ALGOS, default="saf")
+    parser.add_argument("--game", choices=GAMES, default="hecogrid")
+    parser.add_argument("--cpus", type=int, default=1, help="worker processes of games of others")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--rollouts", type=int, default=40, help="length of the run")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--at", nargs="+", default=[], metavar="KIND:NUMBER", help="kill one run at these, in a row")
     parser.add_argument("--train", type=Path, metavar="FOLDER", help="only train, in this process")
     options = parser.parse_args()
+    games = Games(options.game, options.cpus)
     if options.train is not None:
-        train(options.algo, options.train, options.rollouts, Watch())
+        train(options.algo, games, options.train, options.rollouts, Watch())
         return
-    make_run(options.algo, None).warm_up()  # before the forks: they inherit what is compiled
+    make_run(options.algo, None, games).warm_up()  # before the forks: they inherit what is compiled
     if options.at:
         moments = [Moment(kind, int(number)) for kind, number in (text.split(":") for text in options.at)]
-        doing, is_equal = kill_in_a_row(options.algo, options.rollouts, moments)
+        doing, is_equal = kill_in_a_row(options.algo, games, options.rollouts, moments)
         print(json.dumps({"killed": doing, "equal": is_equal}))
         return
-    done, equal = kill_one_by_one(options.algo, options.rollouts, options.kills, options.seed)
+    done, equal = kill_one_by_one(options.algo, games, options.rollouts, options.kills, options.seed)
     for kind in (*KINDS, CLOCK):
         print(f"{options.algo}, {kind}: {equal[kind]} of {done[kind]} end bit-equal")
     sys.exit(equal != done)

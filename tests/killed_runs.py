@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from stable_baselines3 import PPO
 
 import sb3_saf
+from tests.toy_envs import LazyEnv
 
 N_AGENTS, N_GAMES, N_STEPS = 3, 4, 16
 #: Agent-steps of a rollout of PPO; the unit of a run's length for both algorithms.
@@ -59,25 +61,63 @@ class Run(NamedTuple):
         return found
 
 
-def make_run(algo: str, folder: Path | None) -> Run:
+class Games(NamedTuple):
+    """
+    What is played.
+
+    :param name: one of GAMES
+    :param n_cpus: worker processes of games of others
+    """
+
+    name: str = "hecogrid"
+    n_cpus: int = 1
+
+    def make(self, n_games: int, seed: int, monitor_dir: str | None = None) -> sb3_saf.CentralizedValueWrapper:
+        """Make parallel games."""
+        if self.name == "hecogrid":
+            return sb3_saf.make_team_env("TeamTogether", n_games, seed=seed, monitor_dir=monitor_dir, **_TASK)
+        make, n_cpus = GAMES[self.name], self.n_cpus
+        return sb3_saf.make_team_env(make, n_games, seed=seed, monitor_dir=monitor_dir, n_cpus=n_cpus)
+
+
+def _spread() -> Any:
+    return import_module("mpe2.simple_spread_v3").parallel_env(max_cycles=20)
+
+
+def _pursuit() -> Any:
+    return import_module("pettingzoo.sisl.pursuit_v5").parallel_env(
+        n_pursuers=N_AGENTS, x_size=8, y_size=8, n_evaders=4, max_cycles=20
+    )
+
+
+def _lazy() -> Any:
+    return LazyEnv(n_agents=N_AGENTS, max_cycles=20)
+
+
+#: Games of N_AGENTS agents: this package's; MPE's and SISL's; one that makes its generator late.
+GAMES: Final = {"hecogrid": None, "spread": _spread, "pursuit": _pursuit, "lazy": _lazy}
+
+
+def make_run(algo: str, folder: Path | None, games: Games = Games()) -> Run:  # noqa: B008 - it is a tuple
     """
     Make a run as a user's script makes it at every start.
 
     :param algo: one of ALGOS
     :param folder: for monitor.csv, TensorBoard and evaluations; None for none
+    :param games: what is played
     """
     where = None if folder is None else str(folder)
-    env = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=0, monitor_dir=where, **_TASK)
-    eval_env = sb3_saf.make_team_env("TeamTogether", 2, seed=99, **_TASK)
+    env = games.make(N_GAMES, 0, where)
+    eval_env = games.make(2, 99)
     evaluation = sb3_saf.TeamEvalCallback(
         eval_env, n_eval_episodes=2, eval_freq=200, log_path=where, deterministic=False, verbose=0
     )
     tensorboard = None if folder is None else str(folder / "tb")
     make, every = (_saf, 1) if algo == "saf" else (_qplex, 100)
-    return Run(make(env, tensorboard), evaluation, every)
+    return Run(make(env, tensorboard, _LIGHT if games.name == "hecogrid" else {"net_arch": [16]}), evaluation, every)
 
 
-def _saf(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None) -> PPO:
+def _saf(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None, networks: dict[str, Any]) -> PPO:
     return PPO(
         "SAFPolicy",
         env,
@@ -86,13 +126,13 @@ def _saf(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None) -> PPO:
         batch_size=ROLLOUT // 4,
         n_epochs=2,
         seed=0,
-        policy_kwargs=_LIGHT | {"normalize_values": True},
+        policy_kwargs=networks | {"normalize_values": True},
         rollout_buffer_class=sb3_saf.TeamRolloutBuffer,
         tensorboard_log=tensorboard,
     )
 
 
-def _qplex(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None) -> sb3_saf.QPLEX:
+def _qplex(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None, networks: dict[str, Any]) -> sb3_saf.QPLEX:
     """Its replay buffer is full after a third of the run; targets, exploration and learning rate change all along."""
     return sb3_saf.QPLEX(
         "QPLEXPoolPolicy",
@@ -105,6 +145,6 @@ def _qplex(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None) -> sb3
         target_update_interval=150,
         exploration_fraction=0.8,
         seed=0,
-        policy_kwargs=_LIGHT,
+        policy_kwargs=networks,
         tensorboard_log=tensorboard,
     )

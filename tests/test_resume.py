@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -27,6 +29,7 @@ import sb3_saf
 from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
 from sb3_saf.envs.teams import TeamVecEnvWrapper
 from tests.killed_runs import ALGOS
+from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
@@ -353,20 +356,55 @@ def test_ctrl_c_stops_qplex_at_the_next_step_and_the_second_one_at_once(
         assert f"checkpoint-{saved_at * N_GAMES:012d}.ckpt is saved" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("seed", [3, None])
-def test_foreign_games_begin_new_episodes_and_say_so_at_the_start(seed: int | None, tmp_path: Path) -> None:
-    def supersuit() -> Any:
-        env = sb3_saf.make_team_env("TeamTogether", N_GAMES, backend="supersuit", **TASK)
-        return make(tmp_path, env=env, seed=seed)
+def foreign(game: type[CounterEnv], n_cpus: int = 1, seed: int | None = 3) -> Any:
+    env = sb3_saf.make_team_env(functools.partial(game, max_cycles=5), N_GAMES, seed=3, n_cpus=n_cpus)
+    return make(env=env, seed=seed, policy_kwargs={"net_arch": [8]})
 
+
+@pytest.mark.parametrize("n_cpus", [1, 2])
+@pytest.mark.parametrize("game", [LazyEnv, StateEnv])
+def test_games_of_others_go_on_bit_for_bit(game: type[CounterEnv], n_cpus: int, tmp_path: Path) -> None:
+    struck(tmp_path, lambda: foreign(game, n_cpus), 20)
+    model = go_on(tmp_path, foreign(game, n_cpus))
+    assert weights(model) == weights(foreign(game).learn(WHOLE))
+    assert model.num_timesteps == WHOLE
+
+
+@pytest.mark.parametrize("seed", [3, None])
+def test_games_that_cannot_be_copied_begin_new_episodes_and_say_so_at_the_start(
+    seed: int | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(CheckpointError, match=r"SuperSuitVecEnv cannot give the state.*exact=False"):
-        resumable_learn(supersuit(), ROLLOUT, tmp_path / "exact", exact=True)
-    told = r"SuperSuitVecEnv cannot give the state of its games.*begins new episodes"
+        resumable_learn(foreign(StreamEnv, seed=seed), ROLLOUT, tmp_path / "exact", exact=True)
+    told = r"SuperSuitVecEnv cannot give the state of its games.*by pickle: .* without stream.*begins new episodes"
     with pytest.warns(UserWarning, match=told), pytest.raises(RuntimeError):
-        resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(20), every_game_steps=1)
+        resumable_learn(foreign(StreamEnv, seed=seed), 4 * ROLLOUT, tmp_path / "run", Lightning(20), every_game_steps=1)
+    model = foreign(StreamEnv, seed=seed)
+    model.set_logger(configure(str(tmp_path / "log"), ["log"]))
     with pytest.warns(UserWarning, match=told):
-        model = resumable_learn(supersuit(), 4 * ROLLOUT, tmp_path / "run", Lightning(-1))
+        resumable_learn(model, 4 * ROLLOUT, tmp_path / "run", Lightning(-1))
+    model.logger.close()
     assert model.num_timesteps == 4 * ROLLOUT
+    log = (tmp_path / "log" / "log.txt").read_text()
+    assert "new episodes begin" in log and "cannot give the state of its games" in log
+
+
+def test_pickled_games_of_strangers_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    struck(tmp_path / "ck", lambda: foreign(LazyEnv), 20)
+    undisturbed = weights(foreign(LazyEnv).learn(WHOLE))
+    shutil.copytree(tmp_path / "ck", tmp_path / "trusted")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
+    opened: list[object] = []
+    monkeypatch.setattr("sb3_saf.envs.game_copies._Unpickler.load", lambda reader: opened.append(reader))
+    with pytest.raises(CheckpointError, match="not signed with this user's key"):
+        resume(tmp_path / "ck", foreign(LazyEnv), [Lightning(-1)], exact=True)
+    with pytest.warns(UserWarning, match="not signed with this user's key.*new episodes begin"):
+        resume(tmp_path / "ck", foreign(LazyEnv), [Lightning(-1)])
+    assert not opened
+    monkeypatch.undo()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
+    model = resumable_learn(foreign(LazyEnv), WHOLE, tmp_path / "trusted", [Lightning(-1)], trust_games=True)
+    assert weights(model) == undisturbed
 
 
 def test_lines_of_a_monitor_file_are_kept(tmp_path: Path) -> None:

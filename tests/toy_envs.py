@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -358,6 +359,66 @@ class UnpicklableEnv(CounterEnv):
     def __init__(self, **kwargs: Any):
         super().__init__(**kwargs)
         self.lock = threading.Lock()
+
+
+class LazyEnv(CounterEnv):
+    """Makes its generator when it draws for the first time, which is not in ``reset``; later episodes go on with it."""
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        if seed is not None:
+            self.last_seed, self._rng = seed, None
+        self.agents = self.possible_agents[:]
+        self.steps = 0
+        self.episode += 1
+        return {a: np.zeros(3, np.float32) for a in self.agents}, {a: {} for a in self.agents}
+
+    def _observe(self) -> dict[str, Any]:
+        if self._rng is None:
+            self._rng = np.random.default_rng(self.last_seed)
+        return super()._observe()
+
+
+class GlobalEnv(CounterEnv):
+    """Draws from the global generators."""
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        return np.array([random.random(), index, np.random.random()], np.float32)  # noqa: NPY002
+
+
+class StateEnv(CounterEnv):
+    """
+    Gives its state as plain data.
+
+    :param forgets: whether it forgets its generator
+    """
+
+    def __init__(self, forgets: bool = False, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.forgets = forgets
+
+    def get_state(self) -> dict[str, Any]:
+        assert self._rng is not None
+        generator = None if self.forgets else self._rng.bit_generator.state
+        return {"steps": self.steps, "episode": self.episode, "agents": self.agents, "generator": generator}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        assert self._rng is not None
+        self.steps, self.episode, self.agents = state["steps"], state["episode"], list(state["agents"])
+        if state["generator"] is not None:
+            self._rng.bit_generator.state = state["generator"]
+
+
+class StreamEnv(CounterEnv):
+    """Its future is in an object that cannot be copied."""
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.stream = iter(number / 1000 for number in range(1000))
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        return np.array([self.steps, index, next(self.stream, 1.0)], np.float32)
 
 
 class TracingEnv(CounterEnv):

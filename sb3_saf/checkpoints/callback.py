@@ -137,12 +137,12 @@ class TeamCheckpointCallback(BaseCallback):
             environment_state(self.training_env)
             callback_states(self.others)
         except CheckpointError as error:
-            warnings.warn(
+            message = (
                 f"{str(error).partition(';')[0]}. If this run is interrupted, it goes on with the weights, optimiser "
-                "and counters of its last checkpoint and begins new episodes",
-                UserWarning,
-                stacklevel=2,
+                "and counters of its last checkpoint and begins new episodes"
             )
+            warnings.warn(message, UserWarning, stacklevel=2)
+            self.logger.log(message)
             return False
         return True
 

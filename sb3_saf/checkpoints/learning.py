@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -31,6 +32,7 @@ from sb3_saf.checkpoints.models import check_model_state, is_off_policy, load_mo
 from sb3_saf.checkpoints.runs import check_descriptions
 from sb3_saf.checkpoints.software import check_software, warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.envs.game_copies import ForeignGamesError, sign_games
 from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.errors import NonFiniteError
 
@@ -42,6 +44,9 @@ def resume(
     folder: str | os.PathLike[str],
     model: BaseAlgorithm,
     callback: BaseCallback | Sequence[BaseCallback] | None = None,
+    *,
+    exact: bool | None = None,
+    trust_games: bool = False,
 ) -> Path:
     """
     Load the newest good checkpoint into a model, its environment and its callbacks.
@@ -54,6 +59,8 @@ def resume(
     :param folder: of a TeamCheckpointCallback
     :param model: made as for the first start, with its environment
     :param callback: all callbacks, in the order of the first start; a TeamCheckpointCallback among them is left out
+    :param exact: True refuses a checkpoint whose games cannot go on; else they begin new episodes, with a warning
+    :param trust_games: whether to unpickle games that this user has not written: **this runs code from the file**
     :return: the file that was loaded
     :raises CheckpointError: if there is no good checkpoint, or model, environment, callbacks or seeds differ from those
         of the first start, naming the first difference
@@ -63,9 +70,21 @@ def resume(
     if loaded is None:
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
     others = [one for one in all_callbacks(callback) if not isinstance(one, TeamCheckpointCallback)]
-    _check(model, others, loaded.tree)
-    warn_of_differences(loaded.tree["software"])
-    _load(model, others, loaded.tree)
+    tree = loaded.tree
+    if trust_games:
+        sign_games([tree["environment"], tree["callbacks"]])
+    try:
+        _check(model, others, tree)
+    except ForeignGamesError as error:
+        if exact:
+            raise
+        warnings.warn(f"{error}. Now new episodes begin; all else goes on", UserWarning, stacklevel=2)
+        tree = {**tree, "environment": None, "callbacks": None}
+        _check(model, others, tree)
+    warn_of_differences(tree["software"])
+    _load(model, others, tree)
+    games = "new episodes begin" if tree["environment"] is None else "the games go on where they were, bit for bit"
+    model.logger.log(f"Resumed from {loaded.path}: {games}")
     return loaded.path
 
 
@@ -112,6 +131,7 @@ def resumable_learn(
     every_game_steps: int = 100_000,
     keep: int = 3,
     exact: bool | None = None,
+    trust_games: bool = False,
     finite: bool = True,
     again: str = "start the same command again to go on from there",
     **learn_arguments: Any,
@@ -129,6 +149,7 @@ def resumable_learn(
     :param every_game_steps: see :class:`TeamCheckpointCallback`
     :param keep: see :class:`TeamCheckpointCallback`
     :param exact: see :class:`TeamCheckpointCallback`
+    :param trust_games: see :func:`resume`
     :param finite: whether to look for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
     :param again: what a message after Ctrl-C and SIGTERM tells to do
     :param learn_arguments: of ``model.learn``
@@ -144,7 +165,7 @@ def resumable_learn(
     checkpoints.store.acquire()
     try:
         if checkpoints.store.checkpoints():
-            path = resume(folder, model, given)
+            path = resume(folder, model, given, exact=exact, trust_games=trust_games)
             if model.verbose >= 1:
                 print(f"Going on from {path}")
             learn_arguments["reset_num_timesteps"] = False

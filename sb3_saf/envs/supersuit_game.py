@@ -12,6 +12,7 @@ from gymnasium.vector.utils import iterate
 from supersuit.vector import MarkovVectorEnv
 
 from sb3_saf.envs import game_layers, parallel_calls
+from sb3_saf.envs.game_copies import Way, pickled, unpickled
 from sb3_saf.envs.game_form import OBSERVATION, AnyParallelEnv, GameForm
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.space_reader import SpaceReader
@@ -43,6 +44,8 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     :param index: of the game, for messages
     :param notes: gets a note if observations leave their bounds
     """
+
+    par_env: AnyParallelEnv
 
     def __init__(self, env: AnyParallelEnv, form: GameForm, index: int, notes: list[str]) -> None:
         _add_missing_attributes(env)
@@ -154,6 +157,32 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
             for key in RESERVED_KEYS.intersection(info):
                 info[f"game_{key}"] = info.pop(key)
         return info
+
+    # ---- copies
+
+    def snapshot(self, way: Way) -> dict[str, Any]:
+        """
+        Return all that the future of the game depends on, as plain data and bytes.
+
+        :param way: that :func:`~sb3_saf.envs.game_copies.find_way` has found
+        """
+        if way == "pickle":
+            content = {"pickled": pickled(self.par_env)}
+        else:
+            content = {"state": game_layers.get_attribute(self.par_env, "get_state")()}
+        return {"n_steps": self._n_steps, "ended": [agent in self._ended for agent in self.agents], **content}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a snapshot; the infos of the last reset are gone."""
+        if "pickled" in snapshot:
+            self.par_env = unpickled(snapshot["pickled"], self.par_env)
+        else:
+            parallel_calls.reset(self.par_env, None, None)
+            game_layers.get_attribute(self.par_env, "set_state")(snapshot["state"])
+        self._count_step(snapshot["n_steps"])
+        self._ended = {agent for agent, ended in zip(self.agents, snapshot["ended"], strict=True) if ended}
+        self._playing = self._find_playing()
+        self.reset_infos = [{} for _ in self.agents]
 
     # ---- rows
 

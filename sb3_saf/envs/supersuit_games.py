@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from supersuit.vector import ConcatVecEnv
 
+from sb3_saf.envs.game_copies import Way, find_way
 from sb3_saf.envs.game_form import GameForm
 from sb3_saf.envs.game_source import GameSource
 from sb3_saf.envs.supersuit_game import Info, Infos, TeamMarkovVectorEnv
@@ -57,6 +58,8 @@ class TeamConcatVecEnv(ConcatVecEnv):
             [lambda index=index: TeamMarkovVectorEnv(source.build(), form, index, self._notes) for index in indices]
         )
         self._n_agents = len(form.agents)
+        self._new_game = lambda: TeamMarkovVectorEnv(source.build(), form, indices[0], [])
+        self._way: Way | None = None
         _check_all_differ(self.vec_envs)
 
     def reset(
@@ -113,6 +116,25 @@ class TeamConcatVecEnv(ConcatVecEnv):
             for place, (game, question, args) in enumerate(questions)
             if game in games
         }
+
+    def snapshots(self) -> list[dict[str, Any]]:
+        """
+        Copy the games of this process (see :meth:`TeamMarkovVectorEnv.snapshot`).
+
+        :raises CheckpointError: if they cannot be copied
+        """
+        if self._way is None:
+            self._way = find_way(self._new_game)
+        return [game.snapshot(self._way) for game in self.vec_envs]
+
+    def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
+        """
+        Go on from snapshots.
+
+        :param snapshots: of all E games
+        """
+        for index, game in zip(self._indices, self.vec_envs, strict=True):
+            game.restore(snapshots[index])
 
     def close(self) -> None:
         """Close all games, once; then raise the first error."""

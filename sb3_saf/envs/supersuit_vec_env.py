@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from numbers import Integral
@@ -21,6 +21,8 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     tile_images,
 )
 
+from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
+from sb3_saf.envs.game_copies import check_signature, signature
 from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, check_is_parallel, first_infos_of, game_form
 from sb3_saf.envs.game_source import GameSource
 from sb3_saf.envs.space_reader import bounds_of, counted_from_zero, first_value
@@ -204,6 +206,67 @@ class SuperSuitVecEnv(VecEnv):
     def _check_open(self) -> None:
         if self._closed:
             raise RuntimeError("the vector environment is closed (it was closed); make a new one")
+
+    # ---- checkpoints
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`).
+
+        :return: plain data and bytes for :meth:`load_checkpoint_state`
+        :raises CheckpointError: if games cannot be copied
+        """
+        self._check_open()
+        snapshots = self._games.snapshots()
+        for snapshot in snapshots:
+            if "pickled" in snapshot:
+                snapshot["signature"] = signature(snapshot["pickled"])
+        return {
+            "seeds": list(self.seeded_with),
+            "next_seeds": list(self._next_seeds),
+            "begun": self._begun,
+            "warned": self._has_warned,
+            "games": snapshots if self._begun else [],
+        }
+
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that the games could be in this state, and that this user has signed what is pickled.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises CheckpointError: naming what does not fit
+        """
+        where = "the state of the games"
+        check_keys(state, ("seeds", "next_seeds", "begun", "warned", "games"), where)
+        for name in ("seeds", "next_seeds"):
+            check_list(state[name], f"{name} of the games", self.n_games)
+            for seed in state[name]:
+                if seed is not None:
+                    check_whole(seed, "the seed of a game")
+        check_like([state["begun"], state["warned"]], [True, True], where)
+        check_list(state["games"], where, self.n_games if state["begun"] else 0)
+        for game in state["games"]:
+            content = ("pickled", "signature") if "pickled" in game else ("state",)
+            check_keys(game, ("n_steps", "ended", *content), "the state of a game")
+            check_whole(game["n_steps"], "the steps of a game")
+            check_like(game["ended"], [True] * self.n_agents, "the agents that have ended")
+            if "pickled" in game:
+                check_array(game["pickled"], np.shape(game["pickled"]), np.uint8, "a pickled game")
+                check_signature(game["pickled"], game["signature"])
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises CheckpointError: see :meth:`check_checkpoint_state`
+        """
+        self.check_checkpoint_state(state)
+        if state["begun"]:
+            self._games.restore(state["games"])
+        self.seeded_with, self._next_seeds = tuple(state["seeds"]), list(state["next_seeds"])
+        self._begun, self._has_warned, self._actions = state["begun"], state["warned"], None
+        self.reset_infos = [{} for _ in range(self.num_envs)]
 
     # ---- what SB3 asks for by row
 

@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing import connection
@@ -148,6 +148,14 @@ class WorkerGames:
         for group in self._run("call", "ask", list(questions)):
             answers |= group
         return answers
+
+    def snapshots(self) -> list[dict[str, Any]]:
+        """Copy all games (see :class:`TeamConcatVecEnv`)."""
+        return [snapshot for group in self._run("call", "snapshots") for snapshot in group]
+
+    def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
+        """Go on from snapshots (see :class:`TeamConcatVecEnv`)."""
+        self._run("call", "restore", snapshots)
 
     def close(self) -> None:
         """Close all games and end the processes; then raise the first error of a game."""

@@ -180,7 +180,6 @@ class Training:
             self.callbacks,
             every_game_steps=checkpoint_freq,
             keep=2,
-            exact=self.settings.is_exactly_resumable,
             again=options.resume_hint,
             **arguments,
         )

@@ -95,14 +95,6 @@ class Settings:
         return find_environment(self.env_id)
 
     @property
-    def is_exactly_resumable(self) -> bool:
-        """Whether checkpoints hold the state of the games; others begin new episodes on resuming."""
-        if wraps_games(self.wrapping) or "vec_env_wrapper" in self.wrapping:
-            return False
-        task = self.environment.suite_task
-        return self.environment.task is not None if task is None else task.suite.exact_resume
-
-    @property
     def total_timesteps(self) -> int:
         """What ``learn`` takes: SB3 counts the steps of every agent."""
         return self.game_steps * self.n_agents

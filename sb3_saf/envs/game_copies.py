@@ -1,0 +1,314 @@
+"""
+Copies of games in progress: how a game gives its state, and whether a copy plays on as the game itself does.
+
+A game with ``get_state()`` and ``set_state(state)`` gives plain data. Any other one is pickled. Unpickling runs code
+from the file, so pickled games are signed with a key that only the user has, and others are refused.
+"""
+
+from __future__ import annotations
+
+import copyreg
+import hmac
+import os
+import pickle
+import random
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from copy import deepcopy
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
+
+import cloudpickle
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.utils import EzPickle
+
+from sb3_saf.checkpoints.data import decode, encode
+from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.envs.game_layers import layers_of
+from sb3_saf.envs.teams import ACTION_MASK_KEY
+
+if TYPE_CHECKING:
+    from sb3_saf.envs.supersuit_game import TeamMarkovVectorEnv
+
+#: How a game gives its state: by its own methods, or by being pickled.
+Way = Literal["get_state", "pickle"]
+
+#: Steps that a game plays before it is copied, and game and copy after that.
+TRIAL_STEPS: Final = 30
+#: Seconds after which a slow game stops playing, each time.
+TRIAL_SECONDS: Final = 2.0
+
+_KEY_BYTES: Final = 32
+
+
+class ForeignGamesError(CheckpointError):
+    """Pickled games that this user has not written."""
+
+
+# --- pickled games ----------------------------------------------------------------------------------------------------
+
+
+class _Place(NamedTuple):
+    """An attribute of a game, or of a wrapper around it."""
+
+    layer: int
+    name: str
+
+
+class _Pickler(cloudpickle.Pickler):
+    """
+    A pickler that also takes the state of :class:`gymnasium.utils.EzPickle`, which keeps constructor arguments.
+
+    :param file: to write to
+    :param left_out: objects that the game into which the state is loaded has of its own, by their ids
+    """
+
+    def __init__(self, file: BytesIO, left_out: Mapping[int, _Place]) -> None:
+        super().__init__(file)
+        self._left_out = left_out
+
+    def persistent_id(self, obj: Any) -> tuple[int, str] | None:
+        place = self._left_out.get(id(obj))
+        return None if place is None else (place.layer, place.name)
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
+            # Attributes are set one by one, past the class's own __setstate__.
+            return copyreg.__newobj__, (type(obj),), dict(vars(obj)), None, None, _set_attributes  # type: ignore[attr-defined]
+        return super().reducer_override(obj)
+
+
+def _set_attributes(obj: object, attributes: dict[str, Any]) -> None:
+    vars(obj).update(attributes)
+
+
+class _Unpickler(pickle.Unpickler):
+    """
+    Reads what :class:`_Pickler` wrote.
+
+    :param data: what it wrote
+    :param game: has the objects that were left out
+    """
+
+    def __init__(self, data: bytes, game: Any) -> None:
+        super().__init__(BytesIO(data))
+        self._layers = layers_of(game)
+
+    def persistent_load(self, pid: Any) -> Any:
+        return vars(self._layers[pid[0]])[pid[1]]
+
+
+def pickled(game: Any) -> npt.NDArray[np.uint8]:
+    """
+    Pickle a game, and the global generators of this process, from which it may draw.
+
+    Attributes that cannot be pickled (fonts, surfaces, windows) are left out: a new game has its own. Whether a game is
+    itself without them is shown by :func:`find_way`.
+    """
+    try:
+        data = _dump((game, _global_generators()), {})
+    except Exception:
+        data = _dump((game, _global_generators()), _unpicklable(game))
+    return np.frombuffer(data, dtype=np.uint8)
+
+
+def unpickled(data: npt.NDArray[np.uint8], game: Any) -> Any:
+    """
+    Unpickle a game, and let the global generators go on from where they were; only for what is signed.
+
+    :param data: what :func:`pickled` gave
+    :param game: made in the same way
+    """
+    found, generators = _Unpickler(data.tobytes(), game).load()
+    _set_global_generators(generators)
+    return found
+
+
+def _dump(data: Any, left_out: Mapping[int, _Place]) -> bytes:
+    file = BytesIO()
+    _Pickler(file, left_out).dump(data)
+    return file.getvalue()
+
+
+def _unpicklable(game: Any) -> dict[int, _Place]:
+    """Find the attributes of a game and of its wrappers that cannot be pickled."""
+    layers = layers_of(game)
+    own = {id(layer) for layer in layers}
+    found = {}
+    for number, layer in enumerate(layers):
+        for name, value in getattr(layer, "__dict__", {}).items():
+            try:
+                _dump(value, dict.fromkeys(own, _Place(number, name)))
+            except Exception:
+                found[id(value)] = _Place(number, name)
+    return found
+
+
+def _global_generators() -> tuple[Any, Any]:
+    return random.getstate(), np.random.get_state()  # noqa: NPY002 - games draw from it
+
+
+def _set_global_generators(states: tuple[Any, Any]) -> None:
+    random.setstate(states[0])
+    np.random.set_state(states[1])  # noqa: NPY002
+
+
+@contextmanager
+def _kept_generators() -> Iterator[None]:
+    before = _global_generators()
+    try:
+        yield
+    finally:
+        _set_global_generators(before)
+
+
+# --- signatures -------------------------------------------------------------------------------------------------------
+
+
+def key_file() -> Path:
+    """Return where the user's key is kept, made at its first use."""
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "sb3_saf" / "key"
+
+
+@cache
+def _key(path: Path) -> bytes:
+    """Return the user's key; one for this process alone if none can be kept."""
+    new = secrets.token_bytes(_KEY_BYTES)
+    temporary = path.with_name(f".key-{os.getpid()}-{secrets.token_hex(4)}")
+    with suppress(OSError):
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(new)
+            try:
+                os.link(temporary, path)  # whole, and only if another process has not been faster
+            finally:
+                temporary.unlink()
+    with suppress(OSError):
+        kept = path.read_bytes()
+        if len(kept) == _KEY_BYTES:
+            return kept
+    return new
+
+
+def signature(data: npt.NDArray[np.uint8]) -> str:
+    """Return this user's signature of a pickled game."""
+    return hmac.new(_key(key_file()), data.tobytes(), "sha256").hexdigest()
+
+
+def check_signature(data: npt.NDArray[np.uint8], signed: object) -> None:
+    """
+    Check that this user has signed a pickled game.
+
+    :raises ForeignGamesError: if not, with what to do
+    """
+    if not isinstance(signed, str) or not hmac.compare_digest(signature(data), signed):
+        raise ForeignGamesError(
+            "its games are pickled and were not signed with this user's key, and unpickling a stranger's file runs "
+            "code from it; pass trust_games=True if you know who wrote it (a run of your own on another machine, for "
+            f"instance; the key is in {key_file()})"
+        )
+
+
+def sign_games(tree: Any) -> None:
+    """Sign all pickled games of a checkpoint: the user trusts who wrote it."""
+    if isinstance(tree, dict):
+        if isinstance(tree.get("pickled"), np.ndarray):
+            tree["signature"] = signature(tree["pickled"])
+        tree = list(tree.values())
+    if isinstance(tree, (list, tuple)):
+        for part in tree:
+            sign_games(part)
+
+
+# --- trials -----------------------------------------------------------------------------------------------------------
+
+
+def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
+    """
+    Find out how games give a state from which a copy plays on in the same way.
+
+    A new game plays some steps and is copied; then both play the same actions, and begin another episode.
+
+    :param make_game: makes a game to try it with
+    :raises CheckpointError: if there is no such way, saying what is different
+    """
+    reasons = []
+    with _kept_generators():
+        for way in get_args(Way):
+            reason = _trial(make_game, way)
+            if reason is None:
+                return way
+            reasons.append(f"by {way}: {reason}")
+    raise CheckpointError(
+        f"SuperSuitVecEnv cannot give the state of its games ({', '.join(reasons)}), so a run on them cannot be "
+        "resumed exactly; a game can that is pickled with all its state, or has get_state() and set_state(state). "
+        "TeamCheckpointCallback(..., exact=False) begins new episodes on resuming instead"
+    )
+
+
+def _trial(make_game: Callable[[], TeamMarkovVectorEnv], way: Way) -> str | None:
+    """Return why a way does not do."""
+    original, copy = make_game(), make_game()
+    try:
+        reason = _difference(original, copy, way)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+    if reason is not None and way == "pickle":
+        left_out = [place.name for place in _unpicklable(original.par_env).values()]
+        reason += f" (it has to do without {', '.join(left_out)}, which cannot be pickled)" if left_out else ""
+    for game in (original, copy):
+        with suppress(Exception):
+            game.close()
+    return reason
+
+
+def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: Way) -> str | None:
+    """Return in what a game and its copy differ."""
+    rows, _ = _play(original, original.reset(seed=0)[0], TRIAL_STEPS)
+    copy.restore(decode(encode(original.snapshot(way), "trial")))
+    began = _global_generators()
+    _, seen = _play(original, rows, TRIAL_STEPS)
+    seen.append(_bytes_of(original.reset()[0]))
+    if way == "pickle":  # which takes the generators along
+        _set_global_generators(began)
+    _, seen_by_copy = _play(copy, rows, len(seen) - 1)
+    seen_by_copy.append(_bytes_of(copy.reset()[0]))
+    steps = [step for step, (one, other) in enumerate(zip(seen, seen_by_copy, strict=False)) if one != other]
+    if steps or len(seen) != len(seen_by_copy):
+        return f"{steps[0] + 1 if steps else len(seen_by_copy)} steps later a copy differs from the game"
+    return None
+
+
+def _play(game: TeamMarkovVectorEnv, rows: Any, n_steps: int) -> tuple[Any, list[bytes]]:
+    """Play random legal actions, the same in each call; return the last rows, and what was seen in each step."""
+    space = deepcopy(game.action_space)
+    space.seed(0)
+    seen: list[bytes] = []
+    deadline = time.monotonic() + TRIAL_SECONDS
+    while len(seen) < n_steps and time.monotonic() < deadline:
+        rows, *outcome, _ = game.step(_actions(space, rows, game.num_envs))
+        seen.append(_bytes_of([rows, *outcome]))
+    return rows, seen
+
+
+def _actions(space: spaces.Space[Any], rows: Any, n_rows: int) -> npt.NDArray[Any]:
+    masks = rows.get(ACTION_MASK_KEY) if isinstance(rows, Mapping) else None
+    if masks is None:
+        return np.array([space.sample() for _ in range(n_rows)], dtype=space.dtype)
+    return np.array([space.sample(mask) for mask in masks], dtype=space.dtype)
+
+
+def _bytes_of(data: Any) -> bytes:
+    if isinstance(data, Mapping):
+        data = list(data.values())
+    if isinstance(data, (list, tuple)):
+        return b"".join(map(_bytes_of, data))
+    return np.asarray(data).tobytes()

@@ -1,0 +1,99 @@
+"""Copies of SuperSuit's games play on as the games do."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hecogrid_envs.tasks import TASKS
+from sb3_saf import CheckpointError
+from sb3_saf.envs import game_copies
+from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
+from tests.toy_envs import CounterEnv, GlobalEnv, LazyEnv, OuterWrapper, StateEnv, UnpicklableEnv
+
+GAMES: dict[str, Any] = {
+    "a lazily made generator": LazyEnv,
+    "global generators": GlobalEnv,
+    "a lock": UnpicklableEnv,
+    "agents that die": partial(CounterEnv, deaths={0: 2}, max_cycles=7),
+    "a wrapper": lambda: OuterWrapper(LazyEnv()),
+    "HECOGrid": partial(TASKS["TeamTogether"], n_agents=2, grid_size=9, n_treasures=4, max_cycles=9),
+    "its own methods": StateEnv,
+    "own methods that forget": partial(StateEnv, forgets=True),
+}
+BY_METHODS = {"its own methods"}
+
+
+def played(venv: SuperSuitVecEnv, n_steps: int) -> list[bytes]:
+    rng = np.random.default_rng(0)
+    steps = [venv.step(rng.integers(0, 4, venv.num_envs)) for _ in range(n_steps)]
+    return [np.asarray(array).tobytes() for step in steps for array in step[:3]]
+
+
+@pytest.mark.parametrize("n_cpus", [1, 2])
+@pytest.mark.parametrize("name", GAMES)
+def test_copies_play_on_as_the_games(name: str, n_cpus: int) -> None:
+    venv, other = (SuperSuitVecEnv(GAMES[name], 3, seed, n_cpus) for seed in (0, 1))
+    try:
+        venv.reset()
+        played(venv, 4)
+        state = venv.checkpoint_state()
+        other.load_checkpoint_state(state)
+        assert all(("state" in game) == (name in BY_METHODS) for game in state["games"])
+        if name == "global generators" and n_cpus == 1:
+            before = game_copies._global_generators()
+            expected = played(venv, 20)
+            game_copies._set_global_generators(before)
+        else:
+            expected = played(venv, 20)
+        assert played(other, 20) == expected
+    finally:
+        venv.close()
+        other.close()
+
+
+def test_taking_a_state_draws_no_global_numbers() -> None:
+    venv = SuperSuitVecEnv(GlobalEnv, 1, seed=0)
+    venv.reset()
+    before = repr(np.random.get_state())  # noqa: NPY002
+    venv.checkpoint_state()
+    assert repr(np.random.get_state()) == before  # noqa: NPY002
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("seeds", [1]),
+        ("next_seeds", ["a", "b"]),
+        ("begun", 3),
+        ("games", []),
+        ("n_steps", -1),
+        ("ended", [True]),
+        ("pickled", None),
+        ("signature", "0" * 64),
+    ],
+)
+def test_states_are_checked(part: str, value: Any) -> None:
+    venv = SuperSuitVecEnv(LazyEnv, 2, seed=0)
+    venv.reset()
+    state = venv.checkpoint_state()
+    (state if part in state else state["games"][1])[part] = value
+    with pytest.raises(CheckpointError):
+        venv.load_checkpoint_state(state)
+
+
+def test_a_key_is_made_once_and_is_the_users_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    data = np.arange(9, dtype=np.uint8)
+    signed = game_copies.signature(data)
+    game_copies._key.cache_clear()
+    assert game_copies.signature(data) == signed
+    assert game_copies.key_file().stat().st_mode & 0o777 == 0o600
+    assert [path.name for path in game_copies.key_file().parent.iterdir()] == ["key"]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))  # no folder can be made there
+    assert game_copies.signature(data) == game_copies.signature(data) != signed
