@@ -6,9 +6,10 @@ import ast
 import doctest
 import importlib
 import re
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -58,6 +59,45 @@ def test_sessions_print_what_the_page_says(page: Path) -> None:
     outcome = doctest.DocTestRunner(verbose=False).run(test, out=said.append)
     assert outcome.attempted > 0
     assert outcome.failed == 0, "".join(said)
+
+
+class Page(NamedTuple):
+    """
+    A page whose Python blocks are run, in order.
+
+    :param path: of the page
+    :param small: what its numbers are replaced by, so that it is quick
+    :param given: names that it leaves to the reader
+    """
+
+    path: str
+    small: Mapping[str, str]
+    given: Mapping[str, Any] = {}
+
+
+OWN_ENVIRONMENT = "docs/reference/own_environment.md"
+GAMES = {"n_envs=16": "n_envs=2", "200_000 *": "400 *", "10_000, keep": "400, keep", "=10_000)": "=400)"}
+RUN = [
+    Page("README.md", {"100_000 *": "800 *", "n_envs=16": "n_envs=2", "=32)": "=2)"}, {"own_observation": np.ones(2)}),
+    Page(OWN_ENVIRONMENT, {"20_000 *": "800 *", "100_000 *": "800 *", "=32)": "=2)", "n_envs=8": "n_envs=2"}),
+    Page("docs/resume.md", {**GAMES, "eval_freq=20_000": "eval_freq=400"}),
+    Page(
+        "docs/qplex.md", {"60_000 *": "40 *", "n_envs=32": "n_envs=2", "n_envs=64": "n_envs=2", "games, 64": "games, 2"}
+    ),
+    Page("docs/zoo.md", {'"small"': '"smoke"', "n_envs=32": "n_envs=2"}),
+]
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.path)
+def test_code_of_a_page_runs(page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names: dict[str, Any] = dict(page.given)
+    exec(blocks(ROOT / OWN_ENVIRONMENT, "python")[0], names)  # a whole environment
+    code = "\n".join(blocks(ROOT / page.path, "python"))
+    for number, small in page.small.items():
+        assert number in code, f"{number} is no longer on the page"
+        code = code.replace(number, small)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, page.path, "exec"), names)
 
 
 @EVERY_PAGE
