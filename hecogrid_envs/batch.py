@@ -145,6 +145,11 @@ class GameBatch:
         self._accept(actions)
         self._play_all(STEP)
 
+    def _step_checked(self, actions: npt.NDArray[np.uint8]) -> None:
+        """As :meth:`step`, for actions that were checked one by one: to check a single game's again takes a tenth."""
+        self._take(actions)
+        self._play_all(STEP)
+
     def observe(self, out: U8 | None = None) -> U8:
         """
         Return the views of all agents.
@@ -185,6 +190,9 @@ class GameBatch:
         if actions.shape != shape:
             raise ValueError(f"actions must have shape {shape}, (games, agents), got {actions.shape}")
         check_actions(actions)
+        self._take(actions)
+
+    def _take(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         if not self._begun:
             self._check_begun()
         self._buffers.actions[...] = actions.reshape(-1)
@@ -356,7 +364,8 @@ def check_actions(actions: npt.NDArray[Any]) -> None:
     """
     if actions.dtype.kind not in "iu":
         raise ValueError(f"actions must be integers, got {actions.dtype}")
-    if actions.max() >= N_ACTIONS or (actions.dtype.kind == "i" and actions.min() < 0):
+    # Read without their sign, negative numbers are large ones.
+    if actions.view(f"u{actions.itemsize}").max() >= N_ACTIONS:
         rows = actions.reshape(-1)
         row = int(np.flatnonzero((rows < 0) | (rows >= N_ACTIONS))[0])
         raise ValueError(f"actions must be from 0 to {N_ACTIONS - 1}, got {rows[row]} in row {row}")

@@ -137,7 +137,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
             (after ``max_cycles`` steps) and infos, per agent
         :raises ValueError: for a missing or unknown agent, an action outside the space, or a step without a reset
         """
-        self._batch.step(self._checked(actions))
+        self._batch._step_checked(self._checked(actions))
         agents, reward = self.agents, float(self._batch.rewards[self._game])
         over = bool(self._batch.truncated[self._game])
         result = StepResult(

@@ -79,7 +79,9 @@ def _observe(games: Games, world: World, buffers: Buffers, task: int, out: U8, f
     else:
         codes = buffers.codes[first * world.n_agents * world.view_size**2 :]
         observe_tiles(games, world, codes, first, end)
-        draw_pictures(games, world, codes, out, first, end)
+        draw_pictures(
+            codes, games.direction, world.atlas, world.turn_bytes, world.view_size, world.tile, out, first, end
+        )
 
 
 @hot

@@ -6,7 +6,7 @@ import numpy as np
 
 from hecogrid_envs.core.jit import copy_16, hot, inlined, load_word, store_word
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
-from hecogrid_envs.core.types import U8, Games, World, whole
+from hecogrid_envs.core.types import I32, U8, Games, World, whole
 
 _ONE = np.uint64(1)
 _BYTE = np.uint64(255)
@@ -128,56 +128,47 @@ def observe_tiles(games: Games, world: World, out: U8, first: int, last: int) ->
 
 
 @hot
-def draw_pictures(games: Games, world: World, codes: U8, out: U8, first: int, last: int) -> None:
+def draw_pictures(
+    codes: U8, directions: I32, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
+) -> None:
     """
     Turn the views of games ``first`` to ``last - 1`` into pixels.
 
+    The arguments are few, and not all of a batch, so that the innermost loops find them in registers.
+
     :param codes: (n * N * V * V,) their tile codes, n = last - first
+    :param directions: (E, N) that agents face
+    :param atlas: see :class:`World`
+    :param turn_bytes: see :class:`World`
+    :param size: V
+    :param tile: t
     :param out: (n * N * V t * V t * 3,)
     """
-    size, n_agents = world.view_size, world.n_agents
-    line, tile_bytes = 3 * world.tile, 3 * world.tile * world.tile
+    n_agents = directions.shape[1]
+    line, tile_bytes = 3 * tile, 3 * tile * tile
     # As many views as a chunk may reach into are drawn line by line: nothing repairs what lies beyond the last.
     repairing = 1 + (_CHUNK_BYTES - 1) // (size * size * tile_bytes)
     n_quick = (last - first) * n_agents - repairing if line <= _CHUNK_BYTES else 0
     view = 0
     for e in range(first, last):
         for agent in range(n_agents):
-            turned = games.direction[e, agent] * world.turn_bytes
-            if view < n_quick:
-                _draw_in_chunks(world, codes, out, view, turned)
-            else:
-                _draw_in_lines(world, codes, out, view, turned)
+            turned = directions[e, agent] * turn_bytes
+            to = view * size * size * tile_bytes
+            for row in range(size):
+                cell = (view * size + row) * size
+                for pixel_row in range(tile):
+                    source = turned + pixel_row * line
+                    if view < n_quick:
+                        # Each copy takes more than a tile's line; what comes next, written later, repairs it.
+                        for column in range(size):
+                            # An unsigned index spares the check for counting from the end.
+                            copy_16(out, to, atlas, source + whole(codes[np.uint64(cell + column)]) * tile_bytes)
+                            to += line
+                    else:
+                        for column in range(size):
+                            _copy_line(out, to, atlas, source + whole(codes[cell + column]) * tile_bytes, line)
+                            to += line
             view += 1
-
-
-@inlined
-def _draw_in_chunks(world: World, codes: U8, out: U8, view: int, turned: int) -> None:
-    """Draw a view, copying more than a tile's line; what comes next, written later, repairs it."""
-    size, line, tile_bytes = world.view_size, 3 * world.tile, 3 * world.tile * world.tile
-    to = view * size * size * tile_bytes
-    for row in range(size):
-        cell = (view * size + row) * size
-        for pixel_row in range(world.tile):
-            source = turned + pixel_row * line
-            for column in range(size):
-                # An unsigned index spares the check for counting from the end.
-                copy_16(out, to, world.atlas, source + whole(codes[np.uint64(cell + column)]) * tile_bytes)
-                to += line
-
-
-@inlined
-def _draw_in_lines(world: World, codes: U8, out: U8, view: int, turned: int) -> None:
-    """Draw a view, copying each line of a tile and nothing beyond it."""
-    size, line, tile_bytes = world.view_size, 3 * world.tile, 3 * world.tile * world.tile
-    to = view * size * size * tile_bytes
-    for row in range(size):
-        cell = (view * size + row) * size
-        for pixel_row in range(world.tile):
-            source = turned + pixel_row * line
-            for column in range(size):
-                _copy_line(out, to, world.atlas, source + whole(codes[cell + column]) * tile_bytes, line)
-                to += line
 
 
 @inlined
