@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, cast, overload
+from typing import Any, Final, Literal, NamedTuple, cast, overload
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +20,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, Array, check_count, find_n_agents, team_dones
+
+#: SB3's name of what tells that an episode was won.
+IS_SUCCESS: Final = "is_success"
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -44,10 +47,13 @@ class EvaluationResult(NamedTuple):
 
     :param returns: team return of each episode, the sum of the rewards of all agents over all steps
     :param lengths: game steps of each episode
+    :param successes: whether each episode was won; empty where the games do not tell (``"is_success"`` in the last info
+        of agent 0)
     """
 
     returns: list[float]
     lengths: list[int]
+    successes: tuple[bool, ...] = ()
 
     @property
     def mean(self) -> float:
@@ -59,13 +65,19 @@ class EvaluationResult(NamedTuple):
         """Standard deviation of the team returns, as SB3 reports it (division by the number of episodes)."""
         return float(np.std(self.returns))
 
+    @property
+    def success_rate(self) -> float | None:
+        """Part of the episodes that were won; None where the games do not tell."""
+        return float(np.mean(self.successes)) if self.successes else None
+
     def interval(self, confidence: float = 0.95) -> Interval:
         """Student's t interval of the mean team return."""
         return confidence_interval(self.returns, confidence)
 
     def __str__(self) -> str:
         low, high = self.interval()
-        return f"{self.mean:.2f} [{low:.2f}, {high:.2f}] (95 %, Student's t, {len(self.returns)} team episodes)"
+        won = "" if self.success_rate is None else f", {100 * self.success_rate:.0f} % won"
+        return f"{self.mean:.2f} [{low:.2f}, {high:.2f}] (95 %, Student's t, {len(self.returns)} team episodes{won})"
 
 
 def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Interval:
@@ -265,17 +277,25 @@ def evaluate_team(
             UserWarning,
             stacklevel=2,
         )
+    successes: list[bool] = []
+
+    def note_success(local: dict[str, Any], of_module: dict[str, Any]) -> None:
+        if local["done"] and (won := local["info"].get(IS_SUCCESS)) is not None:
+            successes.append(bool(won))
+        if callback is not None:
+            callback(local, of_module)
+
     returns, lengths = evaluate_rows(
         cast(PolicyPredictor, _GamePredictor(model, n_agents)),
         _GameRows(env, n_agents),
         n_eval_episodes,
         deterministic=deterministic,
         render=render,
-        callback=callback,
+        callback=note_success,
         return_episode_rewards=True,
         warn=False,
     )
-    return EvaluationResult([float(value) for value in returns], [int(value) for value in lengths])  # type: ignore[union-attr]
+    return EvaluationResult([float(value) for value in returns], [int(value) for value in lengths], tuple(successes))  # type: ignore[union-attr]
 
 
 def _team_size(env: VecEnv) -> int:

@@ -61,7 +61,9 @@ class TestEvaluatePolicy:
         assert returns == [60, 9, 60, 9]
         assert lengths == [2, 3, 2, 3]
         assert evaluate_policy(StillPolicy(), env, 4) == (34.5, 25.5)
-        assert evaluate_team(StillPolicy(), env, 4) == EvaluationResult([60, 9, 60, 9], [2, 3, 2, 3])
+        assert evaluate_team(StillPolicy(), env, 4) == EvaluationResult(
+            [60, 9, 60, 9], [2, 3, 2, 3], (False, False, True, True)
+        )
 
     def test_sb3_alone_counts_agents(self) -> None:
         """The failing baseline: with 3 agents, 2 "episodes" are two agents of one game."""
@@ -320,8 +322,8 @@ class TestTeamEvalCallback:
         eval_env = teams(lengths=(3, 2), reward=constant(1, 10))
         self.learn(TeamEvalCallback(eval_env, n_eval_episodes=2, eval_freq=8), 8, tmp_path)
         assert capsys.readouterr().out == (
-            "Evaluation after 8 game steps: team return 34.50 [-289.51, 358.51] (95 %, Student's t, 2 team episodes), "
-            "2.50 steps per episode\nSuccess rate: 0.00 %\nNew best mean team return\n"
+            "Evaluation after 8 game steps: team return 34.50 [-289.51, 358.51] (95 %, Student's t, 2 team episodes, "
+            "0 % won), 2.50 steps per episode\nSuccess rate: 0.00 %\nNew best mean team return\n"
         )
 
     def test_environments_without_teams_are_refused(self, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,25 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 
-from sb3_saf import RandomPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import RandomPolicy, SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
 from sb3_saf.envs.team_game import EqualSpaces
+from sb3_saf.envs.team_reward import SharedReward
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.registry import find_task, suites
 from sb3_saf.suites.suite import Suite
 from sb3_saf.training.environments import find_environment
+from sb3_saf.training.settings import load_settings, saved_settings
+from tests.toy_envs import CounterEnv
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+#: Suites whose games have hundreds of agents: a test of their own makes them smaller.
+_MANY_AGENTS = ("magent",)
 
 
 def _examples() -> list[Any]:
@@ -28,6 +37,7 @@ def _examples() -> list[Any]:
         pytest.param(f"{suite.name}/{task}", marks=[_needs(suite.name)])
         for suite in suites().values()
         for task in suite.examples
+        if suite.name not in _MANY_AGENTS
     ]
 
 
@@ -53,7 +63,10 @@ def _random_episodes(env_id: str, seed: int, n_steps: int = 12) -> list[Any]:
 # --- declarations -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suite", suites().values(), ids=list(suites()))
+AVAILABLE = [suite for suite in suites().values() if suite.unavailable is None]
+
+
+@pytest.mark.parametrize("suite", AVAILABLE, ids=[suite.name for suite in AVAILABLE])
 def test_the_extra_of_a_suite_installs_what_it_requires(suite: Suite) -> None:
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg", encoding="utf-8")
@@ -68,7 +81,7 @@ def test_what_is_said_of_packages_that_are_missing_or_of_another_version() -> No
     )
     old = Suite("x", requires=("gymnasium<0.1",), **one)
     assert f"works with gymnasium<0.1, got version {gym.__version__}: pip install 'gymnasium<0.1'" == old.problem()
-    with pytest.raises(ValueError, match=r"x/\.\.\. works with gymnasium<0.1"):
+    with pytest.raises(ValueError, match=r"x/\.\.\.: works with gymnasium<0.1"):
         old.check_task("y")
     assert "another version of Python" in str(Suite("x", requires=('a; python_version < "3"',), **one).problem())
 
@@ -98,7 +111,8 @@ def test_the_listing(capsys: pytest.CaptureFixture[str]) -> None:
     listed = capsys.readouterr().out
     for suite in suites().values():
         assert suite.title in listed
-        assert suite.pip_line in listed or f"{suite.name}/{suite.examples[0]}: " in listed
+        problem = suite.problem()
+        assert problem in listed if problem else f"{suite.name}/{suite.examples[0]}: " in listed
     assert main(["lbff"]) == 2
     assert "did you mean 'lbf'" in capsys.readouterr().err
 
@@ -130,6 +144,20 @@ def test_seeds_decide_what_happens(env_id: str) -> None:
         for key, value in step.items():
             np.testing.assert_array_equal(value, same[key], err_msg=key)
     assert any((step["obs"] != different["obs"]).any() for step, different in zip(first, other, strict=True))
+
+
+@_needs("magent")
+def test_groups_with_other_spaces_are_one_team() -> None:
+    with pytest.warns(UserWarning, match="one team"):
+        env = make_team_env("magent/tiger_deer_v4", n_envs=1, seed=0, state=True, map_size=14, max_cycles=30)
+    assert env.team_spaces.own.shape == (9, 9, 5) and env.action_space == spaces.Discrete(9)
+    policy = RandomPolicy(env, seed=0)
+    rows: Any = env.reset()
+    n_legal = rows["action_mask"].sum(axis=1).tolist()
+    assert set(n_legal) == {5, 9} and rows["state"].shape[1:] == (14, 14, 5)
+    for _ in range(30):
+        rows, *_ = env.step(policy.predict(rows)[0])
+    assert rows["action_mask"].sum(axis=1).tolist() == n_legal
 
 
 # --- suites of their own kind -----------------------------------------------------------------------------------------
@@ -197,6 +225,64 @@ def test_agents_with_other_spaces_are_padded_and_masked() -> None:
         game.step({"speaker_0": 4, "listener_0": 0})
     env = make_team_env("mpe/simple_speaker_listener_v4", n_envs=2, seed=0)
     evaluate_team(RandomPolicy(env, seed=0), env, 4)  # would raise at a masked action
+
+
+def test_rewards_are_shared_and_returns_stay_in_the_unit_of_the_games() -> None:
+    """PickUp gives 1 and 2 at every step, for 3 steps unless both agents choose 1."""
+    found = {}
+    for team_reward in ("given", "sum", "mean"):
+        env = make_team_env(PickUp, n_envs=1, seed=0, team_reward=team_reward)
+        env.reset()
+        steps = [env.step(np.array([0, 1])) for _ in range(3)]
+        found[team_reward] = (steps[0][1].tolist(), steps[2][3][0]["episode"]["r"])
+    assert found == {"given": ([1, 2], 9), "sum": ([3, 3], 9), "mean": ([1.5, 1.5], 9)}
+    with pytest.raises(ValueError, match="team_reward must be 'given', 'sum', 'mean' or None, got 'max'"):
+        make_team_env(PickUp, team_reward="max")  # type: ignore[arg-type]
+
+
+def test_settings_name_reward_state_and_algorithm() -> None:
+    given = {"algo": "MaskablePPO", "team_reward": "sum", "state": True}
+    settings = load_settings("saf", "tests.toy_envs:TellingEnv", "smoke", overrides=given)
+    assert saved_settings(settings.as_dict()) == settings
+    env = settings.make_env(0)
+    assert env.team_spaces.state is not None and isinstance(env.venv, SharedReward)
+    model = settings.make_model(env, 0)
+    assert isinstance(model, MaskablePPO) and isinstance(model.policy, SAFMaskablePolicy)
+    with pytest.raises(ValueError, match="unknown algorithm that trains QPLEXPolicy 'MaskablePPO'; there is QPLEX"):
+        load_settings("qplex", "tests.toy_envs:TellingEnv", "smoke", overrides={"algo": "MaskablePPO"})
+
+
+def test_masks_that_nobody_asks_for_are_told_of_once() -> None:
+    def step_twice(env: Any) -> None:
+        env.reset()
+        for _ in range(2):
+            env.step(np.ones(env.num_envs, dtype=int))
+
+    with pytest.warns(UserWarning, match=r'MaskablePPO\("SAFPolicy", env\)') as told:
+        step_twice(make_team_env(CounterEnv))
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = make_team_env(CounterEnv)
+        env.reset()
+        env.env_method("action_masks")
+        step_twice(env)
+        step_twice(make_team_env(PickUp))
+
+
+@_needs("lbf")
+def test_wins_are_counted_once_for_each_team() -> None:
+    env = make_team_env("lbf/Foraging-5x5-2p-1f-v3", n_envs=4, seed=0)
+    model = PPO("IPPOPolicy", env, n_steps=128, batch_size=512, n_epochs=1, seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.learn(1024)
+    assert model.ep_info_buffer is not None and model.ep_success_buffer is not None
+    returns = [episode["r"] for episode in model.ep_info_buffer]
+    assert list(model.ep_success_buffer) == [value > 0.99 for value in returns] and 0 < np.mean(returns) < 1
+    result = evaluate_team(RandomPolicy(env, seed=0), env, 12)
+    assert result.successes == tuple(value > 0.99 for value in result.returns) and result.success_rate
+    assert f"{100 * result.success_rate:.0f} % won" in str(result)
 
 
 def test_ids_of_no_suite_are_left_to_others() -> None:

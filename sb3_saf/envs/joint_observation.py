@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, Final, Literal, get_args
 
@@ -98,6 +99,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
         self._n_steps = 0
         self._masks_shown: Array | None = None
+        self._has_asked_for_masks = False
 
     def has_attr(self, attr_name: str) -> bool:
         """Return whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""
@@ -116,6 +118,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         :param method_kwargs: keyword arguments
         :return: one result per row
         """
+        self._has_asked_for_masks |= method_name == _ACTION_MASKS
         if self._shows_masks(method_name) and not super().has_attr(method_name):
             assert self._masks_shown is not None, "algorithms reset the environment before they ask"
             return [self._masks_shown[row].astype(bool) for row in self._get_indices(indices)]
@@ -168,6 +171,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         :raises ValueError: for NaN or infinity, dones that differ inside a team, agents without any legal action, and
             missing terminal observations
         """
+        if self._n_steps == 0:
+            self._warn_of_unused_masks()
         obs, rewards, dones, infos = self.venv.step_wait()
         self._n_steps += 1
         check_finite("rewards", rewards, self.n_agents, self._n_steps)
@@ -179,6 +184,17 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             np.repeat(ended, self.n_agents),
             self._complete_infos(infos, ended),
         )
+
+    def _warn_of_unused_masks(self) -> None:
+        """Say that games have masks which neither rows show nor anybody has asked for."""
+        if self.team_spaces.action_mask is None and not self._has_asked_for_masks and self.has_attr(_ACTION_MASKS):
+            warnings.warn(
+                "the games have action_masks(), which nobody has asked for: illegal actions may be taken. Train with "
+                'sb3_contrib.MaskablePPO("SAFPolicy", env), which asks (sb3_saf.train: -params algo:MaskablePPO), or '
+                f"give masks in infos[agent][{ACTION_MASK_KEY!r}], which every policy of sb3_saf reads",
+                UserWarning,
+                stacklevel=3,
+            )
 
     def _joint_observation(self, obs: object) -> dict[str, Array]:
         parts = self._checked_parts(obs, "observations")

@@ -16,6 +16,7 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.team_game import make_team_game, team_game
+from sb3_saf.envs.team_reward import TeamReward, check_team_reward, share_reward
 from sb3_saf.envs.teams import check_count, check_seed
 from sb3_saf.suites.registry import SuiteTask, find_task
 
@@ -40,6 +41,7 @@ def make_team_env(
     active: bool | None = None,
     action_masks: AskMasks = "auto",
     state: bool = False,
+    team_reward: TeamReward | None = None,
     curriculum: Sequence[Stage] = (),
     **params: Any,
 ) -> CentralizedValueWrapper:
@@ -76,6 +78,9 @@ def make_team_env(
     :param action_masks: ``"auto"`` for masks where the environment gives any (for infos, those of its first reset
         decide), True to insist on them, False for none
     :param state: whether observations have the environment's ``state()``
+    :param team_reward: what agents learn from: ``"given"`` is each agent's own reward, ``"sum"`` and ``"mean"`` are
+        over the agents of its team; None for the suite's own way, ``"given"`` without a suite. Logs and evaluation go
+        on to count what the games give, in the suite's unit
     :param curriculum: levels to train on first, see :class:`~sb3_saf.Curriculum`; then come games with ``params``
     :param params: of the task or the factory, for instance ``n_agents=5``
     :raises ValueError: if the arguments do not fit together, with what to do
@@ -84,6 +89,8 @@ def make_team_env(
     check_count("n_cpus", n_cpus)
     check_seed(seed)
     _check_backend(backend)
+    if team_reward is not None:
+        check_team_reward(team_reward)
     signals = {"active": active is not False, "action_masks": action_masks, "state": state}
     task = find_task(env) if isinstance(env, str) else None
     make: Callable[[int | None, dict[str, Any]], VecEnv]
@@ -98,7 +105,10 @@ def make_team_env(
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
         os.makedirs(monitor_dir, exist_ok=True)
-    return CentralizedValueWrapper(TeamMonitor(venv, filename=monitor_dir), time_limit=time_limit)
+    monitor = TeamMonitor(venv, filename=monitor_dir, team_return="sum" if task is None else task.suite.team_return)
+    if team_reward is None:
+        team_reward = "given" if task is None else task.suite.team_reward
+    return CentralizedValueWrapper(share_reward(monitor, team_reward), time_limit=time_limit)
 
 
 def _check_backend(backend: Backend | None) -> None:

@@ -7,7 +7,7 @@ import time
 import warnings
 import weakref
 from collections.abc import Mapping
-from typing import IO, Any, Final
+from typing import IO, Any, Final, Literal
 
 import numpy as np
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
@@ -26,8 +26,9 @@ class TeamMonitor(TeamVecEnvWrapper):
 
     When the episode of a game ends, the info of its **agent 0 alone** gets
     ``info["episode"] = {"r": team return, "l": game steps, "t": seconds since the start}``, where the team return is
-    the sum of the rewards of all agents over all steps. SB3 logs the mean of what it finds under that key, so
-    ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
+    the sum of the rewards of all agents over all steps (``team_return="mean"``: their mean over agents). SB3 logs the
+    mean of what it finds under that key, so ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode
+    once.
 
     It is no VecMonitor: SB3's own ``evaluate_policy`` would wait for an ``"episode"`` entry in every row and never
     return. With a TeamMonitor it does return, but takes every agent for an episode, with a warning; use
@@ -40,6 +41,8 @@ class TeamMonitor(TeamVecEnvWrapper):
         begins with the first step. The file of another run is kept as ``monitor.csv.1``, ``monitor.csv.2`` ...
     :param info_keywords: entries of agent 0's last info to add to the episode's
     :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
+    :param team_return: how the rewards of a team's agents become the team's: their sum, or their mean where every agent
+        is given the whole reward of its team
     :raises ValueError: if N is unknown or does not divide the rows, or a keyword is that of a column of the file
     """
 
@@ -49,8 +52,11 @@ class TeamMonitor(TeamVecEnvWrapper):
         filename: str | None = None,
         info_keywords: tuple[str, ...] = (),
         n_agents: int | None = None,
+        team_return: Literal["sum", "mean"] = "sum",
     ) -> None:
         super().__init__(venv, n_agents)
+        #: The part of the sum of a team's rewards that counts.
+        self._share = 1.0 if team_return == "sum" else 1.0 / self.n_agents
         columns = sorted(_COLUMNS.intersection(info_keywords))
         if columns:
             raise ValueError(
@@ -92,7 +98,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         ended = team_dones(dones, self.n_agents)
         # Sums of many float32 rewards drift; sums of float64 do not.
         by_game = rewards.reshape(self.n_games, self.n_agents)
-        self._returns += by_game.sum(axis=1, dtype=np.float64)
+        self._returns += by_game.sum(axis=1, dtype=np.float64) * self._share
         self._opposition.see(by_game)
         self._lengths += 1
         if ended.any():

@@ -263,6 +263,7 @@ def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | Non
         "return_low": low,
         "return_high": high,
         "returns": result.returns,
+        "success_rate": result.success_rate,
         "wall_seconds": time.perf_counter() - clock,
     }
 

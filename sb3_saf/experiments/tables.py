@@ -11,6 +11,7 @@ Tables of tests have one row per cell and test level, made anew from the cells w
 ``game_steps``, ``episodes``         of the training, 0 for a random team; of the test
 ``return_mean``, ``return_low``,     mean team return with its 95 % interval over episodes (Student's t)
 ``return_high``
+``success_rate``                     part of the episodes that were won; empty where the games do not tell
 ``score``                            share of the largest return; where that is not known, of the range of all returns
                                      in the table on this task and level
 ``returns``                          team return of every episode, with spaces between
@@ -112,6 +113,7 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
             "game_steps": int(results.cell_config(cell).get("game_steps", 0)),
             "episodes": len(test["returns"]),
             **{name: test[name] for name in ("return_mean", "return_low", "return_high")},
+            "success_rate": float("nan") if test.get("success_rate") is None else test["success_rate"],
             "score": float("nan"),
             "returns": " ".join(f"{value:.12g}" for value in test["returns"]),
             "processor_seconds": status["processor_seconds"],

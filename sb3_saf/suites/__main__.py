@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
-from contextlib import closing
 from typing import Any, Final
 
 from sb3_saf.envs.make import make_team_env
@@ -48,15 +48,20 @@ def summary(suite: Suite) -> str:
         return "\n".join([*lines, f"  {problem}"])
     package = suite.requirements[0].name
     lines.append(f"  {package} {suite.installed_version()} is installed, {len(suite.tasks)} tasks")
-    return "\n".join([*lines, *(f"  {example(f'{suite.name}/{task}')}" for task in suite.examples)])
+    return "\n".join([*lines, *(f"  {example(suite, task)}" for task in suite.examples)])
 
 
-def example(env_id: str) -> str:
-    """Return an id with the agents, observations, actions and signals of a task."""
-    with closing(make_team_env(env_id)) as env:
-        spaces = TeamSpaces.from_observation_space(env.observation_space)
-        masked = ", masked" if spaces.action_mask is not None else ""
-        return f"{env_id}: {spaces.n_agents} agents, sees {_short(spaces.own)}, acts {_short(env.action_space)}{masked}"
+def example(suite: Suite, task: str) -> str:
+    """Return the id of a task with its agents, observations and actions."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of opponents, which the line names
+        env = make_team_env(f"{suite.name}/{task}")
+    spaces = TeamSpaces.from_observation_space(env.observation_space)
+    env.close()
+    masked = ", masked" if spaces.action_mask is not None else ""
+    opponents = ", opponents among them" if suite.is_competitive(task) else ""
+    seen, acted = _short(spaces.own), _short(env.action_space)
+    return f"{suite.name}/{task}: {spaces.n_agents} agents{opponents}, sees {seen}, acts {acted}{masked}"
 
 
 def _short(space: Any) -> str:

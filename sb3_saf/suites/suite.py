@@ -40,6 +40,7 @@ class Suite:
     :param team_reward: what agents are given to learn from, see ``make_team_env``
     :param has_state: whether ``state=True`` can be asked for
     :param exact_resume: whether the VecEnv gives its state to checkpoints
+    :param unavailable: why no version of the package works; such a suite has no games, only this message
     """
 
     name: str
@@ -56,9 +57,11 @@ class Suite:
     team_reward: Literal["given"] | Reduction = "given"
     has_state: bool = False
     exact_resume: bool = False
+    unavailable: str | None = None
 
     def __post_init__(self) -> None:
-        assert (self.game is None) != (self.vec_env is None), f"{self.name}: exactly one of game and vec_env"
+        ways = [self.game, self.vec_env, self.unavailable]
+        assert sum(way is not None for way in ways) == 1, f"{self.name}: exactly one of game and vec_env"
 
     @property
     def requirements(self) -> tuple[Requirement, ...]:
@@ -77,6 +80,8 @@ class Suite:
 
     def problem(self) -> str | None:
         """Return why no game can be made, None if all that is needed is installed."""
+        if self.unavailable is not None:
+            return self.unavailable
         if not self.requirements:
             return f"needs another version of Python: {'; '.join(self.requires)}"
         for requirement in self.requirements:
@@ -98,7 +103,7 @@ class Suite:
         :raises ValueError: if the package is missing or of a version that cannot work, with what to install
         """
         if (problem := self.problem()) is not None:
-            raise ValueError(f"{self.name}/... {problem}")
+            raise ValueError(f"{self.name}/...: {problem}")
         return tuple(self.list_tasks())
 
     def is_competitive(self, task: str) -> bool:

@@ -14,12 +14,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, get_args
 
+from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.make import make_team_env
+from sb3_saf.envs.team_reward import TeamReward
 from sb3_saf.suites.registry import suites
 from sb3_saf.training.algorithms import ALGOS, AlgorithmSpec, find_algorithm
 from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
@@ -43,7 +45,12 @@ _OWN_KEYS: Final[dict[str, Any]] = {
     "normalize": bool | dict[str, Any],
     "frame_stack": int,
     "curriculum": list[Any],
+    "team_reward": TeamReward,
+    "state": bool,
+    "algorithm": str,
 }
+#: What files and command lines call ``algorithm``: a class that trains the method's policy, in the place of its own.
+_ALGO: Final = "algo"
 #: RL-Zoo3's name for game steps.
 _N_TIMESTEPS: Final = "n_timesteps"
 _SAVED_KEYS: Final = ("algo", "env", "size", "n_envs", "game_steps", "time_limit", "env_kwargs", "hyperparams")
@@ -82,7 +89,7 @@ class Settings:
     @property
     def spec(self) -> AlgorithmSpec:
         """Algorithm and policy."""
-        return ALGOS[self.algo]
+        return find_algorithm(self.algo, self.wrapping.get("algorithm"))
 
     @property
     def task(self) -> str:
@@ -135,6 +142,8 @@ class Settings:
             monitor_dir=None if monitor_dir is None else str(monitor_dir),
             n_cpus=n_cpus,
             curriculum=() if evaluation else stages_of(self.wrapping, self.game_steps),
+            team_reward=self.wrapping.get("team_reward"),
+            state=self.wrapping.get("state", False),
             **params,
         )
         return wrap_rows(env, self.wrapping, float(self.plain.get("gamma", 0.99)), is_training=not evaluation)
@@ -225,7 +234,7 @@ def load_settings(
     given = _exclusive(_checked_keys(overrides or {}, spec, "the given settings"))
     level = entry_of(read_config("levels"), environment.yaml_keys, size)
     layers = (level, own, given, {"env_kwargs": env_kwargs or {}}, {"policy_kwargs": dict(spec.policy_kwargs)})
-    return _build(algo, environment, size, merge(*layers))
+    return _build(algo, environment, size, _for_algorithm(algo, merge(*layers)))
 
 
 def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | None = None) -> Settings:
@@ -242,7 +251,7 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
     if not isinstance(saved["hyperparams"], Mapping):
         raise ValueError(f"expected saved hyperparams to map names to values, got {saved['hyperparams']!r}")
     spec = find_algorithm(saved["algo"])
-    own = {key: saved[key] for key in _OWN_KEYS if key in saved}
+    own = {key: saved[key] for key in _OWN_KEYS if key in saved and saved[key] != spec.algorithm.__name__}
     entry = merge(_checked_keys({**own, **saved["hyperparams"]}, spec, "the saved settings"))
     # Whoever only draws results needs no package of the games.
     n_agents = None if env_kwargs else saved.get("n_agents")
@@ -253,6 +262,16 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
         merge(entry, {"env_kwargs": env_kwargs or {}}),
         None if n_agents is None else resolve("n_agents", n_agents, int),
     )
+
+
+def _for_algorithm(algo: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """Take back what another algorithm than the method's own cannot take."""
+    own, spec = ALGOS[algo], find_algorithm(algo, entry.get("algorithm"))
+    if spec.algorithm is own.algorithm:
+        return {key: value for key, value in entry.items() if key != "algorithm"}
+    if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):  # whose own buffers keep masks and sequences
+        entry = {key: value for key, value in entry.items() if key != "rollout_buffer_class"}
+    return _checked_keys(entry, spec, f"the settings for {spec.algorithm.__name__}")
 
 
 def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment, source: str) -> None:
@@ -271,6 +290,8 @@ def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) ->
         if "game_steps" in entry:
             raise ValueError(f"{source}: game_steps and {_N_TIMESTEPS} say the same thing; give one of them")
         entry["game_steps"] = entry.pop(_N_TIMESTEPS)
+    if _ALGO in entry:
+        entry["algorithm"] = entry.pop(_ALGO)
     if entry.get("policy") == spec.policy:
         del entry["policy"]
     for key in entry:
@@ -303,7 +324,7 @@ def _exclusive(given: dict[str, Any]) -> dict[str, Any]:
 def _build(
     algo: str, environment: TeamEnvironment, size: Size, entry: dict[str, Any], n_agents: int | None = None
 ) -> Settings:
-    spec = ALGOS[algo]
+    spec = find_algorithm(algo, entry.get("algorithm"))
     own = {key: entry.pop(key, None) for key in _OWN_KEYS}
     n_envs = resolve("n_envs", 1 if own["n_envs"] is None else own["n_envs"], int)
     game_steps = resolve("game_steps", own["game_steps"], int)

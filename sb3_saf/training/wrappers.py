@@ -24,11 +24,22 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.team_reward import SharedReward
 from sb3_saf.envs.teams import OBS_KEY
 from sb3_saf.training.environments import import_by_name
 
 #: Keys of settings that name wrappers; each may be left out.
-WRAPPER_KEYS: Final = ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize", "callback", "curriculum")
+WRAPPER_KEYS: Final = (
+    "env_wrapper",
+    "vec_env_wrapper",
+    "frame_stack",
+    "normalize",
+    "callback",
+    "curriculum",
+    "team_reward",
+    "state",
+    "algorithm",
+)
 NORMALIZATION_FILE: Final = "vecnormalize.npz"
 
 
@@ -80,7 +91,7 @@ def wrap_rows(
     if "vec_env_wrapper" not in wrapping and normalize is None:
         return env
     rows: VecEnv = env
-    while not isinstance(rows, TeamMonitor):
+    while not isinstance(rows, (TeamMonitor, SharedReward)):
         assert isinstance(rows, VecEnvWrapper), "make_team_env monitors its games"
         rows = rows.venv
     for wrapper, arguments in named(wrapping.get("vec_env_wrapper"), "vec_env_wrapper"):

@@ -1,0 +1,68 @@
+"""What agents of a team are given to learn from: their own rewards, or the team's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_saf.envs.teams import TeamVecEnvWrapper
+
+#: Each agent its own reward; each the sum, or the mean, over the agents of its team.
+TeamReward = Literal["given", "sum", "mean"]
+TEAM_REWARDS: Final[tuple[TeamReward, ...]] = get_args(TeamReward)
+
+
+class SharedReward(TeamVecEnvWrapper):
+    """
+    Give every agent the sum or the mean of its team's rewards. Around a TeamMonitor, which goes on to log returns as
+    the games give them.
+
+    :param venv: rows of flattened teams
+    :param team_reward: ``"sum"`` or ``"mean"`` over the agents of a team
+    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
+    """
+
+    def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"], n_agents: int | None = None) -> None:
+        super().__init__(venv, n_agents)
+        self.team_reward = team_reward
+
+    def reset(self) -> VecEnvObs:
+        """Start new episodes in all games."""
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Wait for the step of all games.
+
+        :return: what ``venv`` gives, with rewards (B,) that are equal in a team
+        """
+        obs, rewards, dones, infos = self.venv.step_wait()
+        by_game = np.asarray(rewards).reshape(self.n_games, self.n_agents)
+        shared = by_game.sum(axis=1) if self.team_reward == "sum" else by_game.mean(axis=1)
+        return obs, np.repeat(shared, self.n_agents), dones, infos
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return nothing: the wrapper has no state."""
+        return {}
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """Do nothing."""
+
+
+def check_team_reward(team_reward: object) -> None:
+    """
+    Check a word for what agents learn from.
+
+    :raises ValueError: if it is none of ``TEAM_REWARDS``
+    """
+    if team_reward not in TEAM_REWARDS:
+        raise ValueError(f"team_reward must be {', '.join(map(repr, TEAM_REWARDS))} or None, got {team_reward!r}")
+
+
+def share_reward(venv: VecEnv, team_reward: TeamReward) -> VecEnv:
+    """Wrap a monitored VecEnv of teams, if there is anything to do."""
+    return venv if team_reward == "given" else SharedReward(venv, team_reward)
