@@ -2,9 +2,10 @@
 Run the tests with the oldest or the newest releases that setup.cfg allows.
 
 ``python .ci/versions.py oldest`` and ``python .ci/versions.py newest`` make a virtual environment of their own under
-``build/`` and install the package there with the six libraries that it extends at one end of their ranges; everything
-else, torch included, is as in constraints.txt where that fits. They print the versions and run the tests. Further
-arguments go to pytest: ``python .ci/versions.py oldest -x -k policies``.
+``build/`` (or ``--folder``) and install the package there with the six libraries that it extends at one end of their
+ranges; everything else, torch included, is as in constraints.txt where that fits. They print the versions and run the
+tests, with ``--fast`` only those that touch the libraries most (``FAST``). Further arguments go to pytest:
+``python .ci/versions.py oldest -x -k policies``.
 """
 
 from __future__ import annotations
@@ -22,6 +23,15 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 LIBRARIES: Final = ("gymnasium", "numba", "pettingzoo", "sb3-contrib", "stable-baselines3", "supersuit")
 #: What follows from that choice, and so is not pinned.
 FOLLOWING: Final = ("llvmlite", "numpy", "rl-zoo3")
+#: Tests of what is built on the libraries: kernels, vector environments, policies, buffers, checkpoints, old files.
+FAST: Final = tuple(
+    f"tests/test_{name}.py"
+    for name in (
+        *("active", "advance", "batch", "centralized", "compilation", "contrib", "evaluation", "game_copies", "import"),
+        *("make_team_env", "make_vec_env", "monitor", "old_files", "parallel_env", "policies", "qplex", "same_update"),
+        *("supersuit_vec_env", "team_buffer", "turns"),
+    )
+)
 EXTRAS: Final = "export,render,zoo,dev"
 
 
@@ -83,15 +93,18 @@ def main() -> None:
     """Install, print versions, test."""
     parser = argparse.ArgumentParser(prog="python .ci/versions.py", description=__doc__)
     parser.add_argument("end", choices=["oldest", "newest"])
+    parser.add_argument("--folder", type=Path, help="of the virtual environment")
+    parser.add_argument("--fast", action="store_true", help="only the tests that touch the libraries most")
     options, pytest_arguments = parser.parse_known_args()
-    folder = ROOT / "build" / f"venv-{options.end}"
+    folder = options.folder or ROOT / "build" / f"venv-{options.end}"
     python = install(options.end, folder)
     listing: list[str | Path] = [python, "-m", "pip", "list", "--format=freeze"]
     listed = subprocess.run(listing, capture_output=True, text=True, check=True)
     names = {*LIBRARIES, *FOLLOWING, "torch"}
     print(*(line for line in listed.stdout.splitlines() if line.partition("==")[0].lower() in names), sep="\n")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba")}
-    tests: list[str | Path] = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope", *pytest_arguments]
+    tests: list[str | Path] = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope"]
+    tests += [*(FAST if options.fast else ()), *pytest_arguments]
     sys.exit(subprocess.run(tests, cwd=ROOT, env=environment, check=False).returncode)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from hecogrid_envs.core.jit import copy_16, hot, inlined, load_word, store_word
 from hecogrid_envs.core.occupancy import agent_code, plane_offset
-from hecogrid_envs.core.types import I32, U8, Games, World, whole
+from hecogrid_envs.core.types import U8, Games, World, whole
 
 _ONE = np.uint64(1)
 _BYTE = np.uint64(255)
@@ -129,7 +129,7 @@ def observe_tiles(games: Games, world: World, out: U8, first: int, last: int) ->
 
 @hot
 def draw_pictures(
-    codes: U8, directions: I32, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
+    codes: U8, directions: U8, atlas: U8, turn_bytes: int, size: int, tile: int, out: U8, first: int, last: int
 ) -> None:
     """
     Turn the views of games ``first`` to ``last - 1`` into pixels.
