@@ -27,8 +27,19 @@ FOLLOWING: Final = ("llvmlite", "numpy", "rl-zoo3")
 FAST: Final = tuple(
     f"tests/test_{name}.py"
     for name in (
-        *("active", "advance", "batch", "centralized", "compilation", "contrib", "evaluation", "game_copies", "import"),
-        *("make_team_env", "make_vec_env", "monitor", "old_files", "parallel_env", "policies", "qplex", "same_update"),
+        *(
+            "active",
+            "advance",
+            "batch",
+            "centralized",
+            "checkpoints_files",
+            "compilation",
+            "contrib",
+            "evaluation",
+            "game_copies",
+            "import",
+        ),
+        *("make_team_env", "make_vec_env", "monitor", "export", "parallel_env", "policies", "qplex", "same_update"),
         *("supersuit_vec_env", "team_buffer", "turns"),
     )
 )

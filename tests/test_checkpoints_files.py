@@ -84,6 +84,12 @@ def test_an_unknown_format_says_who_wrote_it(tmp_path: Path) -> None:
         folder.newest()
 
 
+def test_a_checkpoint_of_format_1_says_which_commit_reads_it() -> None:
+    """It was written by commit 9365c97."""
+    with pytest.raises(UnknownFormatError, match=r"format 1, which sb3_saf 0\.1\.0 as of commit 9365c97 reads"):
+        decode((Path(__file__).parent / "golden" / "format_1.ckpt").read_bytes())
+
+
 def test_the_last_ones_are_kept_and_the_newest_is_read(tmp_path: Path) -> None:
     folder = CheckpointFolder(tmp_path / "new" / "folder", keep=2)
     assert folder.newest() is None

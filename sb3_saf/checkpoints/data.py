@@ -25,6 +25,8 @@ import torch as th
 from sb3_saf.checkpoints.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 
 FORMAT: Final = 2
+#: Versions that read earlier formats.
+_EARLIER: Final = {1: "sb3_saf 0.1.0 as of commit 9365c97"}
 
 Array = npt.NDArray[Any]
 #: None, bool, int, float, str, arrays, tensors, and lists, tuples, deques and dicts of these.
@@ -90,10 +92,10 @@ def read_tree(file: BinaryIO) -> Tree:
     if header is None:
         raise DamagedCheckpointError("it does not begin as a checkpoint of sb3_saf does")
     if int(header[1]) != FORMAT:
-        writer = header[2].decode(errors="replace")
+        reader = _EARLIER.get(int(header[1]), f"sb3_saf {header[2].decode(errors='replace')}")
         raise UnknownFormatError(
-            f"it has format {int(header[1])}, written by sb3_saf {writer}, and this version "
-            f"reads format {FORMAT}; install that version to go on"
+            f"it has format {int(header[1])}, which {reader} reads, and this version reads format {FORMAT}; install "
+            "that version to go on"
         )
     try:
         packed = json.loads(file.readline())
