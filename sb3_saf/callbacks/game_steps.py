@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 import time
 import warnings
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
@@ -60,10 +62,50 @@ def check_training(model: BaseAlgorithm) -> None:
         )
 
 
+class GameStepsBoard(TensorBoardOutputFormat):
+    """
+    A run's TensorBoard file with game steps on the x-axis, where SB3 has agents' steps.
+
+    :param board: that SB3 opened
+    :param n_agents: N
+    """
+
+    def __init__(self, board: TensorBoardOutputFormat, n_agents: int) -> None:
+        # Not the base class's constructor, which would open a second file.
+        self.board, self.n_agents, self.writer = board, n_agents, board.writer
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """See the base class; ``step`` counts agents' steps."""
+        self.board.write(key_values, key_excluded, step // self.n_agents)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.board.close()
+
+
+def show_game_steps(model: BaseAlgorithm) -> None:
+    """
+    Let TensorBoard count game steps from now on, whatever logs; callbacks of this package do so when training starts.
+
+    :param model: in ``learn``; one whose environment is not made of teams is left as it is
+    """
+    venv = model.get_env()
+    n_agents = None if venv is None else find_n_agents(venv)
+    if n_agents is None:
+        return
+    model.logger.output_formats = [
+        GameStepsBoard(each, n_agents)
+        if isinstance(each, TensorBoardOutputFormat) and not isinstance(each, GameStepsBoard)
+        else each
+        for each in model.logger.output_formats
+    ]
+
+
 class GameStepsCallback(BaseCallback):
     """
     Log ``time/game_steps`` and ``time/game_steps_per_second`` beside SB3's ``time/total_timesteps`` and ``time/fps``,
-    which count agents' steps. On environments that are not made of teams it logs nothing.
+    which count agents' steps, and let TensorBoard's x-axis count game steps. On environments that are not made of teams
+    it does nothing.
 
     Before training it checks policy, buffer and batch size (:func:`check_training`).
 
@@ -80,6 +122,7 @@ class GameStepsCallback(BaseCallback):
         check_training(self.model)
 
     def _on_training_start(self) -> None:
+        show_game_steps(self.model)
         self._n_agents = find_n_agents(self.training_env)
         self._first_step, self._started = self.num_timesteps, time.monotonic()
 

@@ -12,7 +12,7 @@ from typing import BinaryIO, Final, NamedTuple, NoReturn
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf.callbacks.game_steps import game_steps
+from sb3_saf.callbacks.game_steps import game_steps, show_game_steps
 from sb3_saf.checkpoints.callbacks import all_callbacks, callback_states
 from sb3_saf.checkpoints.checks import check_keys, check_text, check_whole
 from sb3_saf.checkpoints.data import Tree, encode, write_tree
@@ -116,6 +116,7 @@ class TeamCheckpointCallback(BaseCallback):
     def _init_callback(self) -> None:
         require_resumable(self.model)
         require_n_agents(self.training_env)
+        show_game_steps(self.model)
         self.store.acquire()
         if self.model not in _RUNS:
             enter_run(self.model, Run(uuid.uuid4().hex, description(self.model)))

@@ -9,6 +9,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
 
+from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.checkpoints.checks import check_keys, check_list, check_name, check_real, check_text, check_whole
 from sb3_saf.checkpoints.data import Tree
 
@@ -73,6 +74,6 @@ def _continued_logger(model: BaseAlgorithm, name: str | None) -> Logger:
     # TensorBoard hides what was written after the checkpoint: it comes again.
     start = SessionLog(status=SessionLog.START)
     file_writer: Any = board.writer.file_writer
-    file_writer.add_event(Event(step=model.num_timesteps + 1, session_log=start))
+    file_writer.add_event(Event(step=(game_steps(model) or 0) + 1, session_log=start))
     logger.output_formats.append(board)
     return logger

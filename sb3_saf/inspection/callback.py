@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, Image
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, sync_envs_normalization
 
-from sb3_saf.callbacks.game_steps import game_steps
+from sb3_saf.callbacks.game_steps import game_steps, show_game_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.teams import check_count, require_n_agents
 from sb3_saf.inspection.games import Zones, check_zones
@@ -88,7 +88,8 @@ class InspectionCallback(BaseCallback):
         _check_fits(self.training_env, self.eval_env)
 
     def _on_training_start(self) -> None:
-        self._page = Page(self.model)
+        show_game_steps(self.model)
+        self._page = Page(self.model, self.n_agents)
         self._started = time.perf_counter()
         self.seconds = 0.0
         if not self._page.has_tensorboard:
@@ -168,7 +169,7 @@ class InspectionCallback(BaseCallback):
         strip, film = inspection.strip, inspection.film
         if strip is not None and film is not None:
             self._page.show("episode/strip", Image(strip, "HWC"))
-            self._page.gif("episode/film", film, self.num_timesteps)
+            self._page.gif("episode/film", film, self._game_steps())
 
 
 def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:

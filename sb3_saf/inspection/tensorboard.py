@@ -7,10 +7,11 @@ recorded and not yet dumped stays there.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
@@ -33,23 +34,26 @@ _METRICS: Final = (
 
 #: What the groups of tags mean, shown on the Text page.
 _TEXT: Final = """
-The x-axis of every chart counts **agents' steps**, as Stable-Baselines3 does: game steps times the number of agents.
-`time/game_steps` is the same in game steps.
+The x-axis of every chart counts **game steps**, of all parallel games together. Stable-Baselines3's
+`time/total_timesteps` counts agents' steps: game steps times the number of agents.
+
+Each policy, each slot and each kind of message is a run of that name below the training's, so that a chart such as
+`pool/chosen` has a line of its own colour for each.
 
 | tags | meaning |
 | --- | --- |
 | `team/return` | mean team return of a fixed set of episodes; `_low` and `_high` are its 95 % interval (Student's t) |
 | `rollout/ep_rew_mean` | mean team return of the last 100 training episodes |
-| `pool/chosen/policy_k` | how often policy k of the pool is chosen |
+| `pool/chosen` | how often each policy of the pool is chosen |
 | `pool/entropy` | entropy of the choice: 0 decided, 1 all policies blended |
 | `pool/entropy_of_mean` | entropy of the mean choice: 0 if the pool has collapsed to one policy |
 | `pool/difference` | how differently policies act: 0 alike, 1 never alike |
 | `pool/zone_dependence` | how much the zone tells about the chosen policy: 0 nothing, 1 everything |
-| `pool_by_zone/zone_z/policy_k` | how often policy k is chosen in zone z |
+| `pool_by_zone/zone_z` | how often each policy is chosen in zone z |
 | `knowledge_source/write_entropy`, `read_entropy` | attention of slots over agents, of agents over slots: 1 uniform |
-| `knowledge_source/read/slot_l` | how much slot l is read |
+| `knowledge_source/read` | how much each slot is read |
 | `message/strength` | norm of the message that an agent reads |
-| `message/value_error` | error of values; `_zeroed`, `_shuffled`: with another message in place of the one read |
+| `message/value_error` | error of values with the message as read, with zeros in its place, with another game's |
 | `critic/explained_variance` | 1 for a critic that predicts every return, 0 for one that says a constant |
 | `critic/slope`, `critic/bias` | 1 and 0 for a calibrated critic |
 | `lambda/agent_i`, `train/q_tot` | QPLEX: weight of agent i's advantage, value of the team |
@@ -64,20 +68,24 @@ _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
         "evaluation: episode length (game steps)": [r"team/episode_length"],
     },
     "Policy pool": {
-        "how often each policy is chosen": [r"pool/chosen/policy_\d+"],
-        "entropy of the choice (0 decided, 1 blended)": [r"pool/entropy", r"pool/entropy_of_mean"],
-        "difference between policies, dependence on zones": [r"pool/difference", r"pool/zone_dependence"],
+        "how often each policy is chosen": [r"pool/chosen"],
+        "entropy of the choice (0 decided, 1 blended)": [r"pool/entropy"],
+        "entropy of the mean choice (0 one policy for all)": [r"pool/entropy_of_mean"],
+        "difference between policies (0 copies)": [r"pool/difference"],
+        "dependence of the choice on zones (0 none)": [r"pool/zone_dependence"],
     },
     "Knowledge source": {
-        "entropy of writing and reading (1 uniform)": [r"knowledge_source/(write|read)_entropy(_of_mean)?"],
-        "how much each slot is read": [r"knowledge_source/read/slot_\d+"],
-        "value error with and without the message": [r"message/value_error.*"],
+        "how much each slot is read": [r"knowledge_source/read"],
+        "value error: message as read, zeroed, shuffled": [r"message/value_error"],
         "strength of messages": [r"message/strength"],
+        "entropy of writing (1 slots average the team)": [r"knowledge_source/write_entropy"],
+        "entropy of reading (1 all slots alike)": [r"knowledge_source/read_entropy"],
     },
     "Critic": {
-        "explained variance and slope (1 is right)": [r"critic/explained_variance.*", r"critic/slope"],
-        "mean value and mean return": [r"critic/mean_value", r"critic/mean_return"],
-        "error (root mean square)": [r"critic/error", r"critic/td_error"],
+        "explained variance (1 is right)": [r"critic/explained_variance"],
+        "slope (1 is right)": [r"critic/slope"],
+        "bias: value minus return": [r"critic/bias"],
+        "error (root mean square)": [r"critic/error"],
     },
 }
 #: Groups that algorithms log themselves, later than the layout is made.
@@ -93,6 +101,30 @@ _VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
 
 
 _BAND: Final = ("team/return", "team/return_low", "team/return_high")
+#: Tags that are lines of one chart. TensorBoard has a colour for each run, so a line is written as a run of its own.
+_OF_LINES: Final = re.compile(
+    r"(?P<chart>.+)/(?P<line>(policy|slot)_\d+)|(?P<errors>message/value_error)_?(?P<with>.*)"
+)
+
+
+class Line(NamedTuple):
+    """
+    Where TensorBoard shows a scalar that is one of several lines.
+
+    :param chart: its tag there
+    :param run: name of the run below the training's
+    """
+
+    chart: str
+    run: str
+
+
+def line_of(tag: str) -> Line | None:
+    """Return the line that a tag is; None for a chart of its own."""
+    found = _OF_LINES.fullmatch(tag)
+    if found is None:
+        return None
+    return Line(found["chart"] or found["errors"], found["line"] or f"message_{found['with'] or 'as_read'}")
 
 
 class Page:
@@ -100,12 +132,16 @@ class Page:
     Writes to the formats of a model's logger, but not to the screen.
 
     :param model: in ``learn``, with its logger set up
+    :param n_agents: N
     """
 
-    def __init__(self, model: BaseAlgorithm) -> None:
+    def __init__(self, model: BaseAlgorithm, n_agents: int) -> None:
         formats = [each for each in model.logger.output_formats if not isinstance(each, HumanOutputFormat)]
         self._logger = Logger(model.logger.dir, formats)
         self._writers: list[Any] = [each.writer for each in formats if isinstance(each, TensorBoardOutputFormat)]
+        self._n_agents = n_agents
+        self._lines: dict[Line, float] = {}
+        self._writers_of_lines: dict[str, Any] = {}
 
     @property
     def has_tensorboard(self) -> bool:
@@ -115,7 +151,10 @@ class Page:
     def scalars(self, scalars: Mapping[str, float]) -> None:
         """Record numbers, for TensorBoard and for files."""
         for tag, value in scalars.items():
-            self._logger.record(tag, value)
+            line = line_of(tag)
+            self._logger.record(tag, value, exclude=None if line is None else ("tensorboard",))
+            if line is not None:
+                self._lines[line] = value
 
     def show(self, tag: str, value: object) -> None:
         """Record a figure, an image, a histogram or hyperparameters, for TensorBoard alone."""
@@ -144,9 +183,24 @@ class Page:
         """
         Write what was recorded.
 
-        :param step: of the x-axis: agents' steps, as everything that SB3 writes
+        :param step: agents' steps, as everything that SB3 writes; the x-axis counts game steps
         """
         self._logger.dump(step)
+        for line, value in self._lines.items():
+            for board in self._writers:
+                lines = self._writer_of(os.path.join(board.get_logdir(), line.run), step)
+                lines.add_scalar(line.chart, value, step // self._n_agents)
+        for writer in self._writers_of_lines.values():
+            writer.flush()
+        self._lines.clear()
+
+    def _writer_of(self, folder: str, step: int) -> Any:
+        if folder not in self._writers_of_lines:
+            from torch.utils.tensorboard import SummaryWriter
+
+            # What an interrupted run wrote after its last checkpoint comes again.
+            self._writers_of_lines[folder] = SummaryWriter(folder, purge_step=step // self._n_agents)
+        return self._writers_of_lines[folder]
 
 
 def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[Any]]]:
@@ -157,7 +211,7 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
     :param value_based: whether the run learns Q_tot
     :return: for ``SummaryWriter.add_custom_scalars``
     """
-    tags = list(tags)
+    tags = [tag if (line := line_of(tag)) is None else line.chart for tag in tags]
     groups: dict[str, dict[str, list[Any]]] = {}
     if set(_BAND) <= set(tags):
         # A group of its own, because the page shows bands after all lines of their group.
@@ -171,7 +225,7 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
         groups["Policy pool by zone"] = {
             f"how often each policy is chosen in {zone.replace('_', ' ')}": [
                 "Multiline",
-                [rf"^pool_by_zone/{zone}/policy_\d+$"],
+                [rf"^pool_by_zone/{zone}$"],
             ]
             for zone in zones
         }
@@ -187,7 +241,9 @@ def hyperparameters(
     model: BaseAlgorithm, policy: OurPolicy, more: Mapping[str, object], scalars: Mapping[str, float]
 ) -> HParam:
     """
-    Describe a run for the HParams page: task and level first, then seed and method, then all else.
+    Describe a run for the HParams page: what the user gave, then seed and method, then all else.
+
+    TensorBoard sorts the columns by name, so the first ones have numbers in front: ``1 task``.
 
     :param model: the algorithm
     :param policy: its policy
@@ -197,11 +253,10 @@ def hyperparameters(
     env = model.get_env()
     assert env is not None
     n_agents = require_n_agents(env)
+    first = {**more, "seed": model.seed, "method": f"{type(model).__name__} {type(policy).__name__}", **more}
+    width = len(str(len(first)))
     found: dict[str, object] = {
-        **more,
-        "seed": model.seed,
-        "algorithm": type(model).__name__,
-        "policy": type(policy).__name__,
+        **{f"{number:0{width}} {name}": value for number, (name, value) in enumerate(first.items(), 1)},
         "n_agents": n_agents,
         "n_games": env.num_envs // n_agents,
         **asdict(policy.parts),

@@ -255,7 +255,13 @@ class Training:
             every_game_steps,
             INSPECTED_EPISODES,
             seed=evaluation_seed(self.seed),
-            hparams={"algo": settings.algo, "task": settings.task, "size": settings.size, **settings.env_kwargs},
+            hparams={
+                "task": settings.env_id,
+                "level": _level(settings),
+                "seed": self.seed,
+                "method": settings.algo,
+                "size": settings.size,
+            },
         )
 
     def _every(self, frequency: int | None, times_per_run: int) -> int:
@@ -263,6 +269,13 @@ class Training:
         if frequency is None:
             return max(1, self.settings.game_steps // times_per_run)
         return max(0, frequency)
+
+
+def _level(settings: Settings) -> str:
+    """The parameters of the games in words; of HECOGrid's, those that make its levels."""
+    of_levels = ("coordination", "heterogeneity")
+    kept = {key: value for key, value in settings.env_kwargs.items() if settings.environment.task is None or key in of_levels}
+    return ", ".join(f"{key} {value}" for key, value in kept.items())
 
 
 def load_parameters(model: BaseAlgorithm, path: Path) -> None:
