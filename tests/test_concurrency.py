@@ -1,0 +1,119 @@
+"""Vector environments and models beside each other: in threads, processes and copies they play as if alone."""
+
+from __future__ import annotations
+
+import copy
+import multiprocessing
+import pickle
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from typing import Any, Final
+
+import numba
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+
+import sb3_saf
+from hecogrid_envs import make_vec_env
+from tests.toy_envs import LazyEnv
+
+LEVEL: Final[dict[str, Any]] = {
+    "n_agents": 2,
+    "grid_size": 9,
+    "n_treasures": 4,
+    "max_cycles": 7,
+    "observation": "tiles",
+}
+
+
+def native(seed: int) -> Any:
+    return make_vec_env("TeamTogether", 6, seed=seed, n_threads=2, **LEVEL)
+
+
+def supersuit(seed: int) -> Any:
+    return sb3_saf.make_team_env(LazyEnv, 3, seed=seed)
+
+
+MAKERS: Final = pytest.mark.parametrize("make", [native, supersuit])
+
+
+def played(venv: Any, n_steps: int = 20) -> list[bytes]:
+    """What is seen and earned with actions that are always the same."""
+    rng = np.random.default_rng(0)
+    seen = []
+    for _ in range(n_steps):
+        observations, rewards, dones, _ = venv.step(rng.integers(0, 4, venv.num_envs))
+        parts = observations.values() if isinstance(observations, dict) else [observations]
+        seen += [np.asarray(part).tobytes() for part in (*parts, rewards, dones)]
+    return seen
+
+
+def begun(make: Callable[[int], Any], seed: int = 0) -> Any:
+    venv = make(seed)
+    venv.reset()
+    return venv
+
+
+def play_alone(make: Callable[[int], Any], seed: int) -> list[bytes]:
+    venv = begun(make, seed)
+    try:
+        return played(venv)
+    finally:
+        venv.close()
+
+
+@MAKERS
+def test_two_threads_at_once(make: Callable[[int], Any]) -> None:
+    expected = [play_alone(make, seed) for seed in (0, 1)]
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(partial(play_alone, make), (0, 1))) == expected
+
+
+@MAKERS
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_processes_that_are_started_in_the_middle_of_an_episode(make: Callable[[int], Any], method: str) -> None:
+    expected = play_alone(make, 0)
+    venv = begun(make)  # its threads, if any, are at work
+    played(venv, 3)
+    with ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:
+        assert pool.submit(play_alone, make, 0).result() == expected
+    venv.close()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda venv: pickle.loads(pickle.dumps(venv))])
+def test_copies_in_the_middle_of_an_episode_share_nothing(copied: Callable[[Any], Any]) -> None:
+    venv = begun(native)
+    played(venv, 3)
+    other = copied(venv)
+    expected = played(venv)
+    assert played(other) == expected
+
+
+@MAKERS
+def test_numbers_of_threads_that_change_in_between(make: Callable[[int], Any]) -> None:
+    expected = play_alone(make, 0)
+    before = th.get_num_threads(), numba.get_num_threads()
+    venv = begun(make)
+    try:
+        th.set_num_threads(2)
+        numba.set_num_threads(1)
+        assert played(venv) == expected
+    finally:
+        th.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+        venv.close()
+
+
+def test_models_trained_in_turn_are_as_if_each_were_alone() -> None:
+    def trained(policy: str) -> list[bytes]:
+        env = sb3_saf.make_team_env(LazyEnv, 2, seed=0)
+        settings: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
+        model = PPO(policy, env, seed=0, rollout_buffer_class=sb3_saf.TeamRolloutBuffer, **settings).learn(64)
+        env.close()
+        return [tensor.numpy().tobytes() for tensor in model.policy.state_dict().values()]
+
+    alone = {policy: trained(policy) for policy in ("SAFPolicy", "MAPPOPolicy")}
+    assert {policy: trained(policy) for policy in ("MAPPOPolicy", "SAFPolicy")} == alone
