@@ -479,8 +479,8 @@ def test_time_limits_are_bootstrapped_from_single_rows() -> None:
     ("kwargs", "message"),
     [
         ({"shared_lstm": True}, r"no LSTM shared by actor and critic.*leave shared_lstm=False"),
-        ({"lstm_hidden_size": 0}, r"lstm_hidden_size must be a whole number of at least 1, got 0"),
-        ({"n_lstm_layers": 1.5}, r"n_lstm_layers must be a whole number of at least 1, got 1.5"),
+        ({"lstm_hidden_size": 0}, r"lstm_hidden_size must be an integer of at least 1, got 0"),
+        ({"n_lstm_layers": 1.5}, r"n_lstm_layers must be an integer of at least 1, got 1.5"),
         ({"use_sde": True}, r"no state-dependent exploration"),
     ],
 )

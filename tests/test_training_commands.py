@@ -340,7 +340,7 @@ def failed(options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         (["--env-kwargs", "coordination:{"], ("not valid YAML",)),
         (["--eval-env-kwargs", "n_agents:5"], ("evaluation needs the 4 agents of training",)),
         (["-params", "clip_range_vf:-1"], ("clip_range_vf", "positive")),
-        (["-params", "policy_kwargs:{n_slots: 0}"], ("n_slots must be a whole number of at least 1",)),
+        (["-params", "policy_kwargs:{n_slots: 0}"], ("n_slots must be an integer of at least 1",)),
         (["-params", "batch_size:7"], ("batch_size", "multiple")),
         (["--seed", "-5"], ("seed must be a whole number from 0",)),
         (["--eval-episodes", "0"], ("--eval-episodes must be at least 1",)),

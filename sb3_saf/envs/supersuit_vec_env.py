@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     tile_images,
 )
 
+from hecogrid_envs.core.rng import game_seeds
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
 from sb3_saf.envs.game_copies import check_signature, signature
 from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, check_is_parallel, first_infos_of, game_form
@@ -30,17 +31,6 @@ from sb3_saf.envs.supersuit_game import Info
 from sb3_saf.envs.supersuit_games import Question, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.envs.teams import Array, check_count, check_seed
-
-
-def game_seeds(seed: int, n_games: int) -> list[int]:
-    """
-    Return the seeds of the games of a run, the same as ``hecogrid_envs.game_seeds``.
-
-    :param seed: of the run
-    :param n_games: E; game ``i`` gets the same seed whatever the number of games
-    """
-    words = [np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1, np.uint64)[0] for i in range(n_games)]
-    return [int(word) >> 1 for word in words]  # 63 bits, which every game takes
 
 
 class SuperSuitVecEnv(VecEnv):

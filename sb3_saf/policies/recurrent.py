@@ -18,11 +18,11 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_saf.envs.teams import check_count
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.row_encoder import EncodedRows
 from sb3_saf.policies.base import Encoded, NetArch, TeamPolicy
-from sb3_saf.policies.parts import check_at_least_one
 
 LstmStates = tuple[th.Tensor, ...]
 
@@ -92,8 +92,8 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
                 "team policies have no LSTM shared by actor and critic, which read different things: leave "
                 "shared_lstm=False; enable_critic_lstm=False leaves the critic without memory"
             )
-        check_at_least_one("lstm_hidden_size", lstm_hidden_size)
-        check_at_least_one("n_lstm_layers", n_lstm_layers)
+        check_count("lstm_hidden_size", lstm_hidden_size)
+        check_count("n_lstm_layers", n_lstm_layers)
         super().__init__(
             observation_space,
             action_space,

@@ -14,10 +14,18 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_saf.buffers.rollout import TeamMinibatch
-from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, ALL_KEYS, OBS_KEY, TEAM_KEY, TeamSpaces
+from sb3_saf.envs.teams import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    ALL_KEYS,
+    OBS_KEY,
+    TEAM_KEY,
+    TeamSpaces,
+    check_count,
+)
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.networks.spaces import pixels_to_codes
-from sb3_saf.policies.parts import check_at_least_one
 
 #: How PettingZoo's environments give masks.
 _CLASSIC: Final = {"observation", ACTION_MASK_KEY}
@@ -55,7 +63,7 @@ class TeamRowsPolicy(BasePolicy):
         :raises ValueError: if the space is not that of a team
         """
         if chunk_size is not None:
-            check_at_least_one("chunk_size", chunk_size)
+            check_count("chunk_size", chunk_size)
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
         _check_masks(self.team_spaces, action_space)
         self.chunk_size = chunk_size

@@ -10,6 +10,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from torch import nn
 
+from sb3_saf.envs.teams import check_count
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
 from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
@@ -22,7 +23,6 @@ from sb3_saf.policies.parts import (
     Declaration,
     PaperTable,
     TeamParts,
-    check_at_least_one,
     check_choice,
     team_policies,
 )
@@ -162,7 +162,7 @@ class SAFParts(MAPPOParts):
         super().__post_init__()
         check_choice("selection", self.selection, get_args(Selection))
         for name in ("n_policies", "n_slots", "latent_dim"):
-            check_at_least_one(name, getattr(self, name))
+            check_count(name, getattr(self, name))
         # Saved models may bring a list.
         object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
 

@@ -9,9 +9,10 @@ from typing import get_args
 from gymnasium import spaces
 from torch import nn
 
+from sb3_saf.envs.teams import check_count
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
-from sb3_saf.policies.parts import check_at_least_one, check_choice
+from sb3_saf.policies.parts import check_choice
 from sb3_saf.qplex.heads import AgentMemory
 from sb3_saf.qplex.mixers import Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer, check_mixer
 
@@ -53,7 +54,7 @@ class QPLEXParts:
         check_mixer(self.mixer)
         check_choice("heads", self.heads, get_args(Heads))
         for name in ("n_policies", "latent_dim", "mixer_hidden", "n_kernels", "sequence_length"):
-            check_at_least_one(name, getattr(self, name))
+            check_count(name, getattr(self, name))
         for name in ("lstm_hidden_size", "burn_in"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:

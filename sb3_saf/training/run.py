@@ -274,7 +274,11 @@ class Training:
 def _level(settings: Settings) -> str:
     """The parameters of the games in words; of HECOGrid's, those that make its levels."""
     of_levels = ("coordination", "heterogeneity")
-    kept = {key: value for key, value in settings.env_kwargs.items() if settings.environment.task is None or key in of_levels}
+    kept = {
+        key: value
+        for key, value in settings.env_kwargs.items()
+        if settings.environment.task is None or key in of_levels
+    }
     return ", ".join(f"{key} {value}" for key, value in kept.items())
 
 
