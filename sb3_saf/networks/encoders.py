@@ -217,17 +217,17 @@ class LightEncoder(Encoder):
     Tile codes are embedded once per code and looked up. In pictures, tiles are cut out first.
 
     Tiles that look nearly alike have nearly the same embedding, as if they were nearly the same thing. With zones that
-    is in the way: an agent in orange means other actions than one in red. ``one_hot_codes`` tells them apart, but then
-    what was learned of one tile helps less with its likes (measured: ``results/README.md``).
+    is in the way: an agent in orange means other actions than one in red. ``one_hot_codes`` tells them apart (measured:
+    ``results/README.md``).
 
     :param observation: pictures (either layout) or tile codes
     :param features_dim: size of the features
     :param tile_size: t, pixels per tile of pictures; tile codes bring their own
     :param embedding_dim: size of a tile's embedding
     :param hidden: size of the hidden layer
-    :param one_hot_codes: whether the embedding reads a tile's code beside its pixels. Needs tile codes, and the weights
-        do not fit pictures
-    :raises ValueError: for pictures that are not made of whole tiles, or with ``one_hot_codes``
+    :param one_hot_codes: whether the embedding reads a tile's code beside its pixels, which needs tile codes; the
+        weights do not fit pictures then. None: where observations are tile codes
+    :raises ValueError: for pictures that are not made of whole tiles, or with ``one_hot_codes=True``
     """
 
     tile_inputs: th.Tensor
@@ -239,11 +239,11 @@ class LightEncoder(Encoder):
         tile_size: int = 4,
         embedding_dim: int = 16,
         hidden: int = 128,
-        one_hot_codes: bool = False,
+        one_hot_codes: bool | None = None,
     ):
         super().__init__()
         self.pixels = PixelInput(observation)
-        self.one_hot_codes = one_hot_codes
+        self.one_hot_codes = self.pixels.layout == "codes" if one_hot_codes is None else one_hot_codes
         self.tile_size = self.pixels.atlas.shape[1] if self.pixels.layout == "codes" else tile_size
         channels, height, width = self.pixels.shape
         if height % self.tile_size or width % self.tile_size:
@@ -255,9 +255,9 @@ class LightEncoder(Encoder):
         self.n_tiles = height * width // self.tile_size**2
         n_inputs = self.tile_size**2 * channels
         if self.pixels.layout == "codes":
-            self.register_buffer("tile_inputs", self._inputs_of_codes(one_hot_codes), persistent=False)
+            self.register_buffer("tile_inputs", self._inputs_of_codes(self.one_hot_codes), persistent=False)
             n_inputs = self.tile_inputs.shape[1]
-        elif one_hot_codes:
+        elif self.one_hot_codes:
             raise ValueError(
                 'one_hot_codes=True needs tile codes, as make_team_env(..., observation="tiles") gives them (a Box of '
                 f"whole numbers with an atlas), got pictures {self.pixels.shape}; leave it False"

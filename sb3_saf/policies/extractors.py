@@ -84,7 +84,7 @@ class LightEncoder(encoders.LightEncoder, BaseFeaturesExtractor):
         tile_size: int = 4,
         embedding_dim: int = 16,
         hidden: int = 128,
-        one_hot_codes: bool = False,
+        one_hot_codes: bool | None = None,
     ):
         BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
         encoders.LightEncoder.__init__(
