@@ -39,7 +39,8 @@ class TeamParts(ABC):
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
     :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts: for teams whose agents have
-        roles that their observations do not tell
+        roles that their observations do not tell. Off, because such a model needs the agent's index to act, and where
+        observations tell agents apart it was not reliably better (measured in docs/reference/own_environment.md)
     """
 
     heads: Heads = "shared"
