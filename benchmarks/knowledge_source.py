@@ -18,8 +18,8 @@ import torch as th
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.knowledge_source import KnowledgeSource
-from sb3_saf.networks.layers import Attention
 
 SIZES: Final = (5, 10, 20, 40, 80, 160, 320)
 FEATURES: Final = 64

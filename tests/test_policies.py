@@ -246,7 +246,7 @@ def test_whole_teams_are_judged_without_search_and_as_rows_in_any_order(
 
 
 def test_each_unique_observation_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = make_policy(SAFPolicy, chunk_size=4)
+    policy = make_policy(SAFPolicy, chunk_size=4, encode_once=True)
     encoded: list[tuple[float, ...]] = []
     forward = policy.features_extractor.forward
 

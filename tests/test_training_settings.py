@@ -116,7 +116,9 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
     schedule = settings.hyperparams["learning_rate"]
     assert isinstance(schedule, LinearSchedule)
     assert schedule(0.5) == pytest.approx(3.5e-4)
-    assert settings.hyperparams["policy_kwargs"] == {"features_extractor_class": LightEncoder, "n_slots": 8}
+    of_the_size = load_settings("saf", ENV, "small").hyperparams["policy_kwargs"]
+    assert of_the_size["features_extractor_class"] is LightEncoder
+    assert settings.hyperparams["policy_kwargs"] == {**of_the_size, "n_slots": 8}
     assert (settings.env_kwargs["coordination"], settings.env_kwargs["grid_size"]) == (2, 15)
 
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_saf.buffers.later import LaterValues, compute_together
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -28,6 +29,10 @@ from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
 
 #: Arrays with one entry per step and row, beside the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
+
+
+#: Rows whose values are computed at once: enough to outweigh the calls, few enough for the cache.
+_ROWS_AT_ONCE: Final = 1024
 
 
 class RolloutReturns:
@@ -163,6 +168,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
         self._allocated = False
         self._returns = RolloutReturns(np.zeros(0))
+        self._later: list[tuple[int, LaterValues[Any]]] = []
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
     def reset(self) -> None:
@@ -175,6 +181,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             self._allocate_by_game()
             self._allocated = True
         self.generator_ready = False
+        self._later.clear()
         BaseBuffer.reset(self)
 
     def _allocate_by_game(self) -> None:
@@ -211,7 +218,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param action: (B, ...)
         :param reward: (B,)
         :param episode_start: (B,) whether an episode starts with this step
-        :param value: (B,) or (B, 1) predicted values
+        :param value: (B,) or (B, 1) predicted values; those that are to be computed later are, at the rollout's end
         :param log_prob: (B,)
         :raises ValueError: if the rows are not whole teams in index order
         """
@@ -219,7 +226,18 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
                 array[self.pos] = self._of_games(obs, key, array)
+        if isinstance(value, LaterValues):
+            self._later.append((self.pos, value))
+            value = log_prob  # any numbers: compute_returns_and_advantage overwrites them
         super().add(obs, action, reward, episode_start, value, log_prob)
+
+    def _compute_later_values(self) -> None:
+        at_once = max(1, _ROWS_AT_ONCE // self.n_envs)
+        for start in range(0, len(self._later), at_once):
+            positions, steps = zip(*self._later[start : start + at_once], strict=True)
+            for position, values in zip(positions, compute_together(steps), strict=True):
+                self.values[position] = values.reshape(-1).cpu().numpy()
+        self._later.clear()
 
     def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
         """What all rows of a game share, once per game: (B, ...) -> (E, ...)."""
@@ -253,6 +271,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param last_values: (B,) or (B, 1) values after the last step
         :param dones: (B,) whether an episode ended with the last step
         """
+        self._compute_later_values()
         if self.active is None:
             super().compute_returns_and_advantage(last_values, dones)
             self._returns = RolloutReturns(self.returns)

@@ -287,6 +287,8 @@ def team_dones(dones: Array, n_agents: int) -> npt.NDArray[np.bool_]:
     :raises ValueError: if the flags differ inside a team
     """
     by_game = np.asarray(dones).astype(bool).reshape(-1, n_agents)
+    if not by_game.any():
+        return np.zeros(len(by_game), dtype=np.bool_)
     ended = by_game[:, 0]
     if (by_game != ended[:, np.newaxis]).any():
         game = int(np.flatnonzero((by_game != ended[:, np.newaxis]).any(axis=1))[0])

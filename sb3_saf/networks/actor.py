@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import torch as th
 from torch import nn
 
 from sb3_saf.networks.distributions import mixture_log_probs, n_action_parameters, policy_parameters
-from sb3_saf.networks.layers import AgentHeads, mlp
+from sb3_saf.networks.layers import AgentHeads, mlp, side_by_side
 from sb3_saf.networks.spaces import AnySpace, spec_of
 
 #: Orthogonal gain of the last layer: first policies are close to uniform.
@@ -33,7 +33,7 @@ class PoolOutput(NamedTuple):
     What each policy of a pool would do, and how likely each is to be chosen.
 
     :param log_weights: (K, U), normalised
-    :param actions: (K, U, P), parameters of each policy's action distribution
+    :param actions: (K, U, P), parameters of each policy's action distribution; in memory, rows are last
     """
 
     log_weights: th.Tensor
@@ -242,8 +242,13 @@ class PolicyPool(ActorNetwork):
     def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """See :class:`ActorNetwork`."""
         features = self.with_identity(features, agent)
-        logits = self.query_net(features) @ self.signature_keys.t() * self.signature_keys.shape[1] ** -0.5
-        return PoolOutput(logits.log_softmax(dim=1), th.stack([policy(features) for policy in self.policies], dim=1))
+        policies = [cast(ActionHead, policy) for policy in self.policies]
+        (queries,), actions = side_by_side([[self.query_net], [policy.net for policy in policies]], features)
+        logits = self.signature_keys @ queries.t() * self.signature_keys.shape[1] ** -0.5
+        if self.space.kind == "box":
+            log_stds = th.stack([cast(nn.Parameter, policy.log_std) for policy in policies])
+            actions = th.cat([actions, log_stds.unsqueeze(1).expand_as(actions)], dim=2)
+        return PoolOutput(logits.log_softmax(dim=0).t(), actions.transpose(0, 1))
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """

@@ -13,7 +13,7 @@ from typing import Literal, cast
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.layers import AgentHeads, NetworkSpec, gather, mlp
+from sb3_saf.networks.layers import AgentHeads, NetworkSpec, Rows, gather, mlp, side_by_side
 
 #: One head for all agents, or one for each.
 Heads = Literal["shared", "per_agent"]
@@ -23,12 +23,12 @@ class TeamCritic(nn.Module, ABC):
     """Base of critics that read what the whole team sees."""
 
     @abstractmethod
-    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """
         Value of every agent of every team.
 
         :param features: (K, d) features of own observations
-        :param teams: (G, N) int64, which of them each agent of a team has
+        :param teams: (G, N), which of them each agent of a team has
         :param active: (G, N) bool, agents that take part; all if None
         :return: (G, N)
         """
@@ -46,12 +46,12 @@ class TeamStates(nn.Module, ABC):
         self.states_dim = states_dim
 
     @abstractmethod
-    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """
         State of every agent of every team.
 
         :param features: (K, d) features of own observations
-        :param teams: (G, N) int64, which of them each agent of a team has
+        :param teams: (G, N), which of them each agent of a team has
         :param active: (G, N) bool, agents that take part; all if None
         :return: (G, N, S)
         """
@@ -72,7 +72,7 @@ class JointStates(TeamStates):
         self.agent_identity = agent_identity
         self.members = members
 
-    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`; agents that take no part are read as zeros."""
         members = gather(features, teams) if self.members is None else self.members.states(features, teams, active)
         return self.join(members, active)
@@ -180,8 +180,11 @@ class JointValueHead(nn.Module):
         joint = features.flatten(1)
         if self.agent_identity:
             return self._with_identity(joint)
-        values = th.cat([head(joint) for head in self.heads], dim=1)
-        return values.expand(-1, self.n_agents)
+        if len(self.heads) == 1:
+            of_team: th.Tensor = self.heads[0](joint)
+            return of_team.expand(-1, self.n_agents)
+        (values,) = side_by_side([cast(list[nn.Sequential], list(self.heads))], joint)
+        return values.squeeze(2).t()
 
     def _with_identity(self, joint: th.Tensor) -> th.Tensor:
         """(G, N) values of [joint features, one-hot agent]; the first layer reads the joint part once per team."""

@@ -166,7 +166,9 @@ def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
     :param logits: (B, U, A)
     :return: (B, A), normalised
     """
-    return (log_weights.unsqueeze(2) + logits.log_softmax(dim=2)).logsumexp(dim=1)
+    # With rows last in memory, loops run over many rows instead of few actions.
+    of_policies = logits.permute(1, 2, 0).contiguous().log_softmax(dim=1)
+    return (log_weights.t().unsqueeze(1) + of_policies).logsumexp(dim=0).t()
 
 
 def mixture_log_prob(

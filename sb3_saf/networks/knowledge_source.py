@@ -11,7 +11,8 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.layers import Attended, Attention, mlp
+from sb3_saf.networks.attention import Attended, Attention
+from sb3_saf.networks.layers import mlp
 
 
 class Written(NamedTuple):
@@ -59,7 +60,7 @@ class CrossAttentionBlock(nn.Module):
         """
         Update the slots.
 
-        :param slots: (G, L, d)
+        :param slots: (L, d), the same for all teams, or (G, L, d)
         :param messages: (G, N, d)
         :param active: (G, N) bool or None
         :return: slots (G, L, d) and attention (G, L, N)
@@ -127,8 +128,7 @@ class KnowledgeSource(nn.Module):
         :param active: (G, N) bool, agents that are heard; all if None
         :return: slots (G, L, d) and write attention (G, L, N)
         """
-        slots = self.slots.expand(len(messages), -1, -1)
-        slots, attention = self.write_block(slots, messages + self.agent_embeddings, active)
+        slots, attention = self.write_block(self.slots, messages + self.agent_embeddings, active)
         for block in self.slot_blocks:
             slots = block(slots)
         return Written(slots, attention)

@@ -9,15 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
 import torch as th
 from torch import nn
+
+from sb3_saf.networks.tanh import Tanh
 
 if TYPE_CHECKING:
     from gymnasium import spaces
 
 HIDDEN_GAIN: Final = math.sqrt(2)
+#: Up to so many outputs of a layer are laid out column by column.
+_FEW_OUTPUTS: Final = 16
 
 
 class NetworkSpec(NamedTuple):
@@ -44,7 +48,21 @@ class NetworkSpec(NamedTuple):
     state_space: spaces.Space[Any] | None = None
 
 
-def gather(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
+class InOrder(NamedTuple):
+    """
+    The rows 0, 1, 2 ... laid out in a shape: indices that need neither memory nor a copy of what they select.
+
+    :param shape: of the indices
+    """
+
+    shape: tuple[int, ...]
+
+
+#: Which rows: int64 indices of any shape, or all in order.
+Rows: TypeAlias = th.Tensor | InOrder
+
+
+def gather(x: th.Tensor, rows: Rows) -> th.Tensor:
     """
     Return ``x[rows]``, with a gradient that is the same every time.
 
@@ -52,9 +70,11 @@ def gather(x: th.Tensor, rows: th.Tensor) -> th.Tensor:
     of ``index_select`` is added in order, and in a third of the time.
 
     :param x: (K, *shape)
-    :param rows: int64 of any shape, each in 0..K-1
+    :param rows: int64 of any shape, each in 0..K-1, or all K in order
     :return: (*rows.shape, *shape)
     """
+    if isinstance(rows, InOrder):
+        return x if len(rows.shape) == 1 else x.reshape(*rows.shape, *x.shape[1:])
     return x.index_select(0, rows.flatten()).view(*rows.shape, *x.shape[1:])
 
 
@@ -85,34 +105,6 @@ class Linear(nn.Linear):
         self.gain = gain
 
 
-class Tanh(nn.Tanh):
-    """
-    ``nn.Tanh``, on the CPU as 2 sigmoid(2 x) - 1: PyTorch's sigmoid takes a sixth of the time of its tanh, which would
-    be a fifth of SAF's forward pass. The two differ by 2e-7 at most.
-    """
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        """Of any shape."""
-        if x.device.type != "cpu" or th.compiler.is_compiling():
-            return super().forward(x)
-        result: th.Tensor = _TanhBySigmoid.apply(x)
-        return result
-
-
-class _TanhBySigmoid(th.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:
-        y = (x * 2).sigmoid_().mul_(2).sub_(1)
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: th.Tensor) -> th.Tensor:
-        # Autograd's own formula, which can be differentiated again, as TRPO does.
-        gradient: th.Tensor = th.ops.aten.tanh_backward(gradients[0], *ctx.saved_tensors)
-        return gradient
-
-
 def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float = 1.0) -> nn.Sequential:
     """
     Multi-layer perceptron with a linear output.
@@ -126,6 +118,42 @@ def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float
     for n_in, n_out in pairwise(sizes[:-1]):
         layers += [Linear(n_in, n_out, gain=HIDDEN_GAIN), activation()]
     return nn.Sequential(*layers, Linear(sizes[-2], sizes[-1], gain=output_gain))
+
+
+def side_by_side(groups: Sequence[Sequence[nn.Sequential]], x: th.Tensor) -> list[th.Tensor]:
+    """
+    Outputs of several MLPs for the same inputs, in few large operations: the first layers of all in one product, and
+    every further layer of a group in one batch. Equal to calling them one by one, up to the order of summation.
+
+    :param groups: MLPs of :func:`mlp` with one activation; those of a group have one shape
+    :param x: (K, d)
+    :return: for each group of U MLPs, (U, K, P); few outputs lie in memory as (U, P, K), in which order what goes over
+        them is fastest
+    """
+    firsts = [cast(nn.Linear, net[0]) for group in groups for net in group]
+    wide = nn.functional.linear(x, th.cat([one.weight for one in firsts]), th.cat([one.bias for one in firsts]))
+    have_hidden = [len(group[0]) > 1 for group in groups]
+    if all(have_hidden):
+        wide = groups[0][0][1](wide)
+    parts = list(th.split(wide, [len(group) * cast(nn.Linear, group[0][0]).out_features for group in groups], dim=1))
+    for number, group in enumerate(groups):
+        if have_hidden[number] and not all(have_hidden):
+            parts[number] = group[0][1](parts[number])
+    return [_deeper(group, part) for group, part in zip(groups, parts, strict=True)]
+
+
+def _deeper(group: Sequence[nn.Sequential], hidden: th.Tensor) -> th.Tensor:
+    """(U, K, P) outputs of a group, from (K, U * h) of its first layers."""
+    x = hidden.unflatten(1, (len(group), -1)).transpose(0, 1)
+    for number in range(2, len(group[0]), 2):
+        layers = [cast(nn.Linear, net[number]) for net in group]
+        weight, bias = th.stack([one.weight for one in layers]), th.stack([one.bias for one in layers])
+        if number == len(group[0]) - 1 and weight.shape[1] <= _FEW_OUTPUTS:
+            return th.baddbmm(bias.unsqueeze(2), weight, x.transpose(1, 2)).transpose(1, 2)
+        x = th.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
+        if number < len(group[0]) - 1:
+            x = group[0][number + 1](x)
+    return x
 
 
 def orthogonal_init(module: nn.Module) -> None:
@@ -171,51 +199,3 @@ class AgentHeads(nn.Module):
         position = th.empty_like(order)
         position[order] = th.arange(len(order), device=order.device)
         return gather(by_agent, position)
-
-
-class Attended(NamedTuple):
-    """
-    What an attention layer gives.
-
-    :param values: (G, Q, d)
-    :param weights: (G, Q, S), the share of each source in each query's answer; sums to 1 over sources
-    """
-
-    values: th.Tensor
-    weights: th.Tensor
-
-
-class Attention(nn.Module):
-    """
-    One head of scaled dot-product attention: softmax(Q K^T / sqrt(d)) V, then a linear output layer.
-
-    Queries, keys and values have no bias (spec: SAF's parameter table).
-
-    :param features_dim: d
-    """
-
-    def __init__(self, features_dim: int):
-        super().__init__()
-        self.query = Linear(features_dim, features_dim, gain=1.0, bias=False)
-        self.key = Linear(features_dim, features_dim, gain=1.0, bias=False)
-        self.value = Linear(features_dim, features_dim, gain=1.0, bias=False)
-        self.out = Linear(features_dim, features_dim, gain=1.0)
-        self.scale = features_dim**-0.5
-
-    def forward(self, queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None = None) -> Attended:
-        """
-        Let each query look at the sources.
-
-        :param queries: (G, Q, d)
-        :param sources: (G, S, d)
-        :param active: (G, S) bool, sources to look at; all if None. Without any active source the values are zero
-        :return: values (G, Q, d), with the output layer applied, and weights (G, Q, S)
-        """
-        scores = self.query(queries) @ self.key(sources).transpose(1, 2) * self.scale
-        if active is None:
-            weights = scores.softmax(dim=2)
-        else:
-            # The lowest finite number instead of -inf: a row without sources gives zeros, not NaN.
-            shown = active.unsqueeze(1)
-            weights = scores.masked_fill(~shown, th.finfo(scores.dtype).min).softmax(dim=2) * shown
-        return Attended(self.out(weights @ self.value(sources)), weights)

@@ -6,16 +6,17 @@ Letters: B rows, K unique own observations, G teams, N agents, d features; ``*sh
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 from math import prod
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
 from numba import njit
 
-from sb3_saf.networks.layers import gather
+from sb3_saf.networks.layers import InOrder, Rows, gather
 
 _WORD: Final = 8  # bytes in a machine word
 #: Bytes of temporary words per step of the device path; bounds its memory, not its result.
@@ -71,7 +72,12 @@ class EncodedRows(NamedTuple):
 
     observations: th.Tensor
     features: th.Tensor
-    inverse: th.Tensor
+    inverse: Rows
+
+    @property
+    def n_rows(self) -> int:
+        """B."""
+        return self.inverse.shape[0]
 
     def of_rows(self) -> th.Tensor:
         """Return the features of all rows, (B, d)."""
@@ -83,7 +89,16 @@ class EncodedRows(NamedTuple):
 
         :param rows: (B',) int64
         """
-        return self._replace(inverse=self.inverse[rows])
+        return self._replace(inverse=rows if isinstance(self.inverse, InOrder) else self.inverse[rows])
+
+    def arranged(self, shape: tuple[int, ...]) -> Rows:
+        """
+        Lay the rows out.
+
+        :param shape: of B entries
+        :return: of that shape, which of the features each row has
+        """
+        return InOrder(shape) if isinstance(self.inverse, InOrder) else self.inverse.view(shape)
 
 
 class EncodedTeams(NamedTuple):
@@ -97,7 +112,7 @@ class EncodedTeams(NamedTuple):
     """
 
     features: th.Tensor
-    members: th.Tensor
+    members: Rows
     rows: th.Tensor | None = None
     active: th.Tensor | None = None
 
@@ -112,6 +127,50 @@ class EncodedTeams(NamedTuple):
         return flat if self.rows is None else gather(flat, self.rows)
 
 
+def joined_rows(parts: Sequence[EncodedRows]) -> EncodedRows:
+    """
+    Put encoded rows one after another.
+
+    :param parts: rows that were encoded apart
+    """
+    return EncodedRows(
+        th.cat([part.observations for part in parts]),
+        th.cat([part.features for part in parts]),
+        _joined([part.inverse for part in parts], [len(part.features) for part in parts]),
+    )
+
+
+def joined_teams(parts: Sequence[EncodedTeams]) -> EncodedTeams:
+    """
+    Put encoded teams one after another.
+
+    :param parts: teams that were encoded apart
+    """
+    if len(parts) == 1:
+        return parts[0]
+    n_agents = parts[0].members.shape[1]
+    n_members = [part.members.shape[0] * n_agents for part in parts]
+    every = [
+        th.arange(count, device=part.features.device) if part.rows is None else part.rows
+        for part, count in zip(parts, n_members, strict=True)
+    ]
+    active = [part.active for part in parts]
+    return EncodedTeams(
+        th.cat([part.features for part in parts]),
+        _joined([part.members for part in parts], [len(part.features) for part in parts]),
+        None if all(part.rows is None for part in parts) else cast(th.Tensor, _joined(every, n_members)),
+        None if None in active else th.cat([one for one in active if one is not None]),
+    )
+
+
+def _joined(parts: Sequence[Rows], counts: Sequence[int]) -> Rows:
+    """Indices into what was put one after another: those of each part count from where it starts."""
+    if all(isinstance(part, InOrder) for part in parts):
+        return InOrder((sum(part.shape[0] for part in parts), *parts[0].shape[1:]))
+    starts = accumulate(counts, initial=0)
+    return th.cat([part + start for part, start in zip(cast(Sequence[th.Tensor], parts), starts, strict=False)])
+
+
 class RowEncoder:
     """
     Encodes the own observations of a batch.
@@ -122,6 +181,7 @@ class RowEncoder:
 
     def __init__(self, encode: Callable[[th.Tensor], th.Tensor], once: bool = True):
         self.encode = encode
+        self.once = once
         self.find = unique_rows if once else every_row
 
     def rows(self, observations: th.Tensor) -> EncodedRows:
@@ -130,6 +190,8 @@ class RowEncoder:
 
         :param observations: (B, *shape)
         """
+        if not self.once:
+            return EncodedRows(observations, self.encode(observations), InOrder((len(observations),)))
         found = self.find(observations)
         unique = observations[found.index]
         return EncodedRows(unique, self.encode(unique), found.inverse)
@@ -171,6 +233,8 @@ class RowEncoder:
         """
         if agent is None:
             return gather(module(own.features, None), own.inverse)
+        if isinstance(own.inverse, InOrder):
+            return module(own.features, agent)
         pairs = self.find(th.stack([own.inverse, agent], dim=1))
         of_pairs = module(gather(own.features, own.inverse[pairs.index]), agent[pairs.index])
         return gather(of_pairs, pairs.inverse)

@@ -9,7 +9,7 @@ agents.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from typing import Any, ClassVar, Final, NamedTuple, NoReturn
@@ -24,17 +24,18 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_saf.buffers.later import LaterValues
 from sb3_saf.buffers.rollout import TeamMinibatch
-from sb3_saf.envs.teams import STATE_KEY
+from sb3_saf.envs.teams import ACTIVE_KEY, AGENT_KEY, STATE_KEY
 from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
-from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams
+from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, joined_rows, joined_teams
 from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import TeamParts
-from sb3_saf.policies.rows import TeamRowsPolicy, entry_of, pop_named
+from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, entry_of, pop_named
 
 #: Action masks of MaskablePPO, (B, M).
 Masks = npt.NDArray[Any] | th.Tensor
@@ -59,6 +60,18 @@ class Encoded(NamedTuple):
     teams: EncodedTeams | None
 
 
+class Step(NamedTuple):
+    """
+    What a critic reads of one step of all games.
+
+    :param obs: who acts and who takes part, of the rows
+    :param encoded: what they see
+    """
+
+    obs: dict[str, th.Tensor]
+    encoded: Encoded
+
+
 class TeamPolicy(TeamRowsPolicy):
     """
     Base of policies on rows of teams: one row is one agent in one game at one step.
@@ -80,8 +93,10 @@ class TeamPolicy(TeamRowsPolicy):
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
     :param encode_once: whether equal observations of a batch are encoded once; False encodes every row, which gives
-        the same numbers
-    :param chunk_size: observations encoded at once on the CPU, few enough for the cache; None for all
+        the same numbers. None: once where observations are whole numbers (pictures, codes, choices); float
+        observations are hardly ever equal
+    :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all but where pictures are
+        convolved, whose intermediate results shall fit the cache
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
         ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. Values that the policy
         gives, ``train/value_loss`` and ``clip_range_vf`` are on the raw scale either way
@@ -115,8 +130,8 @@ class TeamPolicy(TeamRowsPolicy):
         lr_schedule: Schedule,
         net_arch: NetArch | None = None,
         *,
-        encode_once: bool = True,
-        chunk_size: int | None = 512,
+        encode_once: bool | None = None,
+        chunk_size: ChunkSize = "auto",
         normalize_values: bool = False,
         use_sde: bool = False,
         share_features_extractor: bool = True,
@@ -215,13 +230,15 @@ class TeamPolicy(TeamRowsPolicy):
         :param obs: rows
         :param deterministic: whether to take the most likely actions
         :param action_masks: (B, M) of MaskablePPO; None allows everything
-        :return: actions (B, ...), values (B, 1), log-likelihoods (B,)
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In a rollout, values are computed when they are
+            used
         """
         encoded = self._encoded(obs)
         distribution = self._distribution(obs, encoded.own, action_masks)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
-        return actions.reshape((-1, *(self.action_space.shape or ()))), self._values(obs, encoded), log_prob
+        actions = actions.reshape((-1, *(self.action_space.shape or ())))
+        return actions, self._values_of_step(obs, encoded), log_prob
 
     def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: Masks | None = None
@@ -307,7 +324,7 @@ class TeamPolicy(TeamRowsPolicy):
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._action_mask(obs)
         if action_masks is not None:
-            allowed = th.as_tensor(action_masks, dtype=th.bool, device=own.inverse.device).reshape(len(own.inverse), -1)
+            allowed = th.as_tensor(action_masks, dtype=th.bool, device=own.features.device).reshape(own.n_rows, -1)
             masks = allowed if masks is None else masks & allowed
         return self._distribution_of(lambda module: self.row_encoder.apply(module, own, agent), masks)
 
@@ -327,6 +344,27 @@ class TeamPolicy(TeamRowsPolicy):
         else:
             values = self.row_encoder.apply(critic, encoded.own, self._agent(obs) if critic.reads_agent else None)
         return self._raw_values(obs, values)
+
+    def _values_of_step(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
+        """(B, 1) values of a step of all games: in a rollout those of many steps are computed together."""
+        if self.training or th.is_grad_enabled() or isinstance(self.value_net, StateCritic):
+            return self._values(obs, encoded)
+        entries = {} if isinstance(obs, th.Tensor) else obs
+        read: dict[str, th.Tensor] = {key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}
+        features = encoded.own.features
+        # Critics read features: the observations need not be kept.
+        encoded = encoded._replace(own=encoded.own._replace(observations=features.new_empty(0)))
+        return LaterValues.of(Step(read, encoded), features.new_empty(encoded.own.n_rows, 0), self._values_of_steps)
+
+    def _values_of_steps(self, steps: Sequence[Step]) -> list[th.Tensor]:
+        """(B, 1) values of each step."""
+        with th.no_grad():
+            obs = {key: th.cat([step.obs[key] for step in steps]) for key in steps[0].obs}
+            own = joined_rows([step.encoded.own for step in steps])
+            found = [step.encoded.teams for step in steps]
+            teams = None if None in found else joined_teams([one for one in found if one is not None])
+            values = self._values(obs, Encoded(own, teams))
+            return list(th.split(values, [step.encoded.own.n_rows for step in steps]))
 
     def _raw_values(self, obs: PyTorchObs, outputs: th.Tensor) -> th.Tensor:
         """(B, 1) values on the raw scale, of the critic's outputs (B,)."""

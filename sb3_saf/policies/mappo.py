@@ -18,7 +18,7 @@ from sb3_saf.networks.critic import (
     TeamCritic,
     TeamStates,
 )
-from sb3_saf.networks.layers import NetworkSpec, gather
+from sb3_saf.networks.layers import NetworkSpec, Rows, gather
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import (
@@ -46,7 +46,7 @@ class JointCritic(TeamCritic):
         joint_dim = spec.n_agents * spec.features_dim
         self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
 
-    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; features of agents that take no part are read as zeros."""
         members = gather(features, teams)
         if active is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 import torch as th
@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.envs.teams import (
@@ -31,6 +32,8 @@ from sb3_saf.networks.spaces import pixels_to_codes
 _CLASSIC: Final = {"observation", ACTION_MASK_KEY}
 
 Observation = np.ndarray | Mapping[str, Any]
+ChunkSize: TypeAlias = int | Literal["auto"] | None
+_CHUNK_OF_CONVOLUTIONS: Final = 512
 
 
 class TeamRowsPolicy(BasePolicy):
@@ -42,15 +45,15 @@ class TeamRowsPolicy(BasePolicy):
 
     team_spaces: TeamSpaces
     row_encoder: RowEncoder
-    encode_once: bool
-    chunk_size: int | None
+    encode_once: bool | None
+    chunk_size: ChunkSize
 
     def _read_rows_of(
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        encode_once: bool,
-        chunk_size: int | None,
+        encode_once: bool | None,
+        chunk_size: ChunkSize,
     ) -> None:
         """
         Take the spaces apart.
@@ -58,17 +61,19 @@ class TeamRowsPolicy(BasePolicy):
         :param observation_space: Dict of ``obs``, ``team``, ``agent``, and perhaps ``active``, ``action_mask``,
             ``state``
         :param action_space: one agent's action space
-        :param encode_once: whether equal observations of a batch are encoded once
-        :param chunk_size: observations encoded at once on the CPU, few enough for the cache; None for all
+        :param encode_once: whether equal observations of a batch are encoded once; None where they are whole numbers
+        :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all but where pictures
+            are convolved, whose intermediate results shall fit the cache
         :raises ValueError: if the space is not that of a team
         """
-        if chunk_size is not None:
+        if chunk_size is not None and chunk_size != "auto":
             check_count("chunk_size", chunk_size)
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
         _check_masks(self.team_spaces, action_space)
         self.chunk_size = chunk_size
         self.encode_once = encode_once
-        self.row_encoder = RowEncoder(self._encode, encode_once)
+        whole_numbers = np.issubdtype(self.team_spaces.team.dtype, np.integer)
+        self.row_encoder = RowEncoder(self._encode, whole_numbers if encode_once is None else encode_once)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """
@@ -241,13 +246,13 @@ class TeamRowsPolicy(BasePolicy):
             observations, rows, active = obs.teams
             members = self.row_encoder.rows(observations.flatten(0, 1))
             own = members if rows is None else members.at(rows)
-            return own, EncodedTeams(members.features, members.inverse.view(observations.shape[:2]), rows, active)
+            return own, EncodedTeams(members.features, members.arranged(observations.shape[:2]), rows, active)
         own, active = self.encode_own(obs), self._active(obs)
         if not self._are_whole_teams(obs):
             return own, self.row_encoder.joint_rows(self._team(obs), self._agent(obs), own, active)
         n_agents = self.team_spaces.n_agents
-        members_of_teams = own.inverse.view(-1, n_agents)
-        return own, EncodedTeams(own.features, members_of_teams, None, None if active is None else active[::n_agents])
+        teams = own.arranged((own.n_rows // n_agents, n_agents))
+        return own, EncodedTeams(own.features, teams, None, None if active is None else active[::n_agents])
 
     def _are_whole_teams(self, obs: PyTorchObs) -> bool:
         """Whether rows are those of whole teams, agents in index order: as in a step of all games."""
@@ -274,10 +279,18 @@ class TeamRowsPolicy(BasePolicy):
         self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
     ) -> th.Tensor:
         """(K, ...) outputs of a module for preprocessed observations (K, *shape)."""
-        on_cpu = observations.device.type == "cpu"
-        parts = th.split(observations, self.chunk_size if self.chunk_size and on_cpu else max(1, len(observations)))
+        size = self._chunk_size_of(module) if observations.device.type == "cpu" else None
+        if size is None or len(observations) <= size:
+            return module(preprocess_obs(observations, space, self.normalize_images))
+        parts = th.split(observations, size)
         results = [module(preprocess_obs(part, space, self.normalize_images)) for part in parts]
-        return results[0] if len(results) == 1 else th.cat(results)
+        return th.cat(results)
+
+    def _chunk_size_of(self, module: object) -> int | None:
+        if self.chunk_size != "auto":
+            return self.chunk_size
+        has_convolutions = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
+        return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
 
 
 def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:

@@ -14,7 +14,7 @@ from sb3_saf.envs.teams import check_count
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
 from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
-from sb3_saf.networks.layers import NetworkSpec, gather, mlp
+from sb3_saf.networks.layers import NetworkSpec, Rows, gather, mlp, side_by_side
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.mappo import MAPPOParts
 from sb3_saf.policies.parts import (
@@ -62,21 +62,22 @@ class SAFStates(TeamStates):
         self.knowledge_source = KnowledgeSource(spec.n_agents, parts.latent_dim, parts.n_slots)
         self.combine_net = projection(2 * parts.latent_dim)  # g_phi
 
-    def states(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`."""
         communicated = self.communicate(features, teams, active)
         return self.combine(communicated.states, communicated.exchanged.read)
 
-    def communicate(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> Communicated:
+    def communicate(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> Communicated:
         """
         Send every agent's message through the knowledge source.
 
         :param features: (K, d) features of own observations
-        :param teams: (G, N) int64, which of them each agent of a team has
+        :param teams: (G, N), which of them each agent of a team has
         :param active: (G, N) bool, agents that take part; all if None
         """
         # g_theta and g_omega depend on one observation only: computed once for each, then gathered.
-        messages, states = gather(self.message_net(features), teams), gather(self.state_net(features), teams)
+        ((own_messages, own_states),) = side_by_side([[self.message_net, self.state_net]], features)
+        messages, states = gather(own_messages, teams), gather(own_states, teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
 
     def combine(self, states: th.Tensor, read: th.Tensor) -> th.Tensor:
@@ -108,7 +109,7 @@ class SAFCritic(SAFStates, TeamCritic):
             joint_dim = spec.n_agents * parts.latent_dim
             self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
 
-    def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`."""
         return self.judge(self.states(features, teams, active), active)
 

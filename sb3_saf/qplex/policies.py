@@ -19,7 +19,7 @@ from sb3_saf.envs.teams import Array
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
 from sb3_saf.policies.extractors import ObservationEncoder
-from sb3_saf.policies.rows import TeamRowsPolicy, pop_named
+from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, pop_named
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
 from sb3_saf.qplex.parts import QPLEXLstmParts, QPLEXParts, QPLEXPoolParts
@@ -91,7 +91,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         ortho_init: bool = True,
         *,
         encode_once: bool = True,
-        chunk_size: int | None = 512,
+        chunk_size: ChunkSize = "auto",
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
         normalize_images: bool = True,

@@ -1,0 +1,271 @@
+"""
+Speed of the loop around the games, where few games and small networks are trained: SB3's own PPO beside IPPO, MAPPO and
+SAF. ``python -m benchmarks.loop``
+
+``free``: games that cost nothing (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of
+2 x 64 on the numbers as they are, for all; 4 epochs, 4 minibatches. SB3 plays the same rows with its ``MlpPolicy``.
+``small``: HECOGrid in the size ``small`` of the zoo, with the zoo's settings. ``growth``: cost by the number of agents,
+``small`` with N agents and as many rows. ``import``: seconds until ``import sb3_saf`` returns, beside torch and SB3.
+
+Each number is processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of
+the rollout in milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole
+loop, and the whole loop's time as a multiple of the first program's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from sb3_saf import CentralizedValueWrapper, TeamMonitor, TeamRolloutBuffer
+from sb3_saf.training.settings import load_settings
+
+N_AGENTS: Final = 3
+N_NUMBERS: Final = 18
+N_ACTIONS: Final = 5
+EPISODE: Final = 25
+N_EPOCHS: Final = 4
+N_MINIBATCHES: Final = 4
+#: Game steps of a rollout in each game.
+N_STEPS: Final = {4: 128, 16: 128, 128: 25}
+NARROW: Final[dict[str, Any]] = {"net_arch": [64, 64], "features_extractor_class": FlattenExtractor}
+POLICIES: Final[Mapping[str, dict[str, Any]]] = {
+    "IPPO": NARROW,
+    "MAPPO": NARROW,
+    "SAF": {**NARROW, "projection_arch": [64], "latent_dim": 32},
+}
+GROWTH: Final = (2, 5, 10, 20, 50, 100)
+GROWTH_ROWS: Final = 100
+_SET_UP = "import time; start = time.perf_counter(); import {}; print(time.perf_counter() - start)"
+
+
+class FreeGames(VecEnv):
+    """
+    Games whose steps were drawn beforehand.
+
+    :param n_games: E
+    :param n_agents: N; 0 for rows without teams
+    """
+
+    def __init__(self, n_games: int, n_agents: int) -> None:
+        box = spaces.Box(-1.0, 1.0, (N_NUMBERS,), np.float32)
+        super().__init__(n_games * n_agents, box, spaces.Discrete(N_ACTIONS))
+        self.n_agents, self.n_games, self.render_mode = n_agents, n_games, None
+        generator = np.random.default_rng(0)
+        self._observations = generator.uniform(-1, 1, (EPISODE, self.num_envs, N_NUMBERS)).astype(np.float32)
+        self._rewards = generator.uniform(-1, 1, (EPISODE, self.num_envs)).astype(np.float32)
+        self._going, self._ended = np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
+        self._infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        self._last = [{"terminal_observation": row} for row in self._observations[0]]
+        self._step = 0
+
+    def reset(self) -> VecEnvObs:
+        """First observations."""
+        self._step = 0
+        return self._observations[0]
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Actions change nothing."""
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """The next observations."""
+        self._step = (self._step + 1) % EPISODE
+        ended = self._step == 0
+        infos: Any = self._last if ended else self._infos
+        return (
+            self._observations[self._step],
+            self._rewards[self._step].copy(),  # SB3 may add to them
+            (self._ended if ended else self._going).copy(),
+            infos.copy(),
+        )
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """One for all."""
+        return [getattr(self, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Nobody asks."""
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Nobody asks."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
+        """Rows have no wrappers."""
+        return [False] * self.num_envs
+
+
+class Cost(NamedTuple):
+    """
+    Best seconds of processor time.
+
+    :param rollout: of a rollout
+    :param update: of an update
+    :param n_steps: game steps of the rollout in each game
+    :param n_rows: agent-steps of the rollout
+    """
+
+    rollout: float
+    update: float
+    n_steps: int
+    n_rows: int
+
+    @property
+    def whole(self) -> float:
+        """Seconds per agent-step."""
+        return (self.rollout + self.update) / self.n_rows
+
+
+def free_models(n_games: int) -> dict[str, PPO]:
+    """SB3's PPO and ours on games that cost nothing."""
+    n_steps = N_STEPS[n_games]
+    settings: dict[str, Any] = {
+        "n_steps": n_steps,
+        "batch_size": n_steps * n_games * N_AGENTS // N_MINIBATCHES // N_AGENTS * N_AGENTS,
+        "n_epochs": N_EPOCHS,
+        "device": "cpu",
+        "seed": 0,
+    }
+    models = {"SB3 PPO": PPO("MlpPolicy", FreeGames(n_games, N_AGENTS), policy_kwargs=NARROW, **settings)}
+    for name, policy_kwargs in POLICIES.items():
+        env = CentralizedValueWrapper(TeamMonitor(FreeGames(n_games, N_AGENTS)))
+        buffer: dict[str, Any] = {"rollout_buffer_class": TeamRolloutBuffer, "policy_kwargs": dict(policy_kwargs)}
+        models[name] = PPO(f"{name}Policy", env, **buffer, **settings)
+    return models
+
+
+def small_model(algo: str, n_agents: int | None = None) -> PPO:
+    """PPO of the zoo's size ``small``; other numbers of agents get as many rows, and a board of the same density."""
+    settings = load_settings(algo, "TeamSupport-v0", "small")
+    if n_agents is None:
+        model = settings.make_model(settings.make_env(0), 0, device="cpu")
+        assert isinstance(model, PPO)
+        return model
+    n_games = max(1, GROWTH_ROWS // n_agents)
+    side = max(8, round(15 * (n_agents / 5) ** 0.5))
+    settings = load_settings(
+        algo,
+        "TeamSupport-v0",
+        "small",
+        overrides={"n_envs": n_games, "n_minibatches": 2},
+        env_kwargs={"n_agents": n_agents, "grid_size": side, "n_treasures": side * side // 9},
+    )
+    model = settings.make_model(settings.make_env(0), 0, device="cpu")
+    assert isinstance(model, PPO)
+    return model
+
+
+def costs(models: Mapping[str, PPO], rounds: int) -> dict[str, Cost]:
+    """Let programs take turns; the first round warms up."""
+    watches = {name: _Watch(model) for name, model in models.items()}
+    for number in range(rounds + 1):
+        for watch in watches.values():
+            watch.run(counts=number > 0)
+    return {name: watch.cost() for name, watch in watches.items()}
+
+
+class _Watch:
+    """Counts a model's processor time in rollouts and updates."""
+
+    def __init__(self, model: PPO) -> None:
+        self.model = model
+        self._spent: dict[str, float] = {}
+        self._best = {"collect_rollouts": float("inf"), "train": float("inf")}
+        for name in self._best:
+            setattr(model, name, self._timed(name, getattr(model, name)))
+
+    def _timed(self, name: str, inner: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.process_time()
+            result = inner(*args, **kwargs)
+            self._spent[name] = time.process_time() - start
+            return result
+
+        return timed
+
+    @property
+    def _n_rows(self) -> int:
+        return self.model.n_steps * self.model.n_envs
+
+    def run(self, counts: bool) -> None:
+        """One rollout and one update."""
+        self.model.learn(self._n_rows, reset_num_timesteps=False)
+        if counts:
+            self._best = {name: min(best, self._spent[name]) for name, best in self._best.items()}
+
+    def cost(self) -> Cost:
+        """Best of the rounds."""
+        return Cost(self._best["collect_rollouts"], self._best["train"], self.model.n_steps, self._n_rows)
+
+
+def print_table(title: str, found: Mapping[str, Cost]) -> None:
+    """Print Markdown."""
+    first = next(iter(found))
+    print(f"\n{title}\n\n| program | step, ms | update, us a row | agent-steps/s | whole loop, x {first} |")
+    print("| --- | --- | --- | --- | --- |")
+    for name, cost in found.items():
+        step, update = 1e3 * cost.rollout / cost.n_steps, 1e6 * cost.update / cost.n_rows
+        ratio = cost.whole / found[first].whole
+        print(f"| {name} | {step:.2f} | {update:.1f} | {1 / cost.whole:,.0f} | {ratio:.2f} |", flush=True)
+
+
+def print_growth(rounds: int) -> None:
+    """Cost by the number of agents."""
+    print("\n| agents | " + " | ".join(f"{algo}, us per agent-step" for algo in ("SAF", "MAPPO")) + " |")
+    print("| --- | --- | --- |")
+    for n_agents in GROWTH:
+        models = {algo: small_model(algo, n_agents) for algo in ("saf", "mappo")}
+        found = costs(models, rounds)
+        print(f"| {n_agents} | " + " | ".join(f"{1e6 * cost.whole:.0f}" for cost in found.values()) + " |", flush=True)
+
+
+def print_imports(rounds: int) -> None:
+    """Seconds of the clock to import, best of some, in processes of their own."""
+    print("\n| import | seconds, best |\n| --- | --- |")
+    for modules in ("torch, stable_baselines3", "sb3_saf"):
+        command = [sys.executable, "-c", _SET_UP.format(modules)]
+        spent = [
+            float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) for _ in range(rounds)
+        ]
+        print(f"| {modules} | {min(spent):.2f} |", flush=True)
+
+
+def main() -> None:
+    """Print what is asked for, by default everything."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=("free", "small", "growth", "import"))
+    parser.add_argument("--games", nargs="+", type=int, default=list(N_STEPS), choices=list(N_STEPS), help="of free")
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    wanted = options.only or ("free", "small", "growth", "import")
+    th.set_num_threads(1)
+    if "free" in wanted:
+        for n_games in options.games:
+            print_table(f"{n_games} free games x {N_AGENTS} agents", costs(free_models(n_games), options.rounds))
+    if "small" in wanted:
+        models = {algo.upper(): small_model(algo) for algo in ("ippo", "mappo", "saf")}
+        print_table("HECOGrid TeamSupport, size small", costs(models, options.rounds))
+    if "growth" in wanted:
+        print_growth(options.rounds)
+    if "import" in wanted:
+        print_imports(options.rounds)
+
+
+if __name__ == "__main__":
+    main()

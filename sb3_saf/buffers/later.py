@@ -1,0 +1,73 @@
+"""
+Values of a rollout's steps, computed many steps at a time.
+
+Nothing in a rollout asks for values before its end, where advantages are computed. A few rows at a time, as a step of a
+few games has them, a critic takes mostly the time that calling it takes; those of many steps together take a fraction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import torch as th
+
+Step = TypeVar("Step")
+#: From what critics read of several steps to the values of each, (B, 1).
+Compute = Callable[[Sequence[Step]], list[th.Tensor]]
+
+
+class LaterValues(th.Tensor, Generic[Step]):
+    """
+    The values of one step, (B, 1), which are not computed yet.
+
+    Whoever uses it as a tensor has them computed at once, for this step alone; ``TeamRolloutBuffer`` asks for those of
+    many steps together.
+    """
+
+    step: Step
+    compute: Compute[Step]
+    known: th.Tensor | None
+
+    @classmethod
+    def of(cls, step: Step, like: th.Tensor, compute: Compute[Step]) -> LaterValues[Step]:
+        """
+        Values to be computed.
+
+        :param step: what the critic reads
+        :param like: (B, ...) whose device and number of rows they have
+        :param compute: the critic
+        """
+        later = like.new_empty(len(like), 1).as_subclass(cls)
+        later.step, later.compute, later.known = step, compute, None
+        return later
+
+    @classmethod
+    def __torch_function__(
+        cls, func: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Compute the values and call the function with them."""
+        return func(*map(_known, args), **{name: _known(value) for name, value in (kwargs or {}).items()})
+
+
+def compute_together(steps: Sequence[LaterValues[Any]]) -> list[th.Tensor]:
+    """
+    Compute the values of several steps of one policy.
+
+    :return: (B, 1) of each
+    """
+    waiting = [step for step in steps if step.known is None]
+    if waiting:
+        for step, values in zip(waiting, waiting[0].compute([step.step for step in waiting]), strict=True):
+            step.known = values
+    return [_known(step) for step in steps]
+
+
+def _known(argument: Any) -> Any:
+    if isinstance(argument, (list, tuple)):
+        return type(argument)(map(_known, argument))
+    if not isinstance(argument, LaterValues):
+        return argument
+    if argument.known is None:
+        (argument.known,) = argument.compute([argument.step])
+    return argument.known
