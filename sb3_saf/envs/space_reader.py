@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_saf.envs.teams import Array
 
@@ -150,9 +151,43 @@ class SpaceReader:
             self._notes.append(message)
 
 
+class Part(NamedTuple):
+    """
+    Entries of a vector that belong together.
+
+    :param start: first entry
+    :param stop: one after the last
+    :param picture: shape of the picture that they are, None for scalars and vectors
+    """
+
+    start: int
+    stop: int
+    picture: tuple[int, ...] | None
+
+
+class PartsSpace(spaces.Box):
+    """
+    Pictures, scalars and vectors one after the other in one float32 vector. Encoders take it apart by ``parts``;
+    pixels are 0 to 255.
+
+    :param flat: the vector, from ``gymnasium.spaces.flatten_space``
+    :param parts: what its entries are
+    """
+
+    def __init__(self, flat: spaces.Box, parts: tuple[Part, ...]) -> None:
+        super().__init__(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+        self.parts = parts
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether bounds and parts are equal."""
+        return isinstance(other, PartsSpace) and super().__eq__(other) and self.parts == other.parts
+
+    __hash__ = None  # type: ignore[assignment]  # as of every space with arrays
+
+
 class FlatReader(SpaceReader):
     """
-    Read a Dict or Tuple of scalars and vectors as one vector, as ``gymnasium.spaces.flatten`` makes it.
+    Read a Dict or Tuple as one vector, as ``gymnasium.spaces.flatten`` makes it.
 
     :param space: see :class:`SpaceReader`
     :param notes: see :class:`SpaceReader`
@@ -163,7 +198,10 @@ class FlatReader(SpaceReader):
         self._structured = self.rows
         flat = spaces.flatten_space(self._structured)
         assert isinstance(flat, spaces.Box)
-        if flat.dtype == np.float64 and all(leaf.dtype != np.float64 for leaf in leaves_of(space)):
+        leaves = leaves_of(self._structured)
+        if any(_is_picture(leaf) for leaf in leaves):
+            flat = PartsSpace(flat, _parts_of_vector(leaves))
+        elif flat.dtype == np.float64 and all(leaf.dtype != np.float64 for leaf in leaves):
             # What integers and float32 become beside each other takes twice the memory for nothing.
             flat = spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
         self.rows = flat
@@ -173,10 +211,24 @@ class FlatReader(SpaceReader):
         return np.asarray(spaces.flatten(self._structured, super().read(value, owner)), dtype=self.rows.dtype)
 
 
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    return isinstance(space, spaces.Box) and is_image_space(space)
+
+
+def _parts_of_vector(leaves: Sequence[spaces.Space[Any]]) -> tuple[Part, ...]:
+    ends = np.cumsum([spaces.flatdim(leaf) for leaf in leaves]).tolist()
+    return tuple(
+        Part(start, stop, leaf.shape if _is_picture(leaf) else None)
+        for leaf, start, stop in zip(leaves, [0, *ends], ends, strict=False)
+    )
+
+
 def can_be_flattened(space: spaces.Space[Any]) -> bool:
-    """Return whether a space is a Dict or a Tuple of scalars and vectors."""
+    """Return whether a space is a Dict or a Tuple of pictures, scalars and vectors."""
     leaves = leaves_of(space)
-    return space not in leaves and all(isinstance(leaf, FIXED_SHAPE) and len(leaf.shape or ()) <= 1 for leaf in leaves)
+    return space not in leaves and all(
+        isinstance(leaf, FIXED_SHAPE) and (len(leaf.shape or ()) <= 1 or _is_picture(leaf)) for leaf in leaves
+    )
 
 
 def _as_array(value: Any) -> Array:

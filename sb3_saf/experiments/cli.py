@@ -184,7 +184,7 @@ def _name(options: argparse.Namespace) -> str:
         example = f"{PROGRAM} {options.command} coordination, or --env mpe2.simple_spread_v3"
         what = "several environments need a name before --env" if options.env else "name an experiment"
         raise ValueError(f"{what}: {example}")
-    return options.env[0].removesuffix("-v0").replace(":", "-") if name is None else name
+    return options.env[0].removesuffix("-v0").replace(":", "-").replace("/", "-") if name is None else name
 
 
 def _experiment(options: argparse.Namespace) -> Experiment:

@@ -10,11 +10,13 @@ from __future__ import annotations
 import warnings
 from typing import Any, Final
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_saf.envs.space_reader import PartsSpace
 from sb3_saf.networks import encoders
 from sb3_saf.networks.encoders import NATURE_PIXELS, PixelInput
 from sb3_saf.networks.spaces import observation_spec
@@ -29,6 +31,8 @@ from sb3_saf.networks.tile_sums import (
 
 #: Up to this many pixels the paper's encoder is the default; from there on it grows beyond 7 million weights.
 _PAPERS_PIXELS: Final = 64 * 64
+#: The least side of a picture that the paper's encoder takes.
+_FEWEST_PIXELS: Final = 8
 #: More pixels, or more weights, than anybody wants to train on without being asked.
 _MANY_PIXELS: Final = 128 * 128
 _MANY_WEIGHTS: Final = 10_000_000
@@ -119,10 +123,50 @@ class MLPEncoder(encoders.MLPEncoder, BaseFeaturesExtractor):
         encoders.MLPEncoder.__init__(self, observation_space, features_dim, hidden)
 
 
+class PartsEncoder(BaseFeaturesExtractor):
+    """
+    An encoder for pictures beside scalars and vectors: each picture's own encoder (an MLP below 8 pixels), one
+    :class:`MLPEncoder` for all the rest, then linear ``features_dim`` and ReLU.
+
+    :param observation_space: a :class:`~sb3_saf.envs.space_reader.PartsSpace`, which ``make_team_env`` makes of Dicts
+    :param features_dim: size of the features, of each encoder and of all together
+    :raises ValueError: for another space
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        if not isinstance(observation_space, PartsSpace):
+            raise ValueError(f"expected pictures beside vectors in one PartsSpace, got {observation_space}")
+        super().__init__(observation_space, features_dim)
+        self.parts = observation_space.parts
+        pictures = [spaces.Box(0, 255, part.picture, np.uint8) for part in self.parts if part.picture is not None]
+        self.pictures = nn.ModuleList(_picture_encoder_class(space)(space, features_dim) for space in pictures)
+        n_rest = sum(part.stop - part.start for part in self.parts if part.picture is None)
+        rest = spaces.Box(-np.inf, np.inf, (n_rest,), np.float32)
+        self.rest = MLPEncoder(rest, features_dim) if n_rest else None
+        n_encoders = len(pictures) + (n_rest > 0)
+        self.join = nn.Sequential(nn.Linear(n_encoders * features_dim, features_dim), nn.ReLU())
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(K, n) observations to (K, features_dim)."""
+        slices = [observations[:, part.start : part.stop] for part in self.parts]
+        shown = [
+            slice_.reshape(-1, *part.picture) / 255.0
+            for slice_, part in zip(slices, self.parts, strict=True)
+            if part.picture is not None
+        ]
+        found = [encoder(pixels) for encoder, pixels in zip(self.pictures, shown, strict=True)]
+        if self.rest is not None:
+            vectors = [slice_ for slice_, part in zip(slices, self.parts, strict=True) if part.picture is None]
+            found.append(self.rest(th.cat(vectors, dim=1)))
+        features: th.Tensor = self.join(th.cat(found, dim=1))
+        return features
+
+
 class ObservationEncoder(BaseFeaturesExtractor):
     """
     The default encoder, chosen by space: for pictures (uint8, 0..255) and tile codes :class:`PaperCNN`, or
-    :class:`NatureEncoder` if they have more than 64 x 64 pixels; for all else :class:`MLPEncoder`.
+    :class:`NatureEncoder` if they have more than 64 x 64 pixels; for pictures beside vectors :class:`PartsEncoder`; for
+    all else :class:`MLPEncoder`.
 
     Warns of pictures that make training slow whatever encodes them.
 
@@ -133,7 +177,7 @@ class ObservationEncoder(BaseFeaturesExtractor):
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
         super().__init__(observation_space, features_dim)
         self.encoder: BaseFeaturesExtractor = _encoder_class(observation_space)(observation_space, features_dim)
-        if not isinstance(self.encoder, MLPEncoder):
+        if not isinstance(self.encoder, (MLPEncoder, PartsEncoder)):
             _warn_if_large(self.encoder, observation_space)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -143,6 +187,8 @@ class ObservationEncoder(BaseFeaturesExtractor):
 
 
 def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:
+    if isinstance(observation_space, PartsSpace):
+        return PartsEncoder
     space = observation_spec(observation_space).space
     if space.atlas is None and not space.picture:
         return MLPEncoder
@@ -150,6 +196,12 @@ def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExt
     if height * width <= _PAPERS_PIXELS or min(height, width) < NATURE_PIXELS:
         return PaperCNN
     return NatureEncoder
+
+
+def _picture_encoder_class(space: spaces.Box) -> type[BaseFeaturesExtractor]:
+    """As :func:`_encoder_class`, but an MLP for pictures that are too small to be convolved."""
+    _, height, width = observation_spec(space).space.picture_shape
+    return MLPEncoder if min(height, width) < _FEWEST_PIXELS else _encoder_class(space)
 
 
 def _warn_if_large(encoder: BaseFeaturesExtractor, space: spaces.Space[Any]) -> None:

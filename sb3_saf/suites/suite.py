@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from typing import Any, Final, Literal
 
 from packaging.requirements import Requirement
@@ -39,7 +40,9 @@ class Suite:
         (where every agent is given the team's whole reward)
     :param team_reward: what agents are given to learn from, see ``make_team_env``
     :param has_state: whether ``state=True`` can be asked for
+    :param is_seeded: whether seeds decide what happens in its games
     :param exact_resume: whether the VecEnv gives its state to checkpoints
+    :param module: of the package, where it may be a folder of sources on ``PYTHONPATH`` instead of an installed package
     :param unavailable: why no version of the package works; such a suite has no games, only this message
     """
 
@@ -56,7 +59,9 @@ class Suite:
     team_return: Reduction = "sum"
     team_reward: Literal["given"] | Reduction = "given"
     has_state: bool = False
+    is_seeded: bool = True
     exact_resume: bool = False
+    module: str | None = None
     unavailable: str | None = None
 
     def __post_init__(self) -> None:
@@ -76,7 +81,15 @@ class Suite:
 
     def installed_version(self) -> str | None:
         """Return the version of the suite's own package, None if it is not installed."""
-        return _version(Requirement(self.requires[0]).name)
+        found = _version(self._package)
+        return "of a source folder" if found is None and self._is_source_folder(self._package) else found
+
+    @property
+    def _package(self) -> str:
+        return Requirement(self.requires[0]).name
+
+    def _is_source_folder(self, package: str) -> bool:
+        return package == self._package and self.module is not None and find_spec(self.module) is not None
 
     def problem(self) -> str | None:
         """Return why no game can be made, None if all that is needed is installed."""
@@ -86,6 +99,8 @@ class Suite:
             return f"needs another version of Python: {'; '.join(self.requires)}"
         for requirement in self.requirements:
             found = _version(requirement.name)
+            if found is None and self._is_source_folder(requirement.name):
+                continue
             if found is None:
                 return f"needs {requirement.name}, which is not installed: {self.pip_line}"
             if not requirement.specifier.contains(found, prereleases=True):

@@ -17,6 +17,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from hecogrid_envs.core.rng import game_seeds
+from sb3_saf.envs.game_form import has_masks_inside
+from sb3_saf.envs.space_reader import FlatReader, can_be_flattened
 from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, OBS_KEY, TeamSpaces
 from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.seeds import evaluation_seed
@@ -95,7 +97,7 @@ def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool)
 def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterator[Any]:
     """Play a game, a ParallelEnv; yield what ``env.render()`` gives, at the start and after every step."""
     set_random_seed(seed)
-    read = _Reader(team)
+    read = _Reader(team, env)
     observations, infos = env.reset(seed=game_seeds(evaluation_seed(seed), 1)[0])
     state, starts = None, np.ones(len(env.possible_agents), dtype=bool)
     yield env.render()
@@ -112,7 +114,10 @@ def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterato
 class _Reader:
     """Make rows for the policy of what a ParallelEnv gives its agents: one row for each agent, absent ones included."""
 
-    def __init__(self, team: TrainedTeam) -> None:
+    def __init__(self, team: TrainedTeam, env: Any) -> None:
+        space = env.observation_space(env.possible_agents[0])
+        has_parts = can_be_flattened(space) and not has_masks_inside(space)
+        self._flat = FlatReader(space, []) if has_parts else None
         self._spaces = TeamSpaces.from_observation_space(team.policy.observation_space)
         self._games = team.settings.make_env(0, evaluation=True, n_envs=1)
         load_normalization(self._games, team.path.parent)
@@ -131,6 +136,8 @@ class _Reader:
             told = seen if isinstance(seen, Mapping) else infos.get(agent, {})
             if n_actions is not None and ACTION_MASK_KEY in told:
                 masks[index] = told[ACTION_MASK_KEY]
+            if self._flat is not None:
+                seen = self._flat.read(seen, str(agent))
             seen = np.asarray(seen["observation"] if isinstance(seen, Mapping) else seen)
             own[index] = seen if seen.shape == own.shape[1:] else np.moveaxis(seen, -1, 0)
         rows = {OBS_KEY: self._normalized(own), AGENT_KEY: np.arange(len(agents))}

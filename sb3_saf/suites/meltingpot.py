@@ -1,0 +1,124 @@
+"""
+Melting Pot's substrates: ``meltingpot/clean_up``, ``meltingpot/collaborative_cooking__cramped``.
+
+Agents see ``RGB`` (88 x 88 pixels; ``pixels_per_sprite=1`` averages each sprite of 8 x 8 to one pixel, which is what
+most published agents learn from) and what else the substrate gives them, such as ``READY_TO_SHOOT`` or ``INVENTORY``.
+``WORLD.RGB`` and ``COLLECTIVE_REWARD``, which they must not see when they act, are left out of observations; with
+``state=True`` the critic reads ``WORLD.RGB``. The engine draws its own random numbers: seeds do not decide episodes.
+An episode that the substrate ends is an end, one that reaches ``max_cycles`` is truncated.
+
+dm-meltingpot fetches its assets while it is built. Where that cannot work, the folder ``meltingpot`` of its public
+source on ``PYTHONPATH`` does as well, beside ``pip install dmlab2d dm-env chex immutabledict ml-collections networkx
+reactivex tensorflow-cpu shimmy``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+
+from sb3_saf.suites.suite import Suite
+
+#: Side of a sprite in pixels as the engine draws it.
+_SPRITE: Final = 8
+_PICTURE: Final = "RGB"
+_WORLD: Final = "WORLD.RGB"
+#: What agents must not see when they act, beside all that begins with ``WORLD.``.
+_HIDDEN: Final = "COLLECTIVE_REWARD"
+
+
+class MeltingPotTeam(BaseParallelWrapper[str, Any, Any]):
+    """
+    A substrate whose agents see what they may see, and whose ``state()`` is the picture of the world.
+
+    :param env: the substrate as shimmy's ParallelEnv
+    :param substrate: the same, as Melting Pot made it
+    :param pixels_per_sprite: side of a sprite in what agents see: 1, 2, 4 or 8
+    :raises ValueError: for another number of pixels
+    """
+
+    def __init__(self, env: ParallelEnv[str, Any, Any], substrate: Any, pixels_per_sprite: int = _SPRITE) -> None:
+        if pixels_per_sprite not in (1, 2, 4, 8):
+            raise ValueError(f"pixels_per_sprite must be 1, 2, 4 or 8, got {pixels_per_sprite!r}")
+        super().__init__(env)
+        self._substrate = substrate
+        self._block = _SPRITE // pixels_per_sprite
+        seen = env.observation_space(env.possible_agents[0])
+        assert isinstance(seen, spaces.Dict)
+        own = {key: space for key, space in seen.spaces.items() if key != _HIDDEN}
+        height, width, channels = own[_PICTURE].shape or (0, 0, 0)
+        own[_PICTURE] = spaces.Box(0, 255, (height // self._block, width // self._block, channels), np.uint8)
+        self._observation_space = spaces.Dict(own)
+        self.state_space = spaces.Box(0, 255, substrate.observation_spec()[0][_WORLD].shape, np.uint8)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Return the space of an agent's observation."""
+        return self._observation_space
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Begin an episode; the engine takes no seed."""
+        observations, _ = self.env.reset(seed=seed, options=options)
+        return self._shown(observations), {agent: {} for agent in observations}
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        """Play one step (see PettingZoo)."""
+        observations, *others = self.env.step(dict(actions))
+        return (self._shown(observations), *others)
+
+    def state(self) -> Any:
+        """Return the picture of the world."""
+        return self._substrate.observation()[0][_WORLD]
+
+    def _shown(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            agent: {key: self._smaller(seen[key]) if key == _PICTURE else seen[key] for key in self._observation_space}
+            for agent, seen in observations.items()
+        }
+
+    def _smaller(self, picture: Any) -> Any:
+        """(H, W, C) bytes with blocks of pixels averaged."""
+        if self._block == 1:
+            return picture
+        height, width, channels = picture.shape
+        blocks = picture.reshape(height // self._block, self._block, width // self._block, self._block, channels)
+        return blocks.mean(axis=(1, 3)).astype(np.uint8)
+
+
+def _tasks() -> list[str]:
+    return sorted(_substrates().SUBSTRATES)
+
+
+def _substrates() -> Any:
+    # By its name, because the package that has it is called otherwise.
+    return importlib.import_module("meltingpot.substrate")
+
+
+def _game(
+    task: str, *, render_mode: str | None = None, max_cycles: int = 1000, pixels_per_sprite: int = _SPRITE
+) -> Any:
+    from shimmy import MeltingPotCompatibilityV0
+
+    substrate = _substrates().build(task, roles=_substrates().get_config(task).default_player_roles)
+    game = MeltingPotCompatibilityV0(env=substrate, max_cycles=max_cycles, render_mode=render_mode)
+    return MeltingPotTeam(game, substrate, pixels_per_sprite)
+
+
+SUITE: Final = Suite(
+    name="meltingpot",
+    title="Melting Pot: social dilemmas, clean-up, cooking together",
+    requires=("dm-meltingpot>=2.2", "dmlab2d>=1.0.2", "shimmy>=2,<3"),
+    extra="meltingpot",
+    page="https://github.com/google-deepmind/meltingpot",
+    list_tasks=_tasks,
+    examples=("collaborative_cooking__cramped", "clean_up"),
+    game=_game,
+    has_state=True,
+    is_seeded=False,
+    module="meltingpot",
+)
