@@ -56,6 +56,14 @@ def test_copies_play_on_as_the_games(name: str, n_cpus: int) -> None:
         other.close()
 
 
+def test_a_slow_game_is_tried_for_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(10**6))
+    monkeypatch.setattr("sb3_saf.envs.game_copies.time.monotonic", lambda: next(clock) ** 2 / 40)  # ever slower
+    venv = SuperSuitVecEnv(LazyEnv, 1, seed=0)
+    venv.reset()
+    assert "pickled" in venv.checkpoint_state()["games"][0]
+
+
 def test_taking_a_state_draws_no_global_numbers() -> None:
     venv = SuperSuitVecEnv(GlobalEnv, 1, seed=0)
     venv.reset()

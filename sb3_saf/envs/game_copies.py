@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copyreg
 import hmac
+import math
 import os
 import pickle
 import random
@@ -279,20 +280,29 @@ def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: W
     seen.append(_bytes_of(original.reset()[0]))
     if way == "pickle":  # which takes the generators along
         _set_global_generators(began)
-    _, seen_by_copy = _play(copy, rows, len(seen) - 1)
+    _, seen_by_copy = _play(copy, rows, len(seen) - 1, math.inf)
     seen_by_copy.append(_bytes_of(copy.reset()[0]))
-    steps = [step for step, (one, other) in enumerate(zip(seen, seen_by_copy, strict=False)) if one != other]
-    if steps or len(seen) != len(seen_by_copy):
-        return f"{steps[0] + 1 if steps else len(seen_by_copy)} steps later a copy differs from the game"
+    for step, (one, other) in enumerate(zip(seen, seen_by_copy, strict=True), 1):
+        if one != other:
+            return f"{step} steps later a copy differs from the game"
     return None
 
 
-def _play(game: TeamMarkovVectorEnv, rows: Any, n_steps: int) -> tuple[Any, list[bytes]]:
-    """Play random legal actions, the same in each call; return the last rows, and what was seen in each step."""
+def _play(
+    game: TeamMarkovVectorEnv, rows: Any, n_steps: int, seconds: float = TRIAL_SECONDS
+) -> tuple[Any, list[bytes]]:
+    """
+    Play random legal actions, the same in each call.
+
+    :param rows: observations that actions are for
+    :param n_steps: steps to play
+    :param seconds: after which fewer will do
+    :return: the last observations, and what was seen in each step
+    """
     space = deepcopy(game.action_space)
     space.seed(0)
     seen: list[bytes] = []
-    deadline = time.monotonic() + TRIAL_SECONDS
+    deadline = time.monotonic() + seconds
     while len(seen) < n_steps and time.monotonic() < deadline:
         rows, *outcome, _ = game.step(_actions(space, rows, game.num_envs))
         seen.append(_bytes_of([rows, *outcome]))
