@@ -39,6 +39,10 @@ FAMILIES = sorted(one.name for one in DECLARATIONS if RecurrentPPO in one.polici
 MASKABLE = [name for name in ACTIONS if name != "box"]
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"": TRPO, "Lstm": RecurrentPPO, "Maskable": MaskablePPO}
 NAMES = [f"{family}{kind}Policy" for kind in ALGORITHMS for family in FAMILIES]
+#: Policy classes by their names; an algorithm need not be among what `sb3_saf` exports.
+CLASSES: dict[str, Any] = {
+    policy.__name__: policy for one in DECLARATIONS for policies in one.policies.values() for policy in policies
+}
 #: Every way to set up a critic or an actor that changes what is computed.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("IPPO", {}),
@@ -72,7 +76,7 @@ def make_policy(
 ) -> Any:
     """A small policy for three agents, with noise on the actor's small first weights so that every part matters."""
     th.manual_seed(0)
-    policy_class: type[TeamPolicy] = getattr(sb3_saf, name)
+    policy_class: type[TeamPolicy] = CLASSES[name]
     space = TeamSpaces.of(VECTOR, 3).to_dict_space()
     policy = policy_class(space, action_space, lambda _: 1e-3, **(sizes_of(name) | kwargs))
     with th.no_grad():
@@ -114,7 +118,7 @@ def no_memory(n_sequences: int) -> LstmStates:
 def test_names_are_registered() -> None:
     for kind, algorithm in ALGORITHMS.items():
         for family in FAMILIES:
-            policy = getattr(sb3_saf, f"{family}{kind}Policy")
+            policy = CLASSES[f"{family}{kind}Policy"]
             for name in (policy.__name__, f"{family}Policy", family):
                 assert algorithm.policy_aliases[name] is policy
 
