@@ -23,7 +23,7 @@ that step many games in one call: an SB3 VecEnv of B rows, game-major, then agen
 - ``action_space`` of one row, counted from 0;
 - ``seed(seed)``, for the next reset, where game ``e`` gets a stream of its own, the same whatever E; and
   ``seeded_with``, a tuple of the seeds of the games, None for fresh ones, by which evaluation is told from training.
-  ``sb3_saf.envs.supersuit_vec_env.game_seeds(seed, E)`` makes 63-bit seeds. ``vec_env(..., seed=None)`` draws one;
+  ``hecogrid_envs.core.rng.game_seeds(seed, E)`` makes 63-bit seeds. ``vec_env(..., seed=None)`` draws one;
 - ``reset()``: observations of the rows, NumPy, an array or a dict of arrays as in the space;
 - ``step_async(actions)``, (B, ...) NumPy; ``step_wait()``: observations, rewards (B,) float32 as the suite gives them
   to each agent, dones (B,) bool, equal within a team, and infos, a list of B dicts. Games of done teams have been

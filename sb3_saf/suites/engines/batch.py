@@ -1,0 +1,321 @@
+"""Games that an engine steps all at once, as a Stable-Baselines3 VecEnv with one row per agent."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from hecogrid_envs.core.rng import game_seeds
+from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.envs.row_spaces import RowSpaces
+from sb3_saf.envs.teams import Array, check_count, check_seed
+
+#: SB3's name for "the episode was won", of which it logs ``rollout/success_rate``.
+IS_SUCCESS = "is_success"
+
+
+class BatchStep(NamedTuple):
+    """
+    What one step of E games gave; games that ended have begun their next episode.
+
+    :param rows: (B, ...) observations of the rows, entries of a Dict by key
+    :param rewards: (E, N) as the suite gives them
+    :param ended: (E,) bool
+    :param truncated: (E,) bool, games that only a time limit ended
+    :param last: (B, ...) the rows before new episodes began; read where ``ended``
+    :param won: (E,) bool, where the suite tells wins
+    """
+
+    rows: dict[str, Array]
+    rewards: Array
+    ended: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+    last: dict[str, Array]
+    won: npt.NDArray[np.bool_] | None = None
+
+
+class Batch(ABC):
+    """
+    E games of N agents in one engine. Arrays that it returns are not written to later.
+
+    :param n_games: E
+    :param agents: N names
+    :param rows: spaces of a row's observation
+    :param action_space: of a row
+    :param env: the suite's own object, for its attributes
+    """
+
+    def __init__(
+        self, n_games: int, agents: Sequence[str], rows: RowSpaces, action_space: spaces.Space[Any], env: Any
+    ) -> None:
+        self.n_games = n_games
+        self.agents = list(agents)
+        self.rows = rows
+        self.action_space = action_space
+        self.env = env
+
+    @abstractmethod
+    def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
+        """
+        Begin an episode in every game.
+
+        :param seeds: (E,) 63 bits each; None to go on with the games' random streams
+        :return: (B, ...) rows
+        """
+
+    @abstractmethod
+    def step(self, actions: Array) -> BatchStep:
+        """
+        Step every game.
+
+        :param actions: (E, N, ...) from the action space
+        """
+
+    @abstractmethod
+    def picture(self, game: int) -> npt.NDArray[np.uint8]:
+        """Return what the suite draws of a game, (height, width, 3)."""
+
+
+class ResumableBatch(Batch):
+    """A batch that gives its state."""
+
+    @abstractmethod
+    def snapshot(self) -> dict[str, Array]:
+        """Return copies of all that the future depends on, the random state included."""
+
+    @abstractmethod
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Go on from a snapshot of equal names, shapes and dtypes."""
+
+
+class BatchVecEnv(VecEnv):
+    """
+    A batch of games as rows: row ``e * N + i`` is agent ``i`` of game ``e``.
+
+    Observations of rows are Dicts, see :class:`sb3_saf.envs.row_spaces.RowSpaces`. Infos of done rows hold
+    ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` where the suite
+    tells wins. All other infos are one empty dict.
+
+    :param batch: the games
+    :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
+    :param render_mode: None or ``"rgb_array"``
+    :raises ValueError: for another render mode
+    """
+
+    def __init__(self, batch: Batch, seed: int | None = None, render_mode: str | None = None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be 'rgb_array' or None here, got {render_mode!r}")
+        self.batch = batch
+        self.n_games = check_count("n_envs", batch.n_games)
+        self.possible_agents = list(batch.agents)
+        self.n_agents = len(batch.agents)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": ["rgb_array"]}
+        self._actions: Array | None = None
+        self._running = False
+        super().__init__(self.n_games * self.n_agents, batch.rows.to_space(), batch.action_space)
+        self.seed(seed)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Seed all games, at the next reset.
+
+        :param seed: of the run; None for fresh entropy
+        :return: (B,) the seed of each row's game
+        """
+        check_seed(seed)
+        fresh = np.random.SeedSequence().entropy if seed is None else seed
+        chosen = game_seeds(int(fresh), self.n_games)  # type: ignore[arg-type]
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training; None for fresh ones.
+        self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
+        self._next_seeds: list[int] | None = chosen
+        return [game_seed for game_seed in chosen for _ in range(self.n_agents)]
+
+    def reset(self) -> dict[str, Array]:
+        """
+        Begin an episode in every game.
+
+        :return: (B, ...) rows
+        :raises ValueError: for options, which these games do not take
+        """
+        if any(self._options):
+            raise ValueError(f"expected no options for the reset of batched games, got {self._options[0]}")
+        self._actions = None
+        rows = self.batch.reset(self._next_seeds)
+        self._next_seeds = None
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._running = True
+        return rows
+
+    def step_async(self, actions: npt.ArrayLike) -> None:
+        """
+        Take the actions of the next step.
+
+        :param actions: (B, ...) from the action space
+        :raises ValueError: for a wrong shape, type or value, or a step without a reset
+        """
+        if not self._running:
+            raise ValueError("the games have not begun: call reset() before step()")
+        self._actions = _checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Step all games.
+
+        :return: observations (B, ...), rewards (B,) float32, dones (B,) bool, infos
+        """
+        if self._actions is None:
+            raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
+        actions = self._actions.reshape(self.n_games, self.n_agents, *self._actions.shape[1:])
+        self._actions = None
+        step = self.batch.step(actions)
+        infos: list[dict[str, Any]] = [{}] * self.num_envs
+        for game in np.flatnonzero(step.ended).tolist():
+            self._end(infos, step, game)
+        rewards = np.array(step.rewards, dtype=np.float32).reshape(self.num_envs)
+        return step.rows, rewards, np.repeat(step.ended, self.n_agents), infos
+
+    def _end(self, infos: list[dict[str, Any]], step: BatchStep, game: int) -> None:
+        """Say how the episode of a game ended."""
+        first = game * self.n_agents
+        for row in range(first, first + self.n_agents):
+            last = {key: np.array(part[row]) for key, part in step.last.items()}
+            infos[row] = {TRUNCATED: bool(step.truncated[game]), TERMINAL_OBSERVATION: last}
+            self.reset_infos[row] = {}
+        if step.won is not None:
+            infos[first][IS_SUCCESS] = bool(step.won[game])
+
+    def close(self) -> None:
+        """Do nothing: engines hold memory only."""
+
+    def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
+        """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
+        games = range(self.n_games)
+        pictures = [self.batch.picture(game) if self.render_mode == "rgb_array" else None for game in games]
+        return [picture for picture in pictures for _ in range(self.n_agents)]
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Attribute of the suite's environment, which all rows share."""
+        value = self.render_mode if attr_name == "render_mode" else getattr(self.batch.env, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Refuse: all games share one engine, which is made for its parameters."""
+        raise AttributeError(f"games of an engine have no attributes of their own, got {attr_name!r}; make new games")
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Refuse: all games share one engine, which has no objects for single games."""
+        raise AttributeError(f"games of an engine have no methods of their own, got {method_name!r}")
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """No row is wrapped in a Gymnasium wrapper."""
+        return [False for _ in self._get_indices(indices)]
+
+
+class ResumableBatchVecEnv(BatchVecEnv):
+    """
+    Rows whose state goes into checkpoints.
+
+    :param batch: games that give their state
+    :param seed: see the base class
+    :param render_mode: see the base class
+    """
+
+    batch: ResumableBatch
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """
+        All that the future depends on, as plain data.
+
+        :return: for :meth:`load_checkpoint_state` of an environment that was made with the same arguments
+        """
+        return {
+            "running": self._running,
+            "next_seeds": self._next_seeds,
+            "games": self.batch.snapshot() if self._running else {},
+        }
+
+    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Check that these games could be in a state.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: naming the first difference
+        """
+        seeds, games = state["next_seeds"], state["games"]
+        if not isinstance(state["running"], bool) or not isinstance(games, Mapping):
+            raise ValueError("expected the state of games with 'running' true or false and arrays in 'games'")
+        if seeds is not None and not (len(seeds) == self.n_games and all(_is_seed(seed) for seed in seeds)):
+            raise ValueError(f"expected {self.n_games} seeds of games or None, got {seeds!r:.80}")
+        if state["running"]:
+            for difference in _differences(self._example(), games):
+                raise ValueError(difference)
+
+    def _example(self) -> dict[str, Array]:
+        """Return a state of such games, which are begun for it if they have not."""
+        if not self._running:
+            self.batch.reset([0] * self.n_games)
+        return self.batch.snapshot()
+
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on from there; observations of the present are those of before.
+
+        :param state: what :meth:`checkpoint_state` gave
+        :raises ValueError: see :meth:`check_checkpoint_state`
+        """
+        self.check_checkpoint_state(state)
+        if state["running"]:
+            self.batch.restore(state["games"])
+        self._running = state["running"]
+        self._next_seeds = None if state["next_seeds"] is None else list(state["next_seeds"])
+
+
+def _is_seed(seed: object) -> bool:
+    return isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**63
+
+
+def _differences(own: Mapping[str, Array], found: Mapping[str, Any]) -> Iterator[str]:
+    """Say how a state differs in form from one of these games."""
+    for name in sorted(own.keys() ^ found.keys()):
+        yield f"expected the state of games with {', '.join(own)}, they differ in {name!r}"
+    for name, array in own.items():
+        other = found[name]
+        if getattr(other, "shape", None) != array.shape or other.dtype != array.dtype:
+            yield f"expected {name!r} of shape {array.shape} and dtype {array.dtype}, got {other!r:.80}"
+
+
+def _checked_actions(
+    space: spaces.Space[Any], agents: Sequence[str], n_rows: int, actions: npt.ArrayLike
+) -> npt.NDArray[Any]:
+    """Bring actions into the dtype of their space, or say what is wrong with them."""
+    array = np.asarray(actions)
+    shape = (n_rows, *(space.shape or ()))
+    kinds = "fiu" if isinstance(space, spaces.Box) else "iu"
+    if array.shape != shape or array.dtype.kind not in kinds:
+        raise ValueError(f"expected actions from {space}, shape {shape}, got {array.dtype} of shape {array.shape}")
+    low, high = _action_bounds(space)
+    array = array.astype(space.dtype)
+    inside = ((array >= low) & (array <= high)).reshape(n_rows, -1).all(axis=1)
+    if not inside.all():
+        row = int(np.flatnonzero(~inside)[0])
+        game, agent = divmod(row, len(agents))
+        raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
+    return array
+
+
+def _action_bounds(space: spaces.Space[Any]) -> tuple[Any, Any]:
+    if isinstance(space, spaces.Box):
+        return space.low, space.high
+    if isinstance(space, spaces.MultiDiscrete):
+        return 0, space.nvec - 1
+    assert isinstance(space, spaces.Discrete)
+    return 0, space.n - 1

@@ -1,0 +1,343 @@
+"""
+Games of JaxMARL, stepped all at once by ``vmap`` and ``jit``.
+
+Each game has a random stream of its own, so that its course depends on its seed and the actions alone. New episodes
+begin by ``reset`` of the suite after ``step_env``: its own ``step`` begins them, too, but loses the last observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_saf.envs.row_spaces import RowSpaces
+from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array
+from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch
+from sb3_saf.suites.engines.jaxmarl_package import spaces as jax_spaces
+
+_ALL: Final = "__all__"
+_WORLD_STATE: Final = "world_state"
+
+
+class Rules(NamedTuple):
+    """
+    What the interface of JaxMARL leaves to each environment.
+
+    :param is_undecided: ``(env, state) -> bool``, whether a game that has just ended was stopped by its time limit;
+        None for "whenever ``state.step`` has reached ``env.max_steps``"
+    :param is_won: ``(env, state) -> bool`` of a game that has just ended, None where there is no winning
+    :param pays_the_dead: whether agents that died are given the team's reward until its episode ends. Their rows then
+        go on: as ends of their own they would teach that the team's victory is nothing to those who died for it
+    :param extra_reward: ``infos -> {agent: reward}`` for :attr:`JaxGames.extra_weight`
+    :param draw: ``(env, state) -> picture``, (height, width, 3)
+    """
+
+    is_undecided: Callable[[Any, Any], Any] | None = None
+    is_won: Callable[[Any, Any], Any] | None = None
+    pays_the_dead: bool = False
+    extra_reward: Callable[[Any], Mapping[str, Any]] | None = None
+    draw: Callable[[Any, Any], npt.NDArray[np.uint8]] | None = None
+
+
+class Game(NamedTuple):
+    """
+    A game, or with a leading axis all of them.
+
+    :param key: (2,) of its random stream
+    :param state: of the environment
+    :param active: (N,) bool, agents that take part
+    """
+
+    key: Any
+    state: Any
+    active: Any
+
+
+class Ends(NamedTuple):
+    """
+    How a step ended, of one game or all.
+
+    :param rewards: (N,)
+    :param ended: whether the episode is over
+    :param truncated: whether a time limit alone ended it
+    :param won: whether it was won, None where nobody tells
+    """
+
+    rewards: Any
+    ended: Any
+    truncated: Any
+    won: Any
+
+
+class JaxPrograms:
+    """
+    The compiled functions of an environment. Those who share them compile once for each number of games.
+
+    :param env: of JaxMARL
+    :param rules: of this environment
+    :param with_state: whether rows show the state of the game
+    :raises ValueError: if agents differ in more than the lengths of their observations and actions, or there is no
+        state to show
+    """
+
+    def __init__(self, env: Any, rules: Rules, with_state: bool = False) -> None:
+        self.env = env
+        self.rules = rules
+        self.agents: list[Any] = list(env.agents)
+        key = jax.random.PRNGKey(0)
+        observations, self._state_form = jax.eval_shape(env.reset, key)
+        self._observations = {agent: observations[agent] for agent in self.agents}
+        self._shows_world = with_state
+        self._has_world_entry = _WORLD_STATE in observations
+        self._action_spaces = [env.action_space(agent) for agent in self.agents]
+        self.rows = RowSpaces(
+            self._own_space(),
+            active=not rules.pays_the_dead,
+            n_masked_actions=self._n_masked_actions(),
+            state=self._world_space(observations),
+            is_dict=True,
+        )
+        self.begin = jax.jit(jax.vmap(self._begin))
+        self.step = jax.jit(jax.vmap(self._step, in_axes=(0, 0, None)))
+        self.choose = jax.jit(jax.vmap(_choose))
+
+    # ---- spaces
+
+    @cached_property
+    def _own_dtype(self) -> npt.DTypeLike:
+        """Bytes where all observations are bytes or flags, else float32."""
+        small = all(one.dtype in (np.uint8, np.bool_) for one in self._observations.values())
+        return np.uint8 if small else np.float32
+
+    def _own_space(self) -> spaces.Box:
+        width = max(_size(one) for one in self._observations.values())
+        if self._own_dtype == np.uint8:
+            return spaces.Box(0, 255, (width,), np.uint8)
+        return spaces.Box(-np.inf, np.inf, (width,), np.float32)
+
+    @cached_property
+    def gives_masks(self) -> bool:
+        """Whether the environment says which actions are legal."""
+        try:
+            jax.eval_shape(self.env.get_avail_actions, self._state_form)
+        except (NotImplementedError, AttributeError):
+            return False
+        return True
+
+    @cached_property
+    def _n_actions(self) -> list[int]:
+        """Numbers of actions of the agents; empty where actions are not Discrete."""
+        if not all(isinstance(space, jax_spaces.Discrete) for space in self._action_spaces):
+            return []
+        return [int(space.n) for space in self._action_spaces]
+
+    def _n_masked_actions(self) -> int | None:
+        counts = self._n_actions
+        return max(counts) if counts and (self.gives_masks or len(set(counts)) > 1) else None
+
+    @cached_property
+    def action_space(self) -> spaces.Space[Any]:
+        """Return the space of a row's action."""
+        first = self._action_spaces[0]
+        if self._n_actions:
+            return spaces.Discrete(max(self._n_actions))
+        if all(isinstance(space, jax_spaces.Box) for space in self._action_spaces):
+            lows, highs = (self._padded_bounds(bound) for bound in ("low", "high"))
+            return spaces.Box(lows, highs, dtype=np.float32)
+        if isinstance(first, jax_spaces.MultiDiscrete):
+            choices = {tuple(np.asarray(space.num_categories).tolist()) for space in self._action_spaces}
+            if len(choices) == 1:
+                return spaces.MultiDiscrete(list(next(iter(choices))))
+        raise ValueError(
+            f"expected actions of one kind, Discrete, Box or equal MultiDiscrete, got {self._action_spaces} in "
+            f"{type(self.env).__name__}"
+        )
+
+    def _padded_bounds(self, bound: str) -> npt.NDArray[np.float32]:
+        widest = max(self._action_spaces, key=lambda space: int(space.shape[0]))
+        return np.broadcast_to(np.asarray(getattr(widest, bound), dtype=np.float32), widest.shape)
+
+    def _world_space(self, observations: Mapping[str, Any]) -> spaces.Box | None:
+        if not self._shows_world:
+            return None
+        if not self._has_world_entry and not hasattr(self.env, "get_world_state"):
+            raise ValueError(f"{type(self.env).__name__} tells no state of the game; leave state=True out")
+        key = jax.random.PRNGKey(0)
+        form = jax.eval_shape(lambda key: self._world(*self.env.reset(key)), key)
+        return spaces.Box(-np.inf, np.inf, (_size(form),), np.float32)
+
+    # ---- one game
+
+    def _begin(self, key: Any) -> tuple[Game, dict[str, Any]]:
+        key, now = jax.random.split(key)
+        observations, state = self.env.reset(now)
+        active = jnp.ones(len(self.agents), dtype=bool)
+        return Game(key, state, active), self._rows(observations, state, active, active)
+
+    def _step(self, game: Game, actions: Any, extra_weight: Any) -> tuple[Game, dict[str, Any], Ends]:
+        key, now = jax.random.split(game.key)
+        observations, state, rewards, dones, infos = self.env.step_env(now, game.state, self._chosen(game, actions))
+        ended = dones[_ALL]
+        done = jnp.stack([dones[agent] for agent in self.agents])
+        truncated = ended & self._is_undecided(state)
+        # Where a time limit stops a team, all its agents are done, those that would have gone on as well.
+        goes_on = ~done | (truncated & done.all())
+        active = game.active & goes_on & (~ended | truncated)
+        team = jnp.stack([rewards[agent] for agent in self.agents])
+        if self.rules.extra_reward is not None:
+            extra = self.rules.extra_reward(infos)
+            team = team + extra_weight * jnp.stack([extra[agent] for agent in self.agents])
+        won = None if self.rules.is_won is None else self.rules.is_won(self.env, state)
+        rows = self._rows(observations, state, active, active | (ended & game.active))
+        return Game(key, state, active), rows, Ends(team.astype(jnp.float32), ended, truncated, won)
+
+    def _chosen(self, game: Game, actions: Any) -> dict[str, Any]:
+        """Actions of the agents, cut to their own spaces; a padded action becomes the first legal one."""
+        if not self._n_actions:
+            shapes = [space.shape for space in self._action_spaces]
+            return {
+                agent: actions[index, : shape[0]]
+                for index, (agent, shape) in enumerate(zip(self.agents, shapes, strict=True))
+            }
+        legal = self.env.get_avail_actions(game.state) if self.gives_masks else None
+        chosen = {}
+        for index, (agent, count) in enumerate(zip(self.agents, self._n_actions, strict=True)):
+            chosen[agent] = actions[index]
+            if count < max(self._n_actions):
+                first = 0 if legal is None else jnp.argmax(legal[agent])
+                chosen[agent] = jnp.where(actions[index] < count, actions[index], first)
+        return chosen
+
+    def _is_undecided(self, state: Any) -> Any:
+        if self.rules.is_undecided is not None:
+            return self.rules.is_undecided(self.env, state)
+        limit, step = getattr(self.env, "max_steps", None), getattr(state, "step", None)
+        return False if limit is None or step is None else step >= limit
+
+    def _rows(self, observations: Mapping[str, Any], state: Any, active: Any, shown: Any) -> dict[str, Any]:
+        """
+        The rows of a game, (N, ...).
+
+        :param active: (N,) what rows say about taking part
+        :param shown: (N,) agents whose observations are shown, the others' rows are zeros
+        """
+        width = self.rows.own.shape[0]  # type: ignore[index]
+        own = jnp.stack([_padded(observations[agent], width, self._own_dtype) for agent in self.agents])
+        rows = {OBS_KEY: jnp.where(shown[:, None], own, 0)}
+        if self.rows.active:
+            rows[ACTIVE_KEY] = active
+        if self.rows.n_masked_actions is not None:
+            rows[ACTION_MASK_KEY] = self._masks(state)
+        if self._shows_world:
+            world = self._world(observations, state)
+            rows[STATE_KEY] = jnp.broadcast_to(world, (len(self.agents), *world.shape))
+        return rows
+
+    def _masks(self, state: Any) -> Any:
+        """(N, A) legal actions; those that an agent does not have are not."""
+        legal: Any = self.env.get_avail_actions(state) if self.gives_masks else {}
+        width = max(self._n_actions)
+        own = [legal.get(agent, np.ones(n)) for agent, n in zip(self.agents, self._n_actions, strict=True)]
+        return jnp.stack([_padded(one, width, np.int8) for one in own])
+
+    def _world(self, observations: Mapping[str, Any], state: Any) -> Any:
+        world = observations[_WORLD_STATE] if self._has_world_entry else self.env.get_world_state(state)
+        return jnp.ravel(world).astype(jnp.float32)
+
+
+def _choose(fresh: tuple[Game, dict[str, Any]], game: Game, rows: dict[str, Any], ended: Any) -> Any:
+    """Take a new episode where the last one ended."""
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, (game, rows))
+
+
+def _size(form: Any) -> int:
+    return int(np.prod(form.shape))
+
+
+def _padded(vector: Any, width: int, dtype: npt.DTypeLike) -> Any:
+    flat = jnp.ravel(vector).astype(dtype)
+    return jnp.pad(flat, (0, width - flat.shape[0]))
+
+
+class JaxGames(ResumableBatch):
+    """
+    E games of an environment.
+
+    :param programs: of the environment
+    :param n_games: E
+    :param extra_weight: of the rewards that the rules tell beside the game's own, such as those for steps on the way
+    :param extra_steps: game steps, summed over games, in which that weight falls to 0; None for never
+    """
+
+    def __init__(
+        self, programs: JaxPrograms, n_games: int, extra_weight: float = 0.0, extra_steps: int | None = None
+    ) -> None:
+        super().__init__(n_games, programs.agents, programs.rows, programs.action_space, programs.env)
+        self._programs = programs
+        self._extra_weight = extra_weight
+        self._extra_steps = extra_steps
+        self._n_steps = 0
+        #: All games; None before the first reset.
+        self.games: Game | None = None
+
+    def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
+        """Begin an episode in every game (see the base class)."""
+        if seeds is None:
+            assert self.games is not None, "the first reset has seeds"
+            keys = self.games.key
+        else:
+            keys = np.array([divmod(seed, 2**32) for seed in seeds], dtype=np.uint32)
+        self.games, rows = self._programs.begin(keys)
+        return self._on_host(rows)
+
+    def step(self, actions: Array) -> BatchStep:
+        """Step every game (see the base class)."""
+        narrow = actions.astype(np.int32) if actions.dtype.kind == "i" else actions
+        games, rows, ends = self._programs.step(self.games, narrow, self._weight())
+        self._n_steps += self.n_games
+        rewards, ended, truncated, won = jax.tree.map(np.asarray, ends)
+        last = self._on_host(rows)
+        self.games = games
+        if not ended.any():
+            return BatchStep(last, rewards, ended, truncated, last, won)
+        self.games, rows = self._programs.choose(self._programs.begin(games.key), games, rows, ended)
+        return BatchStep(self._on_host(rows), rewards, ended, truncated, last, won)
+
+    def _weight(self) -> np.float32:
+        left = 1.0 if self._extra_steps is None else max(0.0, 1.0 - self._n_steps / self._extra_steps)
+        return np.float32(self._extra_weight * left)
+
+    def _on_host(self, rows: dict[str, Any]) -> dict[str, Array]:
+        """(E, N, ...) on the device -> (B, ...); on a CPU no byte is copied."""
+        n_rows = self.n_games * len(self.agents)
+        return {key: part.reshape(n_rows, *part.shape[2:]) for key, part in jax.tree.map(np.asarray, rows).items()}
+
+    def picture(self, game: int) -> npt.NDArray[np.uint8]:
+        """Return what JaxMARL draws of a game (see the base class)."""
+        if self._programs.rules.draw is None:
+            raise ValueError(f"JaxMARL draws no pictures of {type(self.env).__name__}; leave render_mode out")
+        assert self.games is not None, "the games have begun"
+        state = jax.tree.map(lambda leaf: np.asarray(leaf[game]), self.games.state)
+        return self._programs.rules.draw(self.env, state)
+
+    def snapshot(self) -> dict[str, Array]:
+        """Return copies of all games, by the places of the environment's state (see the base class)."""
+        leaves = jax.tree_util.tree_leaves_with_path(self.games)
+        arrays = {jax.tree_util.keystr(path): np.array(leaf) for path, leaf in leaves}
+        return {**arrays, "n_steps": np.array(self._n_steps)}
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Go on from a snapshot (see the base class)."""
+        if self.games is None:
+            self.reset([0] * self.n_games)
+        own = jax.tree_util.tree_leaves_with_path(self.games)
+        leaves = [jnp.array(state[jax.tree_util.keystr(path)]) for path, _ in own]
+        self.games = jax.tree.unflatten(jax.tree.structure(self.games), leaves)
+        self._n_steps = int(state["n_steps"])

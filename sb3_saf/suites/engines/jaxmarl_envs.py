@@ -1,0 +1,117 @@
+"""JaxMARL's environments by name, each compiled once for all who ask for the same."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, Final
+
+from sb3_saf.suites.engines.batch import ResumableBatchVecEnv
+from sb3_saf.suites.engines.jaxmarl import JaxGames, JaxPrograms
+from sb3_saf.suites.engines.jaxmarl_package import (
+    MABRAX_AVAILABLE,
+    MAP_NAME_TO_SCENARIO,
+    SUBMODULE_ENVIRONMENTS,
+    jaxmarl,
+)
+from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts as _LAYOUTS
+from sb3_saf.suites.engines.jaxmarl_rules import rules_of
+
+#: Environments that need another package (brax, jaxrobotarium), or a trained enemy.
+_BRAX: Final = ("ant_4x2", "halfcheetah_6x1", "hopper_3x1", "humanoid_9|8", "walker2d_2x3")
+_NEEDS_A_POLICY: Final = "LearnedPolicyEnemySMAX"
+#: Their observations and rewards are not those of named agents.
+_NOT_BY_AGENT: Final = ("storm", "storm_2p", "storm_np")
+#: Compiled environments that are kept; one takes tens of MB.
+_N_KEPT: Final = 8
+
+
+def smax_maps() -> list[str]:
+    """Return the names of SMAX's scenarios."""
+    return list(MAP_NAME_TO_SCENARIO)
+
+
+def smax_map(name: str) -> Any:
+    """Return a scenario of SMAX."""
+    return MAP_NAME_TO_SCENARIO[name]
+
+
+def overcooked_layouts() -> list[str]:
+    """Return the names of Overcooked's kitchens."""
+    return list(_LAYOUTS)
+
+
+def overcooked_layout(name: str) -> Any:
+    """Return a kitchen of Overcooked."""
+    return _LAYOUTS[name]
+
+
+def registered() -> list[str]:
+    """Return the names of the environments that can be made here."""
+    missing = {_NEEDS_A_POLICY, *_NOT_BY_AGENT}
+    if not MABRAX_AVAILABLE:
+        missing.update(_BRAX)
+    names = [name for name in jaxmarl.registered_envs if name not in missing]
+    return [name for name in names if SUBMODULE_ENVIRONMENTS or not name.startswith("JaxRobotarium")]
+
+
+class _Params:
+    """Arguments of an environment, equal if they are the same or equal values; arrays are told by identity."""
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        self.params = dict(params)
+        self._key = tuple(sorted((name, _identity(value)) for name, value in self.params.items()))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Params) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def _identity(value: Any) -> str:
+    return repr(value) if isinstance(value, (bool, int, float, str, tuple, type(None))) else str(id(value))
+
+
+@lru_cache(_N_KEPT)
+def _programs(name: str, params: _Params, with_state: bool) -> JaxPrograms:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Overcooked recommends its second version
+        env = jaxmarl.make(name, **params.params)
+    return JaxPrograms(env, rules_of(name), with_state)
+
+
+def vec_env(
+    name: str,
+    n_envs: int,
+    seed: int | None,
+    *,
+    state: bool = False,
+    render_mode: str | None = None,
+    reward_shaping: float = 0.0,
+    reward_shaping_steps: int | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    **params: Any,
+) -> ResumableBatchVecEnv:
+    """
+    Make games of an environment.
+
+    :param name: as JaxMARL registers it
+    :param n_envs: E
+    :param seed: of the run
+    :param state: whether rows show the state of the game
+    :param render_mode: None or ``"rgb_array"``
+    :param reward_shaping: weight of the rewards for steps on the way, where the environment has such
+    :param reward_shaping_steps: game steps, summed over games, in which that weight falls to 0; None for never
+    :param fixed: arguments of the environment that the task decides
+    :param params: its other arguments
+    :raises ValueError: if there is no such state, picture or reward, or the environment is not one for rows of teams
+    """
+    programs = _programs(name, _Params({**params, **(fixed or {})}), state)
+    if reward_shaping and programs.rules.extra_reward is None:
+        raise ValueError(f"{name} has no rewards for steps on the way, got reward_shaping={reward_shaping}")
+    if render_mode is not None and programs.rules.draw is None:
+        raise ValueError(f"JaxMARL draws no pictures of {name}; leave render_mode={render_mode!r} out")
+    games = JaxGames(programs, n_envs, reward_shaping, reward_shaping_steps)
+    return ResumableBatchVecEnv(games, seed, render_mode)

@@ -1,0 +1,197 @@
+"""Games of VMAS, which torch steps all at once."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+
+with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # gym, which VMAS takes its spaces from, recommends gymnasium
+    import vmas
+    from vmas.simulator.environment import Environment
+
+from sb3_saf.envs.row_spaces import RowSpaces
+from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array
+from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
+
+#: Game steps after which BenchMARL stops an episode.
+_MAX_STEPS: Final = 100
+_ONE_AGENT: Final = "simple"
+#: In VMAS's warning of parameters that a scenario does not know.
+_UNUSED: Final = "not used by the scenario"
+
+
+def scenarios() -> list[str]:
+    """Return the names of the scenarios for teams."""
+    return [*vmas.scenarios, *(name for name in vmas.mpe_scenarios if name != _ONE_AGENT)]
+
+
+class VmasGames(Batch):
+    """
+    E games of a scenario.
+
+    VMAS keeps one random state for all its environments; each batch puts its own in for the time of a call.
+
+    :param env: of VMAS, with ``terminated_truncated=True``
+    """
+
+    def __init__(self, env: Any) -> None:
+        self._random: list[Any] = list(Environment.vmas_random_state)
+        agents = [agent.name for agent in env.agents]
+        self._action_spaces = [env.get_agent_action_space(agent) for agent in env.agents]
+        self._widths = [sum(_flat(part).shape[1] for part in _parts(one)) for one in _observe(env)]
+        own = spaces.Box(-np.inf, np.inf, (max(self._widths),), np.float32)
+        action_space, self._masks = _row_actions(self._action_spaces)
+        n_masked = None if self._masks is None else self._masks.shape[1]
+        super().__init__(env.num_envs, agents, RowSpaces(own, True, n_masked, is_dict=True), action_space, env)
+
+    @contextlib.contextmanager
+    def _own_randomness(self) -> Iterator[None]:
+        """Exchange VMAS's random state for this batch's."""
+        shared = Environment.vmas_random_state
+        kept = list(shared)
+        shared[:] = self._random
+        try:
+            yield
+        finally:
+            self._random = list(shared)
+            shared[:] = kept
+
+    def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
+        """Begin an episode in every game; the first seed is the batch's (see the base class)."""
+        with self._own_randomness():
+            observations = self.env.reset(seed=None if seeds is None else seeds[0] % 2**32)
+        return self._rows(observations, np.ones(self.n_games, dtype=bool))
+
+    def step(self, actions: Array) -> BatchStep:
+        """Step every game (see the base class)."""
+        with self._own_randomness():
+            observations, rewards, terminated, limited, _ = self.env.step(self._chosen(actions))
+            truncated = (limited & ~terminated).numpy(force=True)
+            ended = (limited | terminated).numpy(force=True)
+            last = self._rows(observations, ~ended | truncated)
+            rows = last if not ended.any() else self._rows(self._begin_where(ended), np.ones_like(ended))
+        return BatchStep(rows, th.stack(rewards, dim=1).numpy(force=True), ended, truncated, last)
+
+    def _begin_where(self, ended: npt.NDArray[np.bool_]) -> list[Any]:
+        """Begin the next episode of some games; return the observations of all."""
+        if ended.all():
+            return list(self.env.reset())
+        for game in np.flatnonzero(ended).tolist():
+            self.env.reset_at(game, return_observations=False)
+        return _observe(self.env)
+
+    def _chosen(self, actions: Array) -> list[th.Tensor]:
+        """Actions of the agents, cut to their own spaces; actions that an agent does not have become its first."""
+        chosen = []
+        for index, space in enumerate(self._action_spaces):
+            own = th.from_numpy(np.ascontiguousarray(actions[:, index]))
+            if self._masks is not None:
+                own = th.where(own < space.n, own, 0)
+            chosen.append(own[:, : space.shape[0]] if space.shape else own.unsqueeze(1))
+        return [one.to(self.env.device) for one in chosen]
+
+    def _rows(self, observations: Sequence[Any], active: npt.NDArray[np.bool_]) -> dict[str, Array]:
+        """(B, ...) rows of games whose agents all take part, or none."""
+        width = max(self._widths)
+        padded = [
+            th.nn.functional.pad(th.cat([_flat(part) for part in _parts(one)], dim=1), (0, width - own))
+            for one, own in zip(observations, self._widths, strict=True)
+        ]
+        n_rows = self.n_games * len(self.agents)
+        own = th.stack(padded, dim=1).reshape(n_rows, width).float().numpy(force=True)
+        rows = {OBS_KEY: own, ACTIVE_KEY: np.repeat(active, len(self.agents))}
+        if self._masks is not None:
+            rows[ACTION_MASK_KEY] = np.tile(self._masks, (self.n_games, 1))
+        return rows
+
+    def picture(self, game: int) -> npt.NDArray[np.uint8]:
+        """Return what VMAS draws of a game; it needs a display, or EGL (see the base class)."""
+        with self._own_randomness():
+            return np.asarray(self.env.render(mode="rgb_array", env_index=game), dtype=np.uint8)
+
+
+def _observe(env: Any) -> list[Any]:
+    found = env.get_from_scenario(get_observations=True, get_rewards=False, get_infos=False, get_dones=False)
+    return list(found[0])
+
+
+def _parts(observation: Any) -> Iterator[th.Tensor]:
+    """The tensors of an agent's observation, each (E, ...)."""
+    if isinstance(observation, dict):
+        for part in observation.values():
+            yield from _parts(part)
+    else:
+        yield observation
+
+
+def _flat(part: th.Tensor) -> th.Tensor:
+    return part.reshape(len(part), -1)
+
+
+def _row_actions(own: Sequence[Any]) -> tuple[spaces.Space[Any], npt.NDArray[np.int8] | None]:
+    """Return the action space of a row, and (N, A) the actions that each agent has, None if all have all."""
+    if not own[0].shape:
+        counts = np.array([space.n for space in own])
+        masks = (np.arange(counts.max()) < counts[:, np.newaxis]).astype(np.int8)
+        return spaces.Discrete(int(counts.max())), None if masks.all() else masks
+    width = max(space.shape[0] for space in own)
+    low, high = (np.zeros((len(own), width), dtype=np.float32) for _ in range(2))
+    for index, space in enumerate(own):
+        low[index, : space.shape[0]], high[index, : space.shape[0]] = space.low, space.high
+    return spaces.Box(low.min(axis=0), high.max(axis=0)), None
+
+
+def vec_env(
+    scenario: str,
+    n_envs: int,
+    seed: int | None,
+    *,
+    state: bool = False,
+    render_mode: str | None = None,
+    max_steps: int | None = _MAX_STEPS,
+    continuous_actions: bool = True,
+    device: str = "cpu",
+    **params: Any,
+) -> BatchVecEnv:
+    """
+    Make games of a scenario.
+
+    :param scenario: its name
+    :param n_envs: E
+    :param seed: of the run
+    :param state: must be False: VMAS tells no state of the game
+    :param render_mode: None or ``"rgb_array"``
+    :param max_steps: time limit in game steps; None for none
+    :param continuous_actions: whether actions are forces, or numbers of directions
+    :param device: of torch, where the games are
+    :param params: of the scenario
+    :raises ValueError: if the scenario does not know a parameter, or a state is asked for
+    """
+    if state:
+        raise ValueError(f"vmas/{scenario} tells no state of the game; leave state=True out")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        env = vmas.make_env(
+            scenario,
+            n_envs,
+            device=device,
+            continuous_actions=continuous_actions,
+            max_steps=max_steps,
+            seed=0,
+            clamp_actions=True,
+            terminated_truncated=True,
+            **params,
+        )
+    for warning in said:
+        if _UNUSED in str(warning.message):
+            raise ValueError(f"vmas/{scenario} cannot be made with {params}: {warning.message}")
+    return BatchVecEnv(VmasGames(env), seed, render_mode)

@@ -1,0 +1,42 @@
+"""
+All else that JaxMARL registers: ``jaxmarl/MPE_simple_spread_v3``, ``jaxmarl/overcooked_v2``, ``jaxmarl/hanabi``.
+
+Parameters are those of the environment. Observations are flattened, those of agents with shorter ones padded with
+zeros; actions that an agent does not have are masked. Environments whose packages are missing are not listed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from sb3_saf.suites.suite import Suite
+
+
+def _tasks() -> list[str]:
+    from sb3_saf.suites.engines.jaxmarl_envs import registered
+
+    return registered()
+
+
+def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
+    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+
+    return vec_env(task, n_envs, seed, **params)
+
+
+SUITE: Final = Suite(
+    name="jaxmarl",
+    title="environments by the names that JaxMARL registers",
+    requires=('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"'),
+    extra="jaxmarl",
+    page="https://jaxmarl.foersterlab.com",
+    list_tasks=_tasks,
+    examples=("MPE_simple_spread_v3",),
+    vec_env=_games,
+    competitive=(
+        "SMAX", "MPE_simple_adversary_*", "MPE_simple_crypto_*", "MPE_simple_push_*", "MPE_simple_tag_*",
+        "MPE_simple_world_comm_*", "coin_game",
+    ),
+    has_state=True,
+    exact_resume=True,
+)  # fmt: skip

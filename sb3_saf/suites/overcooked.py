@@ -1,0 +1,39 @@
+"""
+Overcooked on JAX: ``overcooked/cramped_room``.
+
+Both cooks are given the team's reward, 20 for a soup that is served. ``reward_shaping`` adds as many times JaxMARL's
+rewards for steps on the way to it, to those who take them; ``reward_shaping_steps`` are the game steps, summed over
+games, in which that falls to nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from sb3_saf.suites.suite import Suite
+
+
+def _tasks() -> list[str]:
+    from sb3_saf.suites.engines.jaxmarl_envs import overcooked_layouts
+
+    return overcooked_layouts()
+
+
+def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
+    from sb3_saf.suites.engines.jaxmarl_envs import overcooked_layout, vec_env
+
+    return vec_env("overcooked", n_envs, seed, fixed={"layout": overcooked_layout(task)}, **params)
+
+
+SUITE: Final = Suite(
+    name="overcooked",
+    title="two cooks in one kitchen, on JAX",
+    requires=('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"'),
+    extra="overcooked",
+    page="https://jaxmarl.foersterlab.com/environments/overcooked/",
+    list_tasks=_tasks,
+    examples=("cramped_room",),
+    vec_env=_games,
+    team_return="mean",
+    exact_resume=True,
+)

@@ -1,0 +1,41 @@
+"""
+SMAX, the micromanagement of StarCraft without StarCraft: ``smax/3m``.
+
+Allies are trained, enemies play JaxMARL's heuristic. Every ally is given the team's reward: the enemy health that it
+took away, at most 1 in total, and 1 for a battle that is won, which is the success. Dead allies get it, too, so their
+rows go on, with one legal action that does nothing. An episode that ends with both sides alive was stopped by its time
+limit. ``state=True`` shows ``world_state``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from sb3_saf.suites.suite import Suite
+
+
+def _tasks() -> list[str]:
+    from sb3_saf.suites.engines.jaxmarl_envs import smax_maps
+
+    return smax_maps()
+
+
+def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
+    from sb3_saf.suites.engines.jaxmarl_envs import smax_map, vec_env
+
+    return vec_env("HeuristicEnemySMAX", n_envs, seed, fixed={"scenario": smax_map(task)}, **params)
+
+
+SUITE: Final = Suite(
+    name="smax",
+    title="StarCraft's micromanagement, on JAX",
+    requires=('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"'),
+    extra="smax",
+    page="https://jaxmarl.foersterlab.com/environments/smax/",
+    list_tasks=_tasks,
+    examples=("3m",),
+    vec_env=_games,
+    team_return="mean",
+    has_state=True,
+    exact_resume=True,
+)

@@ -1,0 +1,314 @@
+"""Suites whose engines step all games at once, beside the engines themselves stepped game by game."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+from hecogrid_envs.core.rng import game_seeds
+from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env, resumable_learn
+from sb3_saf.checkpoints.data import read_tree, write_tree
+from sb3_saf.checkpoints.environments import check_environment_state, environment_state, load_environment_state
+from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.suites.registry import find_task, suites
+
+Array = npt.NDArray[Any]
+
+
+def _needs(name: str) -> pytest.MarkDecorator:
+    problem = suites()[name].problem()
+    return pytest.mark.skipif(problem is not None, reason=str(problem))
+
+
+needs_jaxmarl, needs_vmas = _needs("jaxmarl"), _needs("vmas")
+
+
+def rows_of(env_id: str, n_envs: int, seed: int = 0, **params: Any) -> Any:
+    """The VecEnv of a task, below the wrappers of ``make_team_env``."""
+    one = find_task(env_id)
+    assert one is not None and one.suite.vec_env is not None
+    return one.suite.vec_env(one.task, n_envs, seed, **params)
+
+
+def legal_actions(observations: dict[str, Array], rng: np.random.Generator, n_actions: int) -> Array:
+    masks = observations.get("action_mask", np.ones((len(observations["active"]), n_actions)))
+    return np.asarray((rng.random(masks.shape) * masks).argmax(axis=1))
+
+
+# --- JaxMARL ----------------------------------------------------------------------------------------------------------
+
+
+@needs_jaxmarl
+def test_rows_are_the_games_of_jaxmarl_one_by_one() -> None:
+    """Observations padded, last ones kept, actions masked, random streams per game; a listener and a speaker."""
+    import jax
+
+    venv = rows_of("jaxmarl/MPE_simple_speaker_listener_v4", 2, seed=7, max_steps=3)  # that are 4: it counts from 0
+    env = venv.batch.env
+    reset, step = jax.jit(env.reset), jax.jit(env.step_env)
+    keys = [np.array(divmod(seed, 2**32), dtype=np.uint32) for seed in game_seeds(7, 2)]
+    rng = np.random.default_rng(0)
+    rows: dict[str, Array] = venv.reset()
+    states: list[Any] = [None, None]
+
+    def check(seen: Array, game: int, own: Any) -> None:
+        for i, agent in enumerate(env.agents):
+            size = len(own[agent])
+            np.testing.assert_allclose(seen[2 * game + i, :size], own[agent], rtol=1e-6, atol=1e-6)
+            assert not seen[2 * game + i, size:].any()
+
+    for t in range(9):
+        for game in range(2):
+            if t % 4 == 0:
+                keys[game], now = np.asarray(jax.random.split(keys[game]))
+                own, states[game] = reset(now)
+                check(rows["obs"], game, own)
+        n_actions = [int(env.action_space(agent).n) for agent in env.agents]
+        assert rows["action_mask"].sum(axis=1).tolist() == n_actions * 2
+        actions = legal_actions(rows, rng, 5)
+        rows, rewards, dones, infos = venv.step(actions)
+        for game in range(2):
+            keys[game], now = np.asarray(jax.random.split(keys[game]))
+            chosen = dict(zip(env.agents, actions[2 * game : 2 * game + 2].tolist(), strict=True))
+            own, states[game], own_rewards, _, _ = step(now, states[game], chosen)
+            np.testing.assert_allclose(
+                rewards[2 * game : 2 * game + 2], [own_rewards[agent] for agent in env.agents], rtol=1e-5
+            )
+            if (t + 1) % 4:
+                check(rows["obs"], game, own)
+            else:
+                last = [info["terminal_observation"] for info in infos]
+                check(np.stack([one["obs"] for one in last]), game, own)
+                assert all(one["active"] == 1 for one in last), "something would have followed"
+        assert dones.all() == (t % 4 == 3) and all(info.get("TimeLimit.truncated", True) for info in infos)
+
+
+@needs_jaxmarl
+def test_games_do_not_depend_on_their_number_and_actions_are_checked() -> None:
+    few, many = (rows_of("jaxmarl/switch_riddle", n, seed=3) for n in (2, 5))
+    first, all_of_them = few.reset(), many.reset()
+    rng = np.random.default_rng(1)
+    for _ in range(12):
+        np.testing.assert_array_equal(first["obs"], all_of_them["obs"][:6])
+        actions = rng.integers(0, 3, 15)
+        first, *_ = few.step(actions[:6])
+        all_of_them, *_ = many.step(actions)
+    assert few.seeded_with == many.seeded_with[:2]
+    with pytest.raises(ValueError, match=r"expected actions from Discrete\(3\), got 3 in row 4 \(game 1, agent_1\)"):
+        few.step(np.array([0, 0, 0, 0, 3, 0]))
+    few.set_options({"layout": 1})
+    with pytest.raises(ValueError, match="no options"):
+        few.reset()
+
+
+@needs_jaxmarl
+def test_an_end_is_no_time_limit() -> None:
+    """Telling in the riddle ends it at once; its observations then count for nothing."""
+    venv = rows_of("jaxmarl/switch_riddle", 2, seed=3)
+    venv.reset()
+    tell = np.tile([2, 2, 2], 2)
+    for _ in range(6):
+        _, _, dones, infos = venv.step(tell)
+        if dones[0]:
+            break
+    assert dones[0] and infos[0]["TimeLimit.truncated"] is False and infos[0]["terminal_observation"]["active"] == 0
+
+
+@needs_jaxmarl
+def test_battles_of_smax() -> None:
+    """The dead are paid and can do nothing, masks are JaxMARL's, the world's state is the critic's, wins are told."""
+    import jax
+
+    env = make_team_env("smax/3m", n_envs=2, seed=0, state=True)
+    venv: Any = env.unwrapped
+    observations: Any = env.reset()
+    assert observations["state"].shape == (6, 72)
+    assert "active" not in observations
+    n_dead, won = 0, []
+    for _ in range(120):  # allies walk up to the enemy, and all shoot at the same one
+        shots = observations["action_mask"][:, 5:]
+        observations, rewards, dones, infos = env.step(np.where(shots.any(axis=1), 5 + shots.argmax(axis=1), 1))
+        game = jax.tree.map(lambda leaf: leaf[1], venv.batch.games)
+        alive = np.asarray(game.state.state.unit_alive[:3])
+        assert rewards[3] == rewards[4] == rewards[5]
+        n_dead += int((~alive).sum())
+        legal = venv.batch.env.get_avail_actions(game.state)
+        for i in range(3):
+            np.testing.assert_array_equal(observations["action_mask"][3 + i], legal[f"ally_{i}"])
+            assert alive[i] or observations["action_mask"][3 + i].tolist() == [0, 0, 0, 0, 1, 0, 0, 0]
+        for first in np.flatnonzero(dones)[::3].tolist():
+            won.append(infos[first]["is_success"])
+            assert won[-1] == (rewards[first] >= 1), "the bonus of a victory is 1"
+            assert infos[first]["TimeLimit.truncated"] is False and "is_success" not in infos[first + 1]
+    assert n_dead and set(won) == {False, True}
+    env.close()
+
+
+@needs_jaxmarl
+def test_the_kitchen() -> None:
+    """Observations are bytes; rewards on the way, 3 for an onion in the pot, are added at a weight that falls."""
+    shaped: dict[str, Any] = {"reward_shaping": 2.0, "reward_shaping_steps": 30}
+    venv = rows_of("overcooked/cramped_room", 3, max_steps=11, **shaped)
+    rows = venv.reset()
+    assert rows["obs"].dtype == np.uint8 and rows["obs"].shape == (6, 520)
+    gained = []
+    left, right, up, interact = 3, 2, 0, 5
+    for action in (left, interact, right, up, interact, left, left, interact, right, up, interact):
+        _, rewards, dones, infos = venv.step(np.array([action, 4] * 3))
+        gained.append(rewards.reshape(3, 2)[2].tolist())
+    np.testing.assert_allclose(gained[4], [3 * 2 * (1 - 12 / 30), 0], rtol=1e-6)
+    assert np.count_nonzero(gained) == 1, "the second onion comes when the weight is gone"
+    assert dones.all() and infos[0]["TimeLimit.truncated"] is True
+    with pytest.raises(ValueError, match="MPE_simple_spread_v3 has no rewards for steps on the way"):
+        rows_of("jaxmarl/MPE_simple_spread_v3", 1, reward_shaping=1.0)
+
+
+class Strike(BaseCallback):
+    """Ends the training in the middle of a rollout, as a crash would."""
+
+    def __init__(self, at: int = -1) -> None:
+        super().__init__()
+        self.at = at
+
+    def _on_step(self) -> bool:
+        if self.n_calls == self.at:
+            raise RuntimeError
+        return True
+
+
+def _riddle(folder: Path) -> PPO:
+    env = make_team_env("jaxmarl/switch_riddle", n_envs=2, seed=5, monitor_dir=str(folder))
+    return PPO("MAPPOPolicy", env, n_steps=8, batch_size=24, n_epochs=2, rollout_buffer_class=TeamRolloutBuffer, seed=5)
+
+
+@needs_jaxmarl
+def test_a_run_that_was_struck_ends_as_the_undisturbed_one(tmp_path: Path) -> None:
+    def learn(folder: str, at: int = -1) -> BaseAlgorithm:
+        path = tmp_path / folder
+        return resumable_learn(_riddle(path), 240, path, [Strike(at)], every_game_steps=1)
+
+    whole = learn("a")
+    with pytest.raises(RuntimeError):
+        learn("b", at=21)
+    again = learn("b")
+    for name, weights in whole.policy.state_dict().items():
+        assert th.equal(weights, again.policy.state_dict()[name]), name
+
+
+@needs_jaxmarl
+def test_states_of_games_are_plain_data_and_checked() -> None:
+    env, other = (make_team_env("overcooked/cramped_room", n_envs=3, seed=seed, max_steps=40) for seed in (0, 1))
+    env.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        env.step(rng.integers(0, 6, 6))
+    file = io.BytesIO()
+    write_tree(file, environment_state(env), "0")
+    states = read_tree(io.BytesIO(file.getvalue()))
+    check_environment_state(other, states)
+    load_environment_state(other, states)
+    for _ in range(45):
+        actions = rng.integers(0, 6, 6)
+        for ours, theirs in zip(env.step(actions)[:3], other.step(actions)[:3], strict=True):
+            np.testing.assert_equal(ours, theirs)
+    states[-1]["state"]["games"]["n_steps"] = np.zeros(2)
+    with pytest.raises(CheckpointError, match="expected 'n_steps' of shape"):
+        check_environment_state(other, states)
+
+
+@needs_jaxmarl
+@pytest.mark.parametrize("env_id", ["smax/3m", "overcooked/cramped_room", "jaxmarl/MPE_simple_spread_v3"])
+def test_pictures_are_those_of_the_suite(env_id: str) -> None:
+    venv = rows_of(env_id, 2, render_mode="rgb_array")
+    venv.reset()
+    first, *_, last = venv.get_images()
+    assert first.dtype == np.uint8 and first.ndim == 3 and first.shape[2] == 3
+    assert (first != last).any(), "games differ"
+
+
+# --- VMAS -------------------------------------------------------------------------------------------------------------
+
+
+@needs_vmas
+@pytest.mark.parametrize("continuous", [True, False])
+def test_rows_are_those_of_vmas_and_draw_from_a_stream_of_their_own(continuous: bool) -> None:
+    import vmas
+
+    venv = rows_of("vmas/balance", 3, seed=2, max_steps=4, continuous_actions=continuous)
+    seed = game_seeds(2, 3)[0] % 2**32
+    make: Any = vmas.make_env
+    engine = make("balance", 3, max_steps=4, continuous_actions=continuous, seed=seed, terminated_truncated=True)
+    before = th.get_rng_state()
+    rows = venv.reset()
+    own = engine.reset(seed=seed)
+    rng = np.random.default_rng(0)
+    for t in range(9):
+        np.testing.assert_array_equal(rows["obs"].reshape(3, 3, -1), np.stack([one.numpy() for one in own], axis=1))
+        shape = (9, 2) if continuous else (9,)
+        actions = rng.uniform(-1, 1, shape).astype(np.float32) if continuous else rng.integers(0, 9, shape)
+        by_agent = [th.from_numpy(actions.reshape(3, 3, *shape[1:])[:, i].copy()) for i in range(3)]
+        own, own_rewards, terminated, truncated, _ = engine.step(by_agent)
+        ended = (terminated | truncated).numpy()
+        last = np.stack([one.numpy() for one in own], axis=1)
+        vmas.make_env("balance", 2, seed=t)  # draws from the state that VMAS keeps for all
+        rows, rewards, dones, infos = venv.step(actions)
+        np.testing.assert_array_equal(rewards.reshape(3, 3), np.stack([one.numpy() for one in own_rewards], axis=1))
+        np.testing.assert_array_equal(dones[::3], ended)
+        for game in np.flatnonzero(ended):
+            info = infos[3 * game + 1]
+            np.testing.assert_array_equal(info["terminal_observation"]["obs"], last[game, 1])
+            assert info["TimeLimit.truncated"] == bool(truncated[game] & ~terminated[game])
+        if ended.any():
+            rows = venv.reset()  # VMAS's own resets share their draws with all its environments, so begin anew
+            venv.seed(2)
+            rows, own = venv.reset(), engine.reset(seed=seed)
+    assert th.equal(before, th.get_rng_state()), "nothing is drawn from the caller's stream"
+
+
+@needs_vmas
+def test_games_of_vmas_begin_again_one_by_one() -> None:
+    venv = rows_of("vmas/balance", 6, seed=1)
+    rows = venv.reset()
+    ends: list[tuple[int, bool]] = []
+    for t in range(100):
+        last = rows
+        rows, _, dones, infos = venv.step(np.full((18, 2), -1, dtype=np.float32))
+        for game in np.flatnonzero(dones[::3]).tolist():
+            ends.append((t, infos[3 * game]["TimeLimit.truncated"]))
+            assert (rows["obs"][3 * game] != infos[3 * game]["terminal_observation"]["obs"]).any()
+        going = ~dones
+        if dones.any() and going.any():
+            assert np.abs(rows["obs"][going] - last["obs"][going]).max() < 0.5, "others go on"
+    assert any(t < 99 and not truncated for t, truncated in ends)
+
+
+@needs_vmas
+def test_agents_of_vmas_with_other_spaces() -> None:
+    env = make_team_env("vmas/simple_speaker_listener", n_envs=2, seed=0, continuous_actions=False)
+    observations = env.reset()
+    assert observations["action_mask"].sum(axis=1).tolist() != [observations["action_mask"].shape[1]] * 4
+    env.step(legal_actions(observations, np.random.default_rng(0), 1))
+    with pytest.raises(ValueError, match=r"vmas/balance cannot be made with \{'colour': 1\}"):
+        make_team_env("vmas/balance", colour=1)
+    with pytest.raises(ValueError, match="vmas/balance tells no state"):
+        make_team_env("vmas/balance", state=True)
+
+
+@needs_vmas
+@pytest.mark.parametrize("continuous", [True, False])
+def test_a_team_of_robots_is_trained_and_evaluated(continuous: bool) -> None:
+    env: CentralizedValueWrapper = make_team_env(
+        "vmas/balance", n_envs=4, seed=0, max_steps=8, continuous_actions=continuous
+    )
+    model = PPO("SAFPolicy", env, n_steps=8, batch_size=48, rollout_buffer_class=TeamRolloutBuffer, seed=0)
+    model.learn(192)
+    assert max(evaluate_team(model, env, 4).lengths) <= 8
