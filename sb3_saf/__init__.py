@@ -31,9 +31,11 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
     from sb3_saf.envs.curriculum import Curriculum, Stage
+    from sb3_saf.envs.gymnasium_team import GymnasiumTeam
     from sb3_saf.envs.joint_observation import CentralizedValueWrapper
     from sb3_saf.envs.make import make_team_env
     from sb3_saf.envs.monitor import TeamMonitor
+    from sb3_saf.envs.team_game import EqualSpaces
     from sb3_saf.envs.turns import TurnsInParallel
     from sb3_saf.errors import NonFiniteError
     from sb3_saf.evaluation import (
@@ -48,7 +50,14 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
     from sb3_saf.inspection.replay import replay
-    from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
+    from sb3_saf.policies.extractors import (
+        LightEncoder,
+        MLPEncoder,
+        NatureEncoder,
+        ObservationEncoder,
+        PaperCNN,
+        PartsEncoder,
+    )
     from sb3_saf.policies.ippo import IPPOLstmPolicy, IPPOMaskablePolicy, IPPOPolicy
     from sb3_saf.policies.mappo import MAPPOLstmPolicy, MAPPOMaskablePolicy, MAPPOPolicy
     from sb3_saf.policies.saf import SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy
@@ -77,10 +86,12 @@ __all__ = [
     "CentralizedValueWrapper",
     "CheckpointError",
     "Curriculum",
+    "EqualSpaces",
     "EvaluationResult",
     "ExportError",
     "FiniteCallback",
     "GameStepsCallback",
+    "GymnasiumTeam",
     "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
@@ -95,6 +106,7 @@ __all__ = [
     "NonFiniteError",
     "ObservationEncoder",
     "PaperCNN",
+    "PartsEncoder",
     "QPLEXLstmPolicy",
     "QPLEXPolicy",
     "QPLEXPoolPolicy",

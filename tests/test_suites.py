@@ -331,6 +331,13 @@ def test_wins_are_counted_once_for_each_team() -> None:
     assert f"{100 * result.success_rate:.0f} % won" in str(result)
 
 
+def test_modules_and_functions_by_name() -> None:
+    env = make_team_env("tests.toy_envs:CounterEnv", n_envs=2, n_agents=3)
+    assert (env.n_games, env.n_agents) == (2, 3)
+    with pytest.raises(ValueError, match=r"cannot import parallel_env from 'no_such\.module'"):
+        make_team_env("no_such.module")
+
+
 def test_ids_of_no_suite_are_left_to_others() -> None:
     assert find_task("TeamTogether") is None
     assert find_task("hecogrid/TeamTogether-v0") is None

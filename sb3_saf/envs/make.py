@@ -25,6 +25,9 @@ BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 #: Whether to look for action masks: where there are any, always, never.
 AskMasks: TypeAlias = Literal["auto"] | bool
 
+#: What the names of modules and functions have, and those of tasks have not.
+_NAMES_OF_CODE: Final = frozenset(".:")
+
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 EnvFactory: TypeAlias = "Callable[..., AnyParallelEnv]"
 
@@ -62,9 +65,11 @@ def make_team_env(
     - The environment's ``state()`` can be the input of MAPPO's critic, ``policy_kwargs={"critic_input": "state"}``.
 
     :param env: a HECOGrid task ("TeamTogether", or its id "hecogrid/TeamTogether-v0"); a task of a suite
-        ("lbf/Foraging-8x8-2p-3f-v3", see :mod:`sb3_saf.suites`); a PettingZoo ParallelEnv, a Gymnasium environment of
-        several agents (:class:`GymnasiumTeam`), or a factory that returns one (``simple_spread_v3.parallel_env``). Of
-        an environment, copies are used. Agents that differ in their spaces get equal ones (:class:`EqualSpaces`)
+        ("lbf/Foraging-8x8-2p-3f-v3", see :mod:`sb3_saf.suites`); a module with ``parallel_env``
+        ("mpe2.simple_spread_v3") or a function ("my_package.my_module:make_env"); a PettingZoo ParallelEnv, a Gymnasium
+        environment of several agents (:class:`GymnasiumTeam`), or a factory that returns one
+        (``simple_spread_v3.parallel_env``). Of an environment, copies are used. Agents that differ in their spaces get
+        equal ones (:class:`EqualSpaces`)
     :param n_envs: E, parallel games
     :param seed: the run's seed, from which each game gets its own; None for fresh ones. An algorithm that is given a
         ``seed`` replaces it with its own
@@ -93,6 +98,8 @@ def make_team_env(
         check_team_reward(team_reward)
     signals = {"active": active is not False, "action_masks": action_masks, "state": state}
     task = find_task(env) if isinstance(env, str) else None
+    if isinstance(env, str) and _NAMES_OF_CODE.intersection(env):
+        env = _imported(env)
     make: Callable[[int | None, dict[str, Any]], VecEnv]
     if task is not None:
         task.warn_if_competitive()
@@ -109,6 +116,15 @@ def make_team_env(
     if team_reward is None:
         team_reward = "given" if task is None else task.suite.team_reward
     return CentralizedValueWrapper(share_reward(monitor, team_reward), time_limit=time_limit)
+
+
+def _imported(name: str) -> EnvFactory:
+    """Return the function of a module that makes games, by its name."""
+    from sb3_saf.training.environments import find_environment  # which knows settings, too
+
+    make = find_environment(name).make
+    assert make is not None, "only HECOGrid's environments have none, whose names have no dots"
+    return make
 
 
 def _check_backend(backend: Backend | None) -> None:
