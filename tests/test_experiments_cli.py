@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,18 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         assert re.search(rf"^{experiment.name} +{re.escape(experiment.question)}$", printed, re.MULTILINE)
     assert "saf, mappo, ippo on TeamTogether, TeamSupport\n" in printed
     assert "trained at c=2, h=1, tested at c=1, h=1; c=2, h=1; c=3, h=1" in printed
+
+
+def test_after_make_train_it_lists_and_says_what_running_needs() -> None:
+    """Without the extra ``zoo``."""
+    code = (
+        "import sys; sys.modules['pandas'] = None; from sb3_saf.experiments.cli import main; "
+        "sys.exit(main(['list']) or main(['run', 'coordination', '--size', 'smoke']))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "this command needs pandas, which is not installed: pip install" in ended.stderr
+    assert "Traceback" not in ended.stderr and "coordination" in ended.stdout
 
 
 @pytest.mark.parametrize("command", ["run", "report"])

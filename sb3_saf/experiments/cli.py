@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, Final, NoReturn, TypeVar
 
 from hecogrid_envs.task import check_task
-from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, Experiment, own_experiment
+from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, PROGRAM, Experiment, own_experiment
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
 from sb3_saf.experiments.grid import RunConfig, Selection, Shard
-from sb3_saf.experiments.page import PROGRAM
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.commands import USAGE_ERROR, KeyValues, OneLineParser, check_device
+from sb3_saf.training.commands import USAGE_ERROR, CommandError, KeyValues, OneLineParser, check_device, require
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.seeds import check_seed
 from sb3_saf.training.yaml_files import SIZES, Size
@@ -45,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _cell(options)
     try:
         code: int = options.function(options)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, CommandError) as error:
         print(f"{PROGRAM} {options.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt:
@@ -284,11 +283,12 @@ def _with_seeds(selection: Selection) -> Selection:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from sb3_saf.experiments.run import RunOptions, run
-
     experiment = _experiment(options)
     if not experiment.is_grid:
         return _print_parameters()
+    require("pandas")
+    from sb3_saf.experiments.run import RunOptions, run
+
     results = _results(options)
     selection, config = _with_seeds(_selection(options, experiment)), _config(options, experiment)
     shard = Shard.parse(options.shard)
@@ -335,6 +335,7 @@ def _report(options: argparse.Namespace) -> int:
     experiment = _experiment(options)
     if not experiment.is_grid:
         return _print_parameters()
+    require("pandas", "matplotlib", "rliable")
     remedy = f"run it first: {PROGRAM} run {name} --size {_size(options)} -f {results.folder}"
     if not results.folder.is_dir():
         raise ValueError(f"there is no folder {results.folder}; name another with -f, or {remedy}")

@@ -8,6 +8,8 @@ from typing import Any, Final, NamedTuple
 
 from sb3_saf.training.names import unknown_name
 
+#: The command, as users type it.
+PROGRAM: Final = "python -m sb3_saf.experiments"
 #: Seeds of a run that names none: the paper's experiments have at least three.
 DEFAULT_SEEDS: Final = (0, 1, 2)
 

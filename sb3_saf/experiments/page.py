@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import pandas as pd
 
-from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Experiment, Level, View
+from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experiment, Level, View
 from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.tables import FEWEST_SEEDS, compare, complete, of_view, strata
@@ -17,7 +17,6 @@ from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
-PROGRAM: Final = "python -m sb3_saf.experiments"
 #: Missing cells that are named.
 _MOST_NAMED: Final = 20
 _NOTHING: Final = "–"
