@@ -233,7 +233,8 @@ class PolicyPool(ActorNetwork):
         features_dim += n_identities
         self.selection = selection
         self.n_policies = n_policies
-        self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn)
+        # First choices are close to uniform, too: policies become different before they are chosen for good.
+        self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn, output_gain=ACTION_GAIN)
         self.signature_keys = nn.Parameter(th.randn(n_policies, latent_dim))
         self.policies = nn.ModuleList(
             ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init) for _ in range(n_policies)
