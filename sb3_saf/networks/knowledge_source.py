@@ -113,8 +113,8 @@ class KnowledgeSource(nn.Module):
     def __init__(self, n_agents: int, features_dim: int = 64, n_slots: int = 4, n_self_attention: int = 2):
         super().__init__()
         self.agent_embeddings = nn.Parameter(th.randn(n_agents, features_dim) * features_dim**-0.5)
-        # As large as the normed values that writing adds to them, and at right angles: smaller slots all become the mean
-        # of what is written, and nobody has a choice of what to read.
+        # As large as the normed values that writing adds to them, and at right angles: smaller slots all become the
+        # mean of what is written, and nobody has a choice of what to read.
         self.slots = nn.Parameter(nn.init.orthogonal_(th.empty(n_slots, features_dim), gain=features_dim**0.5))
         self.write_block = CrossAttentionBlock(features_dim)
         self.slot_blocks = nn.ModuleList(SelfAttentionBlock(features_dim) for _ in range(n_self_attention))
