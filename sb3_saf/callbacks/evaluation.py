@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, game_steps
+from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, game_steps, show_game_steps
 from sb3_saf.envs.teams import check_other_games, require_n_agents
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 
@@ -69,6 +69,7 @@ class TeamEvalCallback(EvalCallback):
     def _init_callback(self) -> None:
         require_n_agents(self.training_env)
         check_training(self.model)
+        show_game_steps(self.model)
         check_other_games(self.training_env, self.eval_env)
         super()._init_callback()
 
