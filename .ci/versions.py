@@ -22,7 +22,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 #: The libraries whose releases differ between the two ends.
 LIBRARIES: Final = ("gymnasium", "numba", "pettingzoo", "sb3-contrib", "stable-baselines3", "supersuit")
 #: What follows from that choice, and so is not pinned.
-FOLLOWING: Final = ("llvmlite", "numpy", "rl-zoo3")
+FOLLOWING: Final = ("huggingface-hub", "huggingface-sb3", "llvmlite", "numpy", "rl-zoo3", "shimmy")
 #: Tests of what is built on the libraries: kernels, vector environments, policies, buffers, checkpoints, old files.
 FAST: Final = tuple(
     f"tests/test_{name}.py"

@@ -6,6 +6,7 @@ import hashlib
 import os
 import subprocess
 import sys
+import tracemalloc
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,18 @@ def test_wrong_content_with_a_right_checksum_is_an_error_of_ours() -> None:
     for content in (b"", b"sb3_saf checkpoint, format 2, written by sb3_saf 1.2\nnonsense", b"something else"):
         with pytest.raises(DamagedCheckpointError):
             decode(content + hashlib.sha256(content).digest())
+
+
+def test_a_replay_buffer_is_written_without_a_copy_of_it(tmp_path: Path) -> None:
+    size = 1 << 26
+    tree = {"replay": [np.zeros(size, np.uint8), np.zeros((1 << 10, size >> 12), np.float32)]}
+    with (tmp_path / "file").open("wb") as file:
+        tracemalloc.start()
+        write_tree(file, tree, "1.0")
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert (tmp_path / "file").stat().st_size > 2 * size
+    assert peak < size // 2
 
 
 def in_format_9() -> bytes:
