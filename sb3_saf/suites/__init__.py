@@ -37,7 +37,7 @@ that step many games in one call: an SB3 VecEnv of B rows, game-major, then agen
 - ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` as SB3 declares them; engines without objects for
   single games raise AttributeError, which is what SB3 expects of attributes that are not there;
 - ``checkpoint_state()`` and ``load_checkpoint_state(state)``, plain data and NumPy arrays, random state included, if
-  runs are to be resumed exactly (``Suite.exact_resume``); perhaps ``check_checkpoint_state(state)``.
+  runs are to be resumed exactly; perhaps ``check_checkpoint_state(state)``.
 
 Arrays may be read-only, and may be those of the engine's next step: :class:`CentralizedValueWrapper` copies what it
 gives. Observations must be finite. Above come, for every suite, :class:`TeamMonitor` (which counts episodes and

@@ -38,5 +38,4 @@ SUITE: Final = Suite(
         "MPE_simple_world_comm_*", "coin_game",
     ),
     has_state=True,
-    exact_resume=True,
 )  # fmt: skip

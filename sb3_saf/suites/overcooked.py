@@ -35,5 +35,4 @@ SUITE: Final = Suite(
     examples=("cramped_room",),
     vec_env=_games,
     team_return="mean",
-    exact_resume=True,
 )

@@ -37,5 +37,4 @@ SUITE: Final = Suite(
     vec_env=_games,
     team_return="mean",
     has_state=True,
-    exact_resume=True,
 )

@@ -41,7 +41,6 @@ class Suite:
     :param team_reward: what agents are given to learn from, see ``make_team_env``
     :param has_state: whether ``state=True`` can be asked for
     :param is_seeded: whether seeds decide what happens in its games
-    :param exact_resume: whether the VecEnv gives its state to checkpoints
     :param module: of the package, where it may be a folder of sources on ``PYTHONPATH`` instead of an installed package
     :param unavailable: why no version of the package works; such a suite has no games, only this message
     """
@@ -60,7 +59,6 @@ class Suite:
     team_reward: Literal["given"] | Reduction = "given"
     has_state: bool = False
     is_seeded: bool = True
-    exact_resume: bool = False
     module: str | None = None
     unavailable: str | None = None
 
