@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TextIO
 
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from hecogrid_envs.core.rng import game_seeds
 from sb3_saf.envs.game_form import has_masks_inside
@@ -82,15 +82,17 @@ def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool)
     """Play the first of the measured games on a screen; each agent is given its own observation only."""
     if screen.env is None:
         return
-    frames = play(screen.env, team, seed, deterministic)
     if screen.file is not None:
+        # A game of now: some packages (mpe2) end pygame for all games when one is closed, as those measured on were.
+        with closing(team.settings.make_game(screen.env.render_mode)) as env:
+            frames = list(play(env, team, seed, deterministic))
         metadata = getattr(screen.env, "metadata", None) or {}
-        write_video(screen.file, list(frames), int(metadata.get("render_fps", FPS)))
+        write_video(screen.file, frames, int(metadata.get("render_fps", FPS)))
         print(screen.file)
     elif screen.env.render_mode == "ansi":
-        print_frames(frames, sys.stdout)
+        print_frames(play(screen.env, team, seed, deterministic), sys.stdout)
     else:
-        for _ in frames:
+        for _ in play(screen.env, team, seed, deterministic):
             pass  # the environment draws
 
 
@@ -111,6 +113,13 @@ def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterato
         yield env.render()
 
 
+def _normalization_of(team: TrainedTeam) -> VecNormalize | None:
+    games = team.settings.make_env(0, evaluation=True, n_envs=1)
+    load_normalization(games, team.path.parent)
+    games.close()
+    return unwrap_vec_normalize(games)
+
+
 class _Reader:
     """Make rows for the policy of what a ParallelEnv gives its agents: one row for each agent, absent ones included."""
 
@@ -119,10 +128,7 @@ class _Reader:
         has_parts = can_be_flattened(space) and not has_masks_inside(space)
         self._flat = FlatReader(space, []) if has_parts else None
         self._spaces = TeamSpaces.from_observation_space(team.policy.observation_space)
-        self._games = team.settings.make_env(0, evaluation=True, n_envs=1)
-        load_normalization(self._games, team.path.parent)
-        self._normalization = unwrap_vec_normalize(self._games)
-        self._games.close()
+        self._normalization = _normalization_of(team) if team.settings.wrapping.get("normalize") else None
 
     def rows(self, agents: Sequence[Any], observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> dict[str, Any]:
         """Stack the own observations of all agents in order, and their masks where there are any."""
