@@ -187,7 +187,7 @@ class BatchVecEnv(VecEnv):
         """Say how the episode of a game ended."""
         first = game * self.n_agents
         for row in range(first, first + self.n_agents):
-            last = {key: np.array(part[row]) for key, part in step.last.items()}
+            last = {key: part[row] for key, part in step.last.items()}
             infos[row] = {TRUNCATED: bool(step.truncated[game]), TERMINAL_OBSERVATION: last}
             self.reset_infos[row] = {}
         if step.won is not None:

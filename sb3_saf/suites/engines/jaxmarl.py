@@ -105,8 +105,7 @@ class JaxPrograms:
             is_dict=True,
         )
         self.begin = jax.jit(jax.vmap(self._begin))
-        self.step = jax.jit(jax.vmap(self._step, in_axes=(0, 0, None)))
-        self.choose = jax.jit(jax.vmap(_choose))
+        self.step = jax.jit(self._step_all)
 
     # ---- spaces
 
@@ -172,6 +171,27 @@ class JaxPrograms:
         key = jax.random.PRNGKey(0)
         form = jax.eval_shape(lambda key: self._world(*self.env.reset(key)), key)
         return spaces.Box(-np.inf, np.inf, (_size(form),), np.float32)
+
+    # ---- all games
+
+    def _step_all(
+        self, games: Game, actions: Any, extra_weight: Any
+    ) -> tuple[Game, dict[str, Any], dict[str, Any], Ends]:
+        """
+        Step, and begin new episodes where some have ended; without such, nothing is begun.
+
+        :param games: E
+        :param actions: (E, N, ...)
+        :param extra_weight: see :class:`JaxGames`
+        :return: games; (E, N, ...) their rows, and those before new episodes began; how episodes ended
+        """
+        games, last, ends = jax.vmap(self._step, in_axes=(0, 0, None))(games, actions, extra_weight)
+
+        def begin_where_ended(games: Game, last: dict[str, Any]) -> Any:
+            return jax.vmap(_choose)(jax.vmap(self._begin)(games.key), games, last, ends.ended)
+
+        games, rows = jax.lax.cond(ends.ended.any(), begin_where_ended, lambda games, last: (games, last), games, last)
+        return games, rows, last, ends
 
     # ---- one game
 
@@ -300,15 +320,11 @@ class JaxGames(ResumableBatch):
     def step(self, actions: Array) -> BatchStep:
         """Step every game (see the base class)."""
         narrow = actions.astype(np.int32) if actions.dtype.kind == "i" else actions
-        games, rows, ends = self._programs.step(self.games, narrow, self._weight())
+        self.games, rows, last, ends = self._programs.step(self.games, narrow, self._weight())
         self._n_steps += self.n_games
         rewards, ended, truncated, won = jax.tree.map(np.asarray, ends)
-        last = self._on_host(rows)
-        self.games = games
-        if not ended.any():
-            return BatchStep(last, rewards, ended, truncated, last, won)
-        self.games, rows = self._programs.choose(self._programs.begin(games.key), games, rows, ended)
-        return BatchStep(self._on_host(rows), rewards, ended, truncated, last, won)
+        shown = self._on_host(rows)
+        return BatchStep(shown, rewards, ended, truncated, self._on_host(last) if ended.any() else shown, won)
 
     def _weight(self) -> np.float32:
         left = 1.0 if self._extra_steps is None else max(0.0, 1.0 - self._n_steps / self._extra_steps)

@@ -1,0 +1,158 @@
+"""
+The batched suites at 64 games: rows as an algorithm gets them, beside the engine alone and beside game by game.
+
+``python -m benchmarks.suites`` prints one table; names of tasks choose among them. Random legal actions. *Engine alone*
+is the suite's own step of all games at once, new episodes included, and nothing is read from it; *rows* is our VecEnv,
+with last observations, masks and infos; *training chain* also joins teams and monitors, copies included; *game by game*
+is the suite's own step of one game, as wrappers of single games call it. Agent-steps per second of processor time, best
+of rounds in which all take turns: it can be compared where the machine is not quiet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_saf import make_team_env
+from sb3_saf.suites.registry import find_task
+
+N_GAMES = 64
+TASKS = ("smax/3m", "overcooked/cramped_room", "jaxmarl/MPE_simple_spread_v3", "vmas/balance", "vmas/navigation")
+ROUNDS = 7
+STEPS = 40
+
+
+class Contestant(NamedTuple):
+    """
+    Something that steps.
+
+    :param step: one step of all its games
+    :param rows: agent-steps that it makes
+    """
+
+    step: Callable[[], object]
+    rows: int
+
+
+def rows_of(env: Any) -> Contestant:
+    """Step a VecEnv, below or above the wrappers of training."""
+    shown: dict[str, Any] = env.reset()
+    rng = np.random.default_rng(0)
+
+    def step() -> None:
+        nonlocal shown
+        masks = shown.get("action_mask")
+        if masks is None:
+            shown = env.step(actions[rng.integers(len(actions))])[0]
+        else:
+            shown = env.step((random[rng.integers(len(random))] * masks).argmax(axis=1))[0]
+
+    random = rng.random((16, env.num_envs, getattr(env.action_space, "n", 1)), dtype=np.float32)
+    actions = np.stack([[env.action_space.sample() for _ in range(env.num_envs)] for _ in range(16)])
+    return Contestant(step, env.num_envs)
+
+
+def jax_engine(env: Any, n_games: int, actions: Any) -> Contestant:
+    """JaxMARL's own ``step``, which begins new episodes itself."""
+    import jax
+
+    def one(key: Any, state: Any, chosen: Any) -> Any:
+        key, now = jax.random.split(key)
+        return key, *env.step(now, state, {agent: chosen[i] for i, agent in enumerate(env.agents)})
+
+    play = jax.jit(jax.vmap(one) if n_games > 1 else one)
+    keys = jax.random.split(jax.random.PRNGKey(0), n_games)
+    keys = keys if n_games > 1 else keys[0]
+    _, state = jax.jit(jax.vmap(env.reset) if n_games > 1 else env.reset)(keys)
+    rng = np.random.default_rng(0)
+
+    def step() -> None:
+        nonlocal keys, state
+        keys, _, state, *rest = play(keys, state, actions[rng.integers(len(actions))])
+        jax.block_until_ready(rest)
+
+    return Contestant(step, n_games * len(env.agents))
+
+
+def vmas_engine(env: Any, n_games: int, actions: Any) -> Contestant:
+    """VMAS's own step, and its own ``reset_at`` for games that have ended."""
+    import torch as th
+
+    env.reset()
+    rng = np.random.default_rng(0)
+
+    def step() -> None:
+        chosen = th.from_numpy(actions[rng.integers(len(actions))])
+        *_, terminated, truncated, _ = env.step([chosen[:, i] for i in range(env.n_agents)])
+        for game in np.flatnonzero((terminated | truncated).numpy()).tolist():
+            env.reset_at(game, return_observations=False)
+
+    return Contestant(step, n_games * env.n_agents)
+
+
+def contestants(env_id: str) -> dict[str, Contestant]:
+    """Engine alone, rows, training chain, game by game."""
+    one = find_task(env_id)
+    assert one is not None and one.suite.vec_env is not None
+    venv = one.suite.vec_env(one.task, N_GAMES, 0)
+    sample = [[venv.action_space.sample() for _ in range(venv.num_envs)] for _ in range(16)]
+    actions = np.stack(sample).reshape(16, N_GAMES, venv.n_agents, *venv.action_space.shape)
+    if one.suite.name == "vmas":
+        engine, single = (_vmas(one.task, n, actions[:, :n]) for n in (N_GAMES, 1))
+    else:
+        actions = actions.astype(np.int32)
+        engine = jax_engine(venv.batch.env, N_GAMES, actions)
+        single = jax_engine(venv.batch.env, 1, actions[:, 0])
+    return {
+        "engine alone": engine,
+        "rows": rows_of(venv),
+        "training chain": rows_of(make_team_env(env_id, N_GAMES, seed=0)),
+        "game by game": single,
+    }
+
+
+def _vmas(scenario: str, n_games: int, actions: Any) -> Contestant:
+    import vmas
+
+    env = vmas.make_env(scenario, n_games, max_steps=100, seed=0, terminated_truncated=True)
+    return vmas_engine(env, n_games, actions)
+
+
+def rates(env_id: str, rounds: int, steps: int) -> dict[str, float]:
+    """Agent-steps per second of processor time, the best of rounds in turns."""
+    found = contestants(env_id)
+    best = dict.fromkeys(found, 0.0)
+    for contestant in found.values():
+        contestant.step()
+        contestant.step()
+    for _ in range(rounds):
+        for name, contestant in found.items():
+            start = time.process_time()
+            for _ in range(steps):
+                contestant.step()
+            best[name] = max(best[name], steps * contestant.rows / (time.process_time() - start))
+    return best
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tasks", nargs="*", default=TASKS)
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--steps", type=int, default=STEPS, help="game steps of each per round")
+    args = parser.parse_args()
+    print("| task | engine alone | rows | of the engine | training chain | game by game |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for env_id in args.tasks:
+        best = rates(env_id, args.rounds, args.steps)
+        share = best["rows"] / best["engine alone"]
+        cells = [f"{best[name]:,.0f}" for name in ("engine alone", "rows", "training chain", "game by game")]
+        print(f"| {env_id} | {cells[0]} | {cells[1]} | {share:.0%} | {cells[2]} | {cells[3]} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
