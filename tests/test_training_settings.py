@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from hecogrid_envs.core.rng import game_seeds
 from hecogrid_envs.params import HECOGridParams
 from sb3_saf import LightEncoder, TeamRolloutBuffer
+from sb3_saf.suites.registry import suites
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.seeds import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ENV_IDS, SIZES, Settings, load_settings, saved_settings
@@ -83,7 +84,7 @@ def _defaults(algorithm: type) -> dict[str, Any]:
 @pytest.mark.parametrize("config", [name for name in config_names() if name != "levels"])
 def test_files_have_only_what_differs(config: str) -> None:
     content = read_config(config)
-    assert set(content) <= {"default", "hecogrid", *ENV_IDS}
+    assert {key for key in content if "/" not in key} <= {"default", "hecogrid", *ENV_IDS, *suites()}
     algorithm = next((spec.algorithm for spec in ALGOS.values() if spec.config == config), PPO)
     defaults = _defaults(algorithm)
     repeated = {key for key, value in content["default"].items() if key in defaults and value == defaults[key]}
