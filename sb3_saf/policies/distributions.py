@@ -115,9 +115,13 @@ class LeanCategorical(CategoricalDistribution):
         return self
 
     @property
-    def distribution(self) -> Categorical:  # type: ignore[override]  # read-only
+    def distribution(self) -> Categorical:
         """PyTorch's distribution, which TRPO compares."""
         return Categorical(logits=self.log_probs, validate_args=False)
+
+    @distribution.setter
+    def distribution(self, value: object) -> None:
+        """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """(B,) log-likelihoods of actions (B,)."""
@@ -197,9 +201,13 @@ class PoolDistribution(_FromPool):
         return self
 
     @property
-    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # read-only
+    def distribution(self) -> PolicyAndAction:
         """What TRPO compares: the distribution of policy and action together."""
         return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
+
+    @distribution.setter
+    def distribution(self, value: object) -> None:
+        """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """(B,) log-likelihoods of actions (B, D)."""
@@ -260,12 +268,16 @@ class SelectedDistribution(_FromPool):
         self.favourite = favourite
 
     @property
-    def distribution(self) -> TorchDistribution:  # type: ignore[override]  # read-only
+    def distribution(self) -> TorchDistribution:
         """Not there: TRPO would compare policies drawn at different times."""
         raise ValueError(
             "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
             "(TRPO's KL divergence) says nothing; use selection='mixture'"
         )
+
+    @distribution.setter
+    def distribution(self, value: object) -> None:
+        """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def proba_distribution(self, *args: Any, **kwargs: Any) -> SelectedDistribution:
         """Set the parameters of the drawn policy."""
