@@ -53,7 +53,7 @@ def parse(arguments: list[str] | None = None) -> Options:
     parser.add_argument("--task", choices=TASK_NAMES, default="TeamSupport")
     parser.add_argument("--coordination", type=int, default=2, help="agents that one treasure needs")
     parser.add_argument("--heterogeneity", type=int, default=1, help="zones with different dynamics")
-    parser.add_argument("--game-steps", type=int, default=100_000, help="steps of the game, not of its agents")
+    parser.add_argument("--game-steps", type=int, default=200_000, help="steps of the game, not of its agents")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"))
     parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")

@@ -120,7 +120,7 @@ def test_sb3s_own_buffer_warns_once_and_names_the_remedy() -> None:
     model = PPO("SAFPolicy", env, n_steps=4, batch_size=8, device="cpu")
     with pytest.warns(UserWarning, match=r"SAFPolicy is trained on .*ppo_settings\(env\)") as told:
         model.learn(32)
-    assert len(told) == 1
+    assert sum("ppo_settings" in str(warning.message) for warning in told) == 1
 
 
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
@@ -143,6 +143,7 @@ def test_good_settings_train_any_team(policy: str, overrides: dict[str, Any]) ->
     assert model.n_steps * model.n_envs == (42 if overrides else 2 * 3 * 268)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "the games have action_masks")
         model.learn(1 if overrides else 0, GameStepsCallback())
 
 

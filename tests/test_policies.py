@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -405,7 +406,7 @@ def test_light_encoder_on_codes_and_on_pictures_gives_the_same_policy() -> None:
         if key != "agent"
     } | {"agent": codes["agent"]}
     assert pictures["team"].shape == (12, 3, 3, 12, 12)
-    for encoder in (LightEncoder, PaperCNN):
+    for encoder in (partial(LightEncoder, one_hot_codes=False), PaperCNN):
         of_codes = make_policy(SAFPolicy, CodeSpace(), features_extractor_class=encoder)
         of_pictures = make_policy(SAFPolicy, PICTURE, features_extractor_class=encoder)
         of_pictures.load_state_dict(of_codes.state_dict())

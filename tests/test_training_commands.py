@@ -272,7 +272,8 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
         "-f",
         str(tmp_path),
     ]
-    zoo_train.main([*given, "--eval-freq", "-1", "-n", "400"])
+    with pytest.warns(UserWarning, match="DoublingWrapper cannot give the state of its games"):
+        zoo_train.main([*given, "--eval-freq", "-1", "-n", "400"])
     run = tmp_path / "saf" / "tests.toy_envs-CounterEnv_1"
     model = PPO.load(run / "tests.toy_envs-CounterEnv.zip")
     assert isinstance(model.observation_space, spaces.Dict)
