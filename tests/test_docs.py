@@ -78,7 +78,11 @@ class Page(NamedTuple):
 OWN_ENVIRONMENT = "docs/reference/own_environment.md"
 GAMES = {"n_envs=16": "n_envs=2", "200_000 *": "400 *", "10_000, keep": "400, keep", "=10_000)": "=400)"}
 RUN = [
-    Page("README.md", {"200_000 *": "800 *", "100_000 *": "800 *", "n_envs=16": "n_envs=2", "=32)": "=2)"}, {"own_observation": np.ones(2)}),
+    Page(
+        "README.md",
+        {"200_000 *": "800 *", "100_000 *": "800 *", "n_envs=16": "n_envs=2", "=32)": "=2)"},
+        {"own_observation": np.ones(2)},
+    ),
     Page(OWN_ENVIRONMENT, {"20_000 *": "800 *", "100_000 *": "800 *", "=32)": "=2)", "n_envs=8": "n_envs=2"}),
     Page("docs/resume.md", {**GAMES, "eval_freq=20_000": "eval_freq=400"}),
     Page(

@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
 from sb3_saf.envs.teams import TeamSpaces
-from sb3_saf.networks.layers import Linear
+from sb3_saf.networks.layers import Linear, Rows
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
@@ -747,7 +747,7 @@ def test_actor_and_encoder_run_without_the_critic() -> None:
 
 def test_parts_can_be_replaced() -> None:
     class DoubledCritic(JointCritic):
-        def forward(self, features: th.Tensor, teams: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+        def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
             return 2.0 * super().forward(features, teams, active)
 
     class DoubledParts(MAPPOParts):
