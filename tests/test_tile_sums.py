@@ -12,7 +12,8 @@ from torch import nn
 
 from hecogrid_envs import make_vec_env
 from sb3_saf import LightEncoder, PaperCNN
-from sb3_saf.networks.tanh import Tanh, mlp
+from sb3_saf.networks.layers import mlp
+from sb3_saf.networks.tanh import Tanh
 from sb3_saf.networks.tile_sums import (
     Places,
     places_of_convolution,
