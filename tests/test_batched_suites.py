@@ -251,7 +251,7 @@ def test_rows_are_those_of_vmas_and_draw_from_a_stream_of_their_own(continuous: 
     rows = venv.reset()
     own = engine.reset(seed=seed)
     rng = np.random.default_rng(0)
-    for t in range(9):
+    for _ in range(9):
         np.testing.assert_array_equal(rows["obs"].reshape(3, 3, -1), np.stack([one.numpy() for one in own], axis=1))
         shape = (9, 2) if continuous else (9,)
         actions = rng.uniform(-1, 1, shape).astype(np.float32) if continuous else rng.integers(0, 9, shape)
@@ -259,7 +259,6 @@ def test_rows_are_those_of_vmas_and_draw_from_a_stream_of_their_own(continuous: 
         own, own_rewards, terminated, truncated, _ = engine.step(by_agent)
         ended = (terminated | truncated).numpy()
         last = np.stack([one.numpy() for one in own], axis=1)
-        vmas.make_env("balance", 2, seed=t)  # draws from the state that VMAS keeps for all
         rows, rewards, dones, infos = venv.step(actions)
         np.testing.assert_array_equal(rewards.reshape(3, 3), np.stack([one.numpy() for one in own_rewards], axis=1))
         np.testing.assert_array_equal(dones[::3], ended)
@@ -268,10 +267,26 @@ def test_rows_are_those_of_vmas_and_draw_from_a_stream_of_their_own(continuous: 
             np.testing.assert_array_equal(info["terminal_observation"]["obs"], last[game, 1])
             assert info["TimeLimit.truncated"] == bool(truncated[game] & ~terminated[game])
         if ended.any():
-            rows = venv.reset()  # VMAS's own resets share their draws with all its environments, so begin anew
-            venv.seed(2)
+            venv.seed(2)  # VMAS's own resets go on with the state that it keeps for all, so begin anew
             rows, own = venv.reset(), engine.reset(seed=seed)
     assert th.equal(before, th.get_rng_state()), "nothing is drawn from the caller's stream"
+
+
+@needs_vmas
+def test_what_others_draw_changes_nothing_in_vmas() -> None:
+    alone, disturbed = (rows_of("vmas/balance", 3, seed=2, max_steps=4) for _ in range(2))
+    still = np.zeros((9, 2), dtype=np.float32)
+    found: list[list[Array]] = []
+    for venv, others in ((alone, None), (disturbed, rows_of("vmas/balance", 2, seed=9, max_steps=3))):
+        venv.reset()
+        if others is not None:
+            others.reset()
+        found.append([])
+        for _ in range(12):
+            if others is not None:
+                others.step(still[:6])
+            found[-1].append(venv.step(still)[0]["obs"])
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 @needs_vmas
