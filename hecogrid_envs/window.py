@@ -122,7 +122,7 @@ def _import_pygame() -> ModuleType:
             warnings.simplefilter("ignore")
             import pygame
     except ImportError as error:
-        raise ImportError("a window needs pygame: pip install sb3-saf[render]") from error
+        raise ImportError("a window needs pygame: pip install -e '.[render]'") from error
     return pygame
 
 

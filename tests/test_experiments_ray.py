@@ -137,5 +137,5 @@ def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys:
     assert cli.main(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)]) == 2
     assert capsys.readouterr().err == (
         "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install "
-        "'sb3-saf[ray]', or leave --ray out to run in processes of this machine\n"
+        "-e '.[ray]', or leave --ray out to run in processes of this machine\n"
     )

@@ -308,10 +308,10 @@ def test_time_bar_grows_with_the_steps(step: int, share: float) -> None:
 
 def test_missing_libraries_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(ImportError, match=r"^drawing games needs Pillow: pip install sb3-saf\[render\]$"):
+    with pytest.raises(ImportError, match=r"^drawing games needs Pillow: pip install -e '.\[render\]'$"):
         rendering._pillow()
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ImportError, match=r"^a window needs pygame: pip install sb3-saf\[render\]$"):
+    with pytest.raises(ImportError, match=r"^a window needs pygame: pip install -e '.\[render\]'$"):
         HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))
 
 

@@ -42,7 +42,7 @@ class Graph:
         try:
             import onnxruntime  # noqa: F401
         except ImportError as error:
-            raise ImportError('runtime="onnx" needs onnxruntime: pip install "sb3-saf[export]"') from error
+            raise ImportError("runtime='onnx' needs onnxruntime: pip install -e '.[export]'") from error
         if ONNX_FILE not in manifest.files:
             raise ExportError(f'{folder} was exported without {ONNX_FILE}; load it with runtime="torch"')
         data = read_checked(folder / ONNX_FILE, manifest.files[ONNX_FILE])

@@ -118,7 +118,7 @@ def onnx_bytes(
         import onnxscript  # noqa: F401 - torch's exporter is built on it
     except ImportError as error:
         raise ImportError(
-            'writing ONNX needs onnx, onnxscript and onnxruntime: pip install "sb3-saf[export]", or pass onnx=False'
+            "writing ONNX needs onnx, onnxscript and onnxruntime: pip install -e '.[export]', or pass onnx=False"
         ) from error
     deciding = DecidingNetwork(network, space, selection).requires_grad_(False).eval()
     inputs = inputs | _more_inputs(network, space, selection, inputs, has_masks)

@@ -69,7 +69,7 @@ def export_actors(
     :param model: an algorithm with a SAF, MAPPO or IPPO policy, also recurrent or maskable; QPLEX without memory; or
         the policy itself
     :param folder: where to
-    :param onnx: whether to write ``actor.onnx`` and ``act.py``, which needs ``pip install "sb3-saf[export]"``
+    :param onnx: whether to write ``actor.onnx`` and ``act.py``, which needs ``pip install -e '.[export]'``
     :param overwrite: whether to replace a folder that is not an export, with everything in it
     :return: the folder
     :raises ExportError: if the model has no such actor, the folder must not be replaced, or the exported network does

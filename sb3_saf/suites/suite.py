@@ -74,8 +74,8 @@ class Suite:
 
     @property
     def pip_line(self) -> str:
-        """The command that installs the suite."""
-        return f"pip install 'sb3-saf[{self.extra}]'"
+        """The command that installs the suite, in a clone of this repository."""
+        return f"pip install -e '.[{self.extra}]'"
 
     def installed_version(self) -> str | None:
         """Return the version of the suite's own package, None if it is not installed."""
