@@ -454,7 +454,7 @@ def test_bad_environments() -> None:
         make_model(ToyTeams(action_space=spaces.Discrete(3, start=1)))
     with pytest.raises(ValueError, match="VecNormalize"):
         make_model(VecNormalize(toy_env(), norm_obs=False))
-    with pytest.raises(ValueError, match="unknown"):
+    with pytest.raises(ValueError, match="expected one of QPLEX's policies"):
         make_model(policy="QPLEXPolice")
 
 
