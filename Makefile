@@ -76,8 +76,8 @@ $(TRAINING): setup.cfg pyproject.toml constraints.txt
 	@touch $@
 
 $(INSTALLED): $(TRAINING)
-	@echo "== install the rest into $(VENV): tests, types, documentation, notebooks, Ray"
-	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[export,render,zoo,ray,docs,notebooks,dev]'
+	@echo "== install the rest into $(VENV): tests, types, documentation, notebooks, Ray, games of others"
+	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[dev,docs,export,lbf,mpe,notebooks,ray,render,rware,sisl,zoo]'
 	@touch $@
 
 # What cannot be installed is left out of the benchmarks, which say so.

@@ -92,6 +92,7 @@ def test_a_run_that_is_resumed_in_a_later_stage_equals_an_undisturbed_one(tmp_pa
 
 
 def test_any_environment_has_stages() -> None:
+    pytest.importorskip("mpe2")
     make = find_environment("mpe2.simple_spread_v3").make
     assert make is not None
     env = make_team_env(make, 2, max_cycles=6, local_ratio=0.0, curriculum=[Stage(8, {"local_ratio": 1.0})])
