@@ -79,7 +79,8 @@ def _copy_pages() -> None:
     tutorials = ROOT / "docs" / "tutorials"
     tutorials.mkdir(exist_ok=True)
     for source in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        shutil.copyfile(source, tutorials / source.name)
+        notebook = source.read_text(encoding="utf-8").replace("../docs/", "../")
+        (tutorials / source.name).write_text(notebook, encoding="utf-8")
     shutil.copyfile(ROOT / "notebooks" / "README.md", tutorials / "README.md")
     shutil.copyfile(ROOT / "CHANGELOG.md", ROOT / "docs" / "changelog.md")
 

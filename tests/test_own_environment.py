@@ -123,15 +123,6 @@ def test_sb3s_own_buffer_warns_once_and_names_the_remedy() -> None:
     assert sum("ppo_settings" in str(warning.message) for warning in told) == 1
 
 
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
-def test_a_batch_of_no_whole_teams_is_refused_before_the_first_rollout() -> None:
-    env = make_team_env(CounterEnv, n_envs=2, seed=0)
-    model = PPO("IPPOPolicy", env, n_steps=8, batch_size=15, rollout_buffer_class=TeamRolloutBuffer, device="cpu")
-    with pytest.raises(ValueError, match=r"must be a multiple of n_agents=2, .*, got 15; use batch_size=14 or 16"):
-        model.learn(16, GameStepsCallback())
-    assert model.num_timesteps == 0
-
-
 @pytest.mark.parametrize("policy", ["SAF", "MAPPO", "IPPO"])
 @pytest.mark.parametrize("overrides", [{}, {"n_steps": 7, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}])
 def test_good_settings_train_any_team(policy: str, overrides: dict[str, Any]) -> None:

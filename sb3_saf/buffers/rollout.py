@@ -129,8 +129,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
       of action, reward, value and so on, where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Arrays are made
       once and reused by all rollouts.
     - **Minibatches** hold whole teams, agents in index order (:class:`TeamMinibatch`), so no
-      team is encoded in two minibatches, and critics need not look for it. ``batch_size`` counts rows and must be a
-      multiple of N; the last minibatch may be smaller.
+      team is encoded in two minibatches, and critics need not look for it. ``batch_size`` counts rows and is rounded
+      down to whole teams, at least one: SB3's default of 64 is 60 for 5 agents. The last minibatch may be smaller.
     - **Advantages** are SB3's, computed by its code.
     - **Value normalisation**: minibatches carry the returns of the rollout to a policy with ``normalize_values=True``;
       advantages and :attr:`values` are those of the rollout.
@@ -318,16 +318,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         Go through the rollout once, in an order of teams drawn anew.
 
-        :param batch_size: rows per minibatch, a multiple of N; None for all. Where agents take no part, rows are fewer
+        :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all. Where agents
+            take no part, rows are fewer
         :return: minibatches of whole teams: rows of one team are consecutive and in index order
-        :raises ValueError: if the buffer is not full, N does not divide ``batch_size``, or nobody ever took part
+        :raises ValueError: if the buffer is not full, or nobody ever took part
         """
         if not self.full:
             raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
         teams_per_batch = self.buffer_size * self.n_games
         if batch_size is not None:
-            self.check_batch_size(batch_size)
-            teams_per_batch = batch_size // self.n_agents
+            teams_per_batch = max(1, batch_size // self.n_agents)
         teams = self._playing_teams()
         # SB3 seeds NumPy's global generator, and no other, from the run's seed.
         order = teams[np.random.permutation(len(teams))]  # noqa: NPY002
@@ -345,27 +345,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 f"is nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or collect longer rollouts"
             )
         return playing
-
-    def check_batch_size(self, batch_size: int) -> None:
-        """
-        Check that minibatches can hold whole teams.
-
-        :param batch_size: rows per minibatch
-        :raises ValueError: if N does not divide it, with the nearest sizes that do
-        """
-        if batch_size < 1 or batch_size % self.n_agents:
-            raise ValueError(
-                f"batch_size counts rows and must be a multiple of n_agents={self.n_agents}, because TeamRolloutBuffer "
-                f"gives whole teams, got {batch_size}; use batch_size={self._nearest_batch_sizes(batch_size)}"
-            )
-
-    def _nearest_batch_sizes(self, batch_size: int) -> str:
-        """What somebody may have meant."""
-        rollout = self.buffer_size * self.n_games * self.n_agents
-        if batch_size > rollout:
-            return f"{rollout}, the whole rollout (n_steps={self.buffer_size} x {self.n_games} games x {self.n_agents})"
-        below = max(batch_size // self.n_agents, 0) * self.n_agents
-        return " or ".join(str(size) for size in (below, below + self.n_agents) if size > 0)
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None

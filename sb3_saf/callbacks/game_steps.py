@@ -12,7 +12,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
-from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.teams import TEAM_KEY, TEAM_KEYS, find_n_agents
 from sb3_saf.policies.rows import TeamRowsPolicy
 
@@ -40,11 +39,7 @@ def check_training(model: BaseAlgorithm) -> None:
     could act on its own observation: a warning says so. It may go on, as the policy of one learner that sees all.
 
     :param model: any algorithm on any environment
-    :raises ValueError: if minibatches cannot hold whole teams, with batch sizes that can
     """
-    buffer, batch_size = getattr(model, "rollout_buffer", None), getattr(model, "batch_size", None)
-    if isinstance(buffer, TeamRolloutBuffer) and batch_size is not None:
-        buffer.check_batch_size(batch_size)
     entries = getattr(model.observation_space, "spaces", {})
     extractor = getattr(model.policy, "features_extractor", None)
     if set(TEAM_KEYS) <= set(entries) and isinstance(extractor, CombinedExtractor):

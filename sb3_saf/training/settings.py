@@ -18,7 +18,6 @@ from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.make import make_team_env
 from sb3_saf.envs.team_reward import TeamReward
@@ -344,7 +343,6 @@ def _build(
     if own["n_minibatches"] is not None:
         n_minibatches = resolve("n_minibatches", own["n_minibatches"], int)
         plain["batch_size"] = _teams(spec, plain, n_minibatches, n_envs) * n_agents
-    _check_batch_size(plain.get("batch_size"), n_agents, plain.get("rollout_buffer_class"))
     hints = algorithm_arguments(spec.algorithm)
     hyperparams = {key: resolve(key, value, hints[key]) for key, value in plain.items()}
     if own["policy_kwargs"]:
@@ -380,17 +378,6 @@ def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_
     if n_steps is None:
         raise ValueError(f"n_minibatches divides a rollout, which needs n_steps; {spec.algorithm.__name__} has none")
     return -(-int(resolve("n_steps", n_steps, int)) * n_envs // n_minibatches)
-
-
-def _check_batch_size(batch_size: object, n_agents: int, buffer: object) -> None:
-    """Check that minibatches are whole teams, which the team buffer would say only after the first rollout."""
-    if buffer != TeamRolloutBuffer.__name__ or batch_size is None:
-        return
-    if resolve("batch_size", batch_size, int) % n_agents:
-        raise ValueError(
-            f"batch_size counts rows and must be a multiple of n_agents={n_agents}, got {batch_size}; n_minibatches "
-            "says how many parts a rollout is divided into instead"
-        )
 
 
 def _resolved_policy_kwargs(spec: AlgorithmSpec, given: Mapping[str, Any]) -> dict[str, Any]:
