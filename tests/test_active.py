@@ -209,9 +209,9 @@ def fill(buffers: list[Any], env: CentralizedValueWrapper, n_steps: int, zero_va
     return np.array(active), np.array(values)
 
 
-def make_buffer(env: CentralizedValueWrapper, n_steps: int, kind: Any = TeamRolloutBuffer) -> Any:
+def make_buffer(env: CentralizedValueWrapper, n_steps: int, kind: Any = TeamRolloutBuffer, **kwargs: Any) -> Any:
     space, n_rows = env.observation_space, env.num_envs
-    return kind(n_steps, space, env.action_space, device="cpu", gae_lambda=0.9, gamma=0.97, n_envs=n_rows)
+    return kind(n_steps, space, env.action_space, device="cpu", gae_lambda=0.9, gamma=0.97, n_envs=n_rows, **kwargs)
 
 
 @pytest.mark.parametrize("n_steps", [3, 5, 8, 13])
@@ -232,6 +232,30 @@ def test_advantages_end_with_the_agent(n_steps: int) -> None:
                 advantage = sum((0.97 * 0.9) ** (j - k) * errors[j] for j in range(k, len(life)))
                 assert buffer.advantages[t, row] == pytest.approx(advantage, rel=1e-4, abs=1e-4)
                 assert buffer.returns[t, row] == pytest.approx(advantage + values[t, row], rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("n_steps", [3, 8, 13])
+def test_returns_of_the_dead_go_on_where_their_team_is_paid(n_steps: int) -> None:
+    """With one reward and one value for all of a team, advantages are those of agents that never end."""
+    env = telling_env()
+    team, immortal = (make_buffer(env, n_steps, ends="team") for _ in range(2))
+    fill([team, immortal], env, n_steps, zero_values=True)
+    rng = np.random.default_rng(1)
+    active, after = team.active.copy(), np.array(ACTIVE[n_steps % 5])
+    shape = (n_steps, 2, 1)
+    values, rewards, last = rng.normal(size=shape), rng.normal(size=shape), rng.normal(size=(2, 1))
+    for buffer, playing, then in ((team, active, after), (immortal, np.ones_like(active), np.ones_like(after))):
+        buffer.active = playing
+        buffer.values = (values * playing).reshape(n_steps, -1).astype(np.float32)
+        buffer.rewards = np.broadcast_to(rewards, active.shape).reshape(n_steps, -1).astype(np.float32)
+        last_values = th.tensor((last * then).reshape(-1), dtype=th.float32)
+        buffer.compute_returns_and_advantage(last_values, np.zeros(env.num_envs))
+    rows = active.reshape(n_steps, -1) == 1
+    assert not rows.all()
+    np.testing.assert_allclose(team.advantages[rows], immortal.advantages[rows], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(team.returns[rows], immortal.returns[rows], rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match="ends must be 'own' or 'team', got 'all'"):
+        make_buffer(env, n_steps, ends="all")
 
 
 def test_minibatches_leave_out_who_takes_no_part_and_keep_the_rest() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,14 @@ import numpy.typing as npt
 import pytest
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 
 from hecogrid_envs.core.rng import game_seeds
-from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env, resumable_learn
+from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.checkpoints.data import read_tree, write_tree
 from sb3_saf.checkpoints.environments import check_environment_state, environment_state, load_environment_state
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.suites.registry import find_task, suites
+from sb3_saf.training.settings import load_settings
 
 Array = npt.NDArray[Any]
 
@@ -172,36 +170,20 @@ def test_the_kitchen() -> None:
         rows_of("jaxmarl/MPE_simple_spread_v3", 1, reward_shaping=1.0)
 
 
-class Strike(BaseCallback):
-    """Ends the training in the middle of a rollout, as a crash would."""
-
-    def __init__(self, at: int = -1) -> None:
-        super().__init__()
-        self.at = at
-
-    def _on_step(self) -> bool:
-        if self.n_calls == self.at:
-            raise RuntimeError
-        return True
-
-
-def _riddle(folder: Path) -> PPO:
-    env = make_team_env("jaxmarl/switch_riddle", n_envs=2, seed=5, monitor_dir=str(folder))
-    return PPO("MAPPOPolicy", env, n_steps=8, batch_size=24, n_epochs=2, rollout_buffer_class=TeamRolloutBuffer, seed=5)
-
-
 @needs_jaxmarl
-def test_a_run_that_was_struck_ends_as_the_undisturbed_one(tmp_path: Path) -> None:
-    def learn(folder: str, at: int = -1) -> BaseAlgorithm:
-        path = tmp_path / folder
-        return resumable_learn(_riddle(path), 240, path, [Strike(at)], every_game_steps=1)
-
-    whole = learn("a")
-    with pytest.raises(RuntimeError):
-        learn("b", at=21)
-    again = learn("b")
-    for name, weights in whole.policy.state_dict().items():
-        assert th.equal(weights, again.policy.state_dict()[name]), name
+def test_soups_alone_are_evaluated() -> None:
+    """A cook puts onions into the pot, which only training pays: 3 for each, with this weight."""
+    shaped = {"reward_shaping": 1.0, "reward_shaping_steps": 1_000_000, "max_steps": 11}
+    settings = load_settings("ippo", "overcooked/cramped_room", "smoke", env_kwargs=shaped)
+    left, right, up, interact = 3, 2, 0, 5
+    gained = []
+    for evaluation in (False, True):
+        env = settings.make_env(0, evaluation=evaluation, n_envs=2)
+        env.reset()
+        steps = [env.step(np.array([action, 4] * 2))[1] for action in (left, interact, right, up, interact)]
+        gained.append(np.sum(steps, axis=0))
+        assert env.step(np.array([4, 4] * 2))[2].tolist() == [False] * 4, "max_steps holds for both"
+    np.testing.assert_allclose(gained, [[3, 0, 3, 0], [0, 0, 0, 0]], rtol=1e-4)
 
 
 @needs_jaxmarl

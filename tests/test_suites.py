@@ -15,8 +15,19 @@ from gymnasium import spaces
 from gymnasium.spaces import Discrete
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf import RandomPolicy, SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import (
+    Actor,
+    RandomPolicy,
+    SAFMaskablePolicy,
+    TeamRolloutBuffer,
+    evaluate_team,
+    export_actors,
+    inspect_team,
+    make_team_env,
+    resumable_learn,
+)
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
 from sb3_saf.envs.space_reader import PartsSpace
 from sb3_saf.envs.team_game import EqualSpaces
@@ -150,6 +161,54 @@ def test_seeds_decide_what_happens(env_id: str) -> None:
         for key, value in step.items():
             np.testing.assert_array_equal(value, same[key], err_msg=key)
     assert any((step["obs"] != different["obs"]).any() for step, different in zip(first, other, strict=True))
+
+
+class Strike(BaseCallback):
+    """Ends the training in the middle of a rollout, as a crash would."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.at = at
+
+    def _on_step(self) -> bool:
+        if self.n_calls == self.at:
+            raise RuntimeError("struck")
+        return True
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        pytest.param("lbf/Foraging-5x5-2p-1f-v3", marks=_needs("lbf")),
+        pytest.param("jaxmarl/switch_riddle", marks=_needs("jaxmarl")),
+    ],
+)
+def test_a_struck_run_goes_on_bit_for_bit_and_its_team_is_exported_and_inspected(env_id: str, tmp_path: Path) -> None:
+    def learn(folder: str, at: int = -1) -> Any:
+        env = make_team_env(env_id, n_envs=2, seed=5, monitor_dir=str(tmp_path / folder))
+        kwargs: dict[str, Any] = {"n_steps": 8, "n_epochs": 2, "rollout_buffer_class": TeamRolloutBuffer}
+        model = PPO("SAFPolicy", env, batch_size=8 * env.n_agents, seed=5, **kwargs)
+        return resumable_learn(
+            model, 80 * env.n_agents, tmp_path / folder, [Strike(at)], every_game_steps=1, trust_games=True
+        )
+
+    whole = learn("a")
+    with pytest.raises(RuntimeError, match="struck"):
+        learn("b", at=21)
+    again = learn("b")
+    for name, weights in whole.policy.state_dict().items():
+        assert th.equal(weights, again.policy.state_dict()[name]), name
+    assert (tmp_path / "a" / "monitor.csv").read_text().splitlines()[1:]
+
+    export_actors(whole, tmp_path / "actor", onnx=False)
+    env = make_team_env(env_id, n_envs=2, seed=7)
+    rows: Any = env.reset()
+    own = [rows["obs"][row] for row in range(env.n_agents)]
+    acted = [Actor.load(tmp_path / "actor", agent=i).act(own[i]) for i in range(env.n_agents)]
+    np.testing.assert_array_equal(acted, whole.predict(rows, deterministic=True)[0][: env.n_agents])
+
+    look = inspect_team(whole, env, 2, pictures=False)
+    assert look.scalars and np.isfinite([value for value in look.scalars.values() if value is not None]).all()
 
 
 @_needs("magent")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, ItemsView
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,9 @@ from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
 #: Arrays with one entry per step and row, beside the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
 
+
+#: Where the return of an agent ends.
+Ends = Literal["own", "team"]
 
 #: Rows whose values are computed at once: enough to outweigh the calls, few enough for the cache.
 _ROWS_AT_ONCE: Final = 1024
@@ -136,7 +139,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
       advantages and :attr:`values` are those of the rollout.
     - **Agents that take no part** (``"active"``, where observations have it): minibatches leave their rows out, so that
       loss, entropy and the normalisation of advantages see active rows only; ``batch_size`` is then an upper bound. An
-      agent's own end is the end of its return, see :meth:`compute_returns_and_advantage`.
+      agent's own end is the end of its return unless ``ends="team"``, see :meth:`compute_returns_and_advantage`.
     - ``"action_mask"`` is stored for each row, ``"state"`` once per game.
     - Rows that are not whole teams in index order are refused when they are added.
 
@@ -149,7 +152,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     :param gae_lambda: trade-off of bias and variance of the advantages, 1 for Monte-Carlo
     :param gamma: discount factor
     :param n_envs: B, rows
-    :raises ValueError: if the space is not that of teams or the rows are no whole teams
+    :param ends: whether an agent's return ends with its own part in the episode, or, ``"team"``, with its team's
+        episode. The latter is for agents that go on to be paid the team's reward after their own end
+        (``make_team_env(..., team_reward="sum")``): a victory then counts for those who died for it
+    :raises ValueError: if the space is not that of teams, the rows are no whole teams, or ``ends`` is another word
     """
 
     def __init__(
@@ -161,7 +167,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         gae_lambda: float = 1,
         gamma: float = 0.99,
         n_envs: int = 1,
+        ends: Ends = "own",
     ) -> None:
+        if ends not in get_args(Ends):
+            raise ValueError(f"ends must be {' or '.join(map(repr, get_args(Ends)))}, got {ends!r}")
+        self.ends = ends
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
         self.n_agents = self.team_spaces.n_agents
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
@@ -268,6 +278,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         V_T ``last_values``: the policies of this package give zero to agents that take no part, which stands for c_T.
         Advantages of rows that take no part are never read.
 
+        With ``ends="team"``, m_t = 1 - b_{t+1}, and V of an agent that takes no part is the mean of V over those of its
+        team that do: the team's reward is the same for all of them.
+
         :param last_values: (B,) or (B, 1) values after the last step
         :param dones: (B,) whether an episode ended with the last step
         """
@@ -276,12 +289,25 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             super().compute_returns_and_advantage(last_values, dones)
             self._returns = RolloutReturns(self.returns)
             return
-        starts = self.episode_starts
         idle = self.active.reshape(self.buffer_size, self.n_envs) == 0
-        self.episode_starts = np.where(idle, np.float32(1), starts)
-        super().compute_returns_and_advantage(last_values, dones)
-        self.episode_starts = starts
+        if self.ends == "team":
+            self.values = self._with_values_of_teams(self.values, ~idle)
+            last = last_values.reshape(-1).cpu().numpy()
+            last_values = th.from_numpy(self._with_values_of_teams(last, last != 0))
+            super().compute_returns_and_advantage(last_values, dones)
+        else:
+            starts = self.episode_starts
+            self.episode_starts = np.where(idle, np.float32(1), starts)
+            super().compute_returns_and_advantage(last_values, dones)
+            self.episode_starts = starts
         self._returns = RolloutReturns(self.returns[~idle])
+
+    def _with_values_of_teams(self, values: Array, active: npt.NDArray[np.bool_]) -> Array:
+        """(..., B) values; those of agents that take no part become the mean of their team's others."""
+        by_team, playing = (array.reshape(-1, self.n_agents) for array in (values, active))
+        total = np.where(playing, by_team, 0).sum(axis=1, keepdims=True)
+        mean = total / playing.sum(axis=1, keepdims=True).clip(min=1)
+        return np.where(playing, by_team, mean).astype(values.dtype).reshape(values.shape)
 
     def _check_rows(self, obs: dict[str, Array]) -> None:
         own, team, agents = (np.asarray(obs[key]) for key in (OBS_KEY, TEAM_KEY, AGENT_KEY))

@@ -3,7 +3,7 @@ Overcooked on JAX: ``overcooked/cramped_room``.
 
 Both cooks are given the team's reward, 20 for a soup that is served. ``reward_shaping`` adds as many times JaxMARL's
 rewards for steps on the way to it, to those who take them; ``reward_shaping_steps`` are the game steps, summed over
-games, in which that falls to nothing.
+games, in which that falls to nothing. Evaluation counts soups alone.
 """
 
 from __future__ import annotations
@@ -35,4 +35,5 @@ SUITE: Final = Suite(
     examples=("cramped_room",),
     vec_env=_games,
     team_return="mean",
+    training_params=("reward_shaping", "reward_shaping_steps"),
 )

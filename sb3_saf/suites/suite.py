@@ -39,6 +39,8 @@ class Suite:
     :param team_return: the suite's own unit of an episode's return: the sum over agents of their rewards, or the mean
         (where every agent is given the team's whole reward)
     :param team_reward: what agents are given to learn from, see ``make_team_env``
+    :param training_params: parameters of the games that only training is given, such as rewards on the way to what
+        counts: evaluation measures the task itself
     :param has_state: whether ``state=True`` can be asked for
     :param is_seeded: whether seeds decide what happens in its games
     :param module: of the package, where it may be a folder of sources on ``PYTHONPATH`` instead of an installed package
@@ -57,6 +59,7 @@ class Suite:
     competitive: tuple[str, ...] = ()
     team_return: Reduction = "sum"
     team_reward: Literal["given"] | Reduction = "given"
+    training_params: tuple[str, ...] = ()
     has_state: bool = False
     is_seeded: bool = True
     module: str | None = None

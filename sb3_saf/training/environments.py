@@ -60,6 +60,11 @@ class TeamEnvironment:
         return ("default", HECOGRID, self.id) if self.task else ("default", self.id)
 
     @property
+    def training_params(self) -> tuple[str, ...]:
+        """Parameters of the games that only training is given."""
+        return () if self.suite_task is None else self.suite_task.suite.training_params
+
+    @property
     def folder_name(self) -> str:
         """The id as a part of file names."""
         return folder_name(self.id)

@@ -126,6 +126,8 @@ class Settings:
         :param render_mode: how games can be drawn; None for not at all
         """
         task, params = self.environment.task, dict(self.env_kwargs)
+        if evaluation:
+            params = {key: value for key, value in params.items() if key not in self.environment.training_params}
         source: Any = task
         if self.environment.suite_task is not None and not wraps_games(self.wrapping):
             source = self.env_id
