@@ -2,10 +2,11 @@
 Run the tests with the oldest or the newest releases that setup.cfg allows.
 
 ``python .ci/versions.py oldest`` and ``python .ci/versions.py newest`` make a virtual environment of their own under
-``build/`` (or ``--folder``) and install the package there with the six libraries that it extends at one end of their
-ranges; everything else, torch included, is as in constraints.txt where that fits. They print the versions and run the
-tests, with ``--fast`` only those that touch the libraries most (``FAST``). Further arguments go to pytest:
-``python .ci/versions.py oldest -x -k policies``.
+``build/`` (or ``--folder``) and install the package there with the libraries that it stands on (``LIBRARIES``) at one
+end of their ranges; everything else is as in constraints.txt. They print the versions and run the tests, with
+``--fast`` only those that touch the libraries most (``FAST``). Further arguments go to pytest::
+
+    python .ci/versions.py oldest --python python3.10 -x -k policies
 """
 
 from __future__ import annotations
@@ -20,9 +21,14 @@ from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 #: The libraries whose releases differ between the two ends.
-LIBRARIES: Final = ("gymnasium", "numba", "pettingzoo", "sb3-contrib", "stable-baselines3", "supersuit")
+LIBRARIES: Final = (
+    *("gymnasium", "numba", "numpy", "pettingzoo", "sb3-contrib", "stable-baselines3", "supersuit", "torch"),
+)
 #: What follows from that choice, and so is not pinned.
-FOLLOWING: Final = ("huggingface-hub", "huggingface-sb3", "llvmlite", "numpy", "rl-zoo3", "shimmy")
+FOLLOWING: Final = (
+    *("huggingface-hub", "huggingface-sb3", "llvmlite", "ml-dtypes", "rl-zoo3", "scipy", "setuptools", "shimmy"),
+    *("sympy", "triton"),
+)
 #: Tests of what is built on the libraries: kernels, vector environments, policies, buffers, checkpoints, old files.
 FAST: Final = tuple(
     f"tests/test_{name}.py"
@@ -69,15 +75,16 @@ def constraints() -> str:
     return "\n".join(kept) + "\n"
 
 
-def install(end: str, folder: Path) -> Path:
+def install(end: str, folder: Path, interpreter: str) -> Path:
     """
     Install into a virtual environment.
 
     :param end: ``"oldest"`` or ``"newest"``
     :param folder: of the environment
+    :param interpreter: that it is made with
     :return: its Python
     """
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    subprocess.run([interpreter, "-m", "venv", folder], check=True)
     python = folder / "bin" / "python"
     pins = folder / "constraints.txt"
     pins.write_text(constraints(), encoding="utf-8")
@@ -104,14 +111,16 @@ def main() -> None:
     """Install, print versions, test."""
     parser = argparse.ArgumentParser(prog="python .ci/versions.py", description=__doc__)
     parser.add_argument("end", choices=["oldest", "newest"])
+    parser.add_argument("--python", default=sys.executable, help="interpreter, this one by default")
     parser.add_argument("--folder", type=Path, help="of the virtual environment")
     parser.add_argument("--fast", action="store_true", help="only the tests that touch the libraries most")
     options, pytest_arguments = parser.parse_known_args()
     folder = options.folder or ROOT / "build" / f"venv-{options.end}"
-    python = install(options.end, folder)
+    python = install(options.end, folder, options.python)
     listing: list[str | Path] = [python, "-m", "pip", "list", "--format=freeze"]
     listed = subprocess.run(listing, capture_output=True, text=True, check=True)
-    names = {*LIBRARIES, *FOLLOWING, "torch"}
+    names = {*LIBRARIES, *FOLLOWING}
+    print(subprocess.run([python, "--version"], capture_output=True, text=True, check=True).stdout.strip())
     print(*(line for line in listed.stdout.splitlines() if line.partition("==")[0].lower() in names), sep="\n")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba")}
     tests: list[str | Path] = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope"]

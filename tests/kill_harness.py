@@ -171,8 +171,9 @@ def train(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) ->
 
 
 def start(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) -> BaseProcess:
-    """Start the run in a process of its own, which has all imports already."""
-    process = mp.get_context("fork").Process(target=train, args=(algo, games, folder, rollouts, watch))
+    """Start the run in a process of its own, which has all imports already where it is forked."""
+    context = mp.get_context(games.start_method)
+    process = context.Process(target=train, args=(algo, games, folder, rollouts, watch))  # type: ignore[attr-defined]
     process.start()
     return process
 
@@ -290,7 +291,8 @@ def main() -> None:
     if options.train is not None:
         train(options.algo, games, options.train, options.rollouts, Watch())
         return
-    make_run(options.algo, None, games).warm_up()  # before the forks: they inherit what is compiled
+    if games.start_method == "fork":
+        make_run(options.algo, None, games).warm_up()  # they inherit what is compiled
     if options.at:
         moments = [Moment(kind, int(number)) for kind, number in (text.split(":") for text in options.at)]
         doing, is_equal = kill_in_a_row(options.algo, games, options.rollouts, moments)

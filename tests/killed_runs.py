@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -72,11 +72,18 @@ class Games(NamedTuple):
     name: str = "hecogrid"
     n_cpus: int = 1
 
+    @property
+    def start_method(self) -> Literal["fork", "spawn"]:
+        """How a process of a run is started: JAX's threads do not survive a fork."""
+        return "spawn" if self.name == "jax" else "fork"
+
     def make(self, n_games: int, seed: int, monitor_dir: str | None = None) -> sb3_saf.CentralizedValueWrapper:
         """Make parallel games."""
         if self.name == "hecogrid":
             return sb3_saf.make_team_env("TeamTogether", n_games, seed=seed, monitor_dir=monitor_dir, **_TASK)
         make, n_cpus = GAMES[self.name], self.n_cpus
+        if self.name == "jax":
+            return sb3_saf.make_team_env(make, n_games, seed=seed, monitor_dir=monitor_dir, max_steps=19)
         return sb3_saf.make_team_env(make, n_games, seed=seed, monitor_dir=monitor_dir, n_cpus=n_cpus)
 
 
@@ -94,8 +101,14 @@ def _lazy() -> Any:
     return LazyEnv(n_agents=N_AGENTS, max_cycles=20)
 
 
-#: Games of N_AGENTS agents: this package's; MPE's and SISL's; one that makes its generator late.
-GAMES: Final = {"hecogrid": None, "spread": _spread, "pursuit": _pursuit, "lazy": _lazy}
+#: Games of N_AGENTS agents: this package's; MPE's and SISL's; one that makes its generator late; JaxMARL's, in a batch.
+GAMES: Final[dict[str, Any]] = {
+    "hecogrid": None,
+    "spread": _spread,
+    "pursuit": _pursuit,
+    "lazy": _lazy,
+    "jax": "jaxmarl/MPE_simple_spread_v3",
+}
 
 
 def make_run(algo: str, folder: Path | None, games: Games = Games()) -> Run:  # noqa: B008 - it is a tuple

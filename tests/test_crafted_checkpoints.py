@@ -176,15 +176,20 @@ EXTREMES = (
 
 
 def mutate_array(array: Any, rng: random.Random) -> Any:
-    """Other values, another shape, another dtype."""
+    """Other values, another shape, another dtype; sometimes one value less or more, or two exchanged."""
     array = np.array(array)
-    how = rng.randrange(5)
+    how = rng.randrange(7)
     if how == 0:
         return array.reshape(-1)[: rng.randrange(array.size + 1)].copy()
     if how == 1:
         return array.astype(rng.choice([np.int8, np.float64, np.uint64, np.int32, np.bool_]))
     if how == 2:
         return np.concatenate([array.reshape(-1)] * 3)
+    if how > 4 and array.size and array.dtype.kind in "iuf":
+        one, other = (rng.randrange(array.size) for _ in range(2))
+        values = array.reshape(-1)
+        values[[one, other]] = values[[other, one]] if how == 5 else values[[one, other]] + rng.choice([-1, 1])
+        return array
     if array.dtype.kind == "f":
         extreme = rng.choice([np.nan, np.inf, -np.inf, 1e30, -1.0])
     else:
@@ -210,7 +215,7 @@ def mutate(tree: Any, rng: random.Random) -> None:
         owner[key] = mutate_array(value, rng)
     elif rng.random() < 0.2:
         other, name = rng.choice(found)
-        owner[key] = copy.deepcopy(other[name]) if name in other or isinstance(other, list) else None
+        owner[key] = copy.deepcopy(other[name])
     else:
         owner[key] = rng.choice(EXTREMES)
 

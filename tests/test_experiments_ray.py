@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from sb3_saf.experiments import cli
@@ -19,7 +21,8 @@ from sb3_saf.experiments.files import unpack
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
-from tests.experiments_jobs import InlineEngine, read_table
+from tests.experiments_jobs import InlineEngine, read_table, wait_until
+from tests.test_experiments_run import assert_same_weights
 
 CHOICE = Selection((0,), ("ippo", "mappo"))
 SMOKE = RunConfig("smoke")
@@ -98,11 +101,61 @@ def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any,
     assert (tmp_path / "ray/cells/TeamSupport-c2-h2/mappo/seed-0/model.zip").exists()
 
 
+#: Starts Ray as ``--ray`` does, and prints the addresses at which its processes listen.
+LISTENING = """
+import psutil
+from sb3_saf.experiments.engines import RayEngine
+
+with RayEngine(workers=1):
+    processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    numbers = {process.pid for process in processes}
+    sockets = [socket for socket in psutil.net_connections("inet") if socket.pid in numbers]
+print(*{socket.laddr.ip for socket in sockets if socket.status == psutil.CONN_LISTEN})
+"""
+
+
+def test_ray_on_this_machine_listens_on_localhost_only() -> None:
+    pytest.importorskip("ray")
+    result = subprocess.run([sys.executable, "-c", LISTENING], capture_output=True, text=True, check=True, timeout=200)
+    addresses = result.stdout.split()
+    assert addresses
+    assert all(address.rpartition(":")[2].startswith("127.") or address == "::1" for address in addresses), addresses
+
+
 def test_a_job_fails_on_ray(cluster: Any, tmp_path: Path) -> None:
     (tmp_path / "job.json").write_text("[]")
     with RayEngine(cluster.address) as engine:
         error = engine.submit(tmp_path).exception(timeout=200)
     assert "job.json holds no JSON object" in str(error).splitlines()[-1]
+
+
+def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any, tmp_path: Path) -> None:
+    experiment = find_experiment("joint")
+    (level, *_) = experiment.tests()
+    job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 2_000}))
+    whole, killed = (tmp_path / name for name in ("whole", "killed"))
+    for folder in (whole, killed):
+        folder.mkdir()
+        job.write(folder)
+    run_job(whole)
+    with RayEngine(cluster.address) as engine:
+        first = engine.submit(killed)
+        wait_until((killed / "training" / "monitor.csv").exists)
+        before = set(killed.glob("training/checkpoints/*.ckpt"))
+        wait_until(lambda: set(killed.glob("training/checkpoints/*.ckpt")) - before)
+        for process in psutil.process_iter(["name"]):
+            if process.name().startswith("ray::_run_on_ray"):
+                process.kill()
+        assert "died" in str(first.exception(timeout=200))
+        begun = began(killed)
+        engine.submit(killed).result(timeout=200)
+    assert began(killed) == begun
+    assert_same_weights(whole / "result" / "model.zip", killed / "result" / "model.zip")
+
+
+def began(folder: Path) -> str:
+    """Return the line of monitor.csv that has the time of the first start."""
+    return (folder / "training" / "monitor.csv").read_text().splitlines()[0]
 
 
 @pytest.mark.parametrize("is_shared", [True, False])

@@ -604,6 +604,10 @@ def test_malformed_observations_are_refused() -> None:
         policy.predict(obs | {"agent": obs["agent"] + 1})
     with pytest.raises(ValueError, match=r"as many rows under each key of an observation, got 'obs' 12, 'agent' 1"):
         policy.predict({"obs": obs["obs"], "agent": np.array(1)})
+    with pytest.raises(ValueError, match=r"'obs' must be finite, got nan"):
+        policy.predict(obs["obs"] * np.float32(np.nan))
+    with pytest.raises(ValueError, match=r"'obs' must be tile codes in 0..19, got 255"):
+        make_policy(SAFPolicy, CodeSpace()).predict(np.full((3, 3), 255, dtype=np.uint8))
     with pytest.raises(ValueError, match=r"Unexpected observation shape"):
         policy.predict(obs["obs"][:, :3])
     with pytest.raises(ValueError, match=r"to have 'team', which the critic reads, got 'obs'"):

@@ -317,7 +317,8 @@ def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path
     numbers = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
     games = copy.deepcopy(model.env)
     again = QPLEX.load(tmp_path / "model", env=games, force_reset=False, device="cpu")
-    again.load_replay_buffer(tmp_path / "buffer")
+    with pytest.warns(UserWarning, match="buffer is unpickled, which runs code from it"):
+        again.load_replay_buffer(tmp_path / "buffer")
     before = weights(model)
     for each in (model, again):
         random.setstate(numbers[0])
@@ -348,7 +349,8 @@ def test_a_loaded_model_acts_as_the_saved(tmp_path: Path) -> None:
 
 def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
     make_model(toy_env(2)).learn(20 * 3).save_replay_buffer(tmp_path / "buffer")
-    with pytest.raises(ValueError, match="4 games of 3 agents, got TeamReplayBuffer of 6 rows"):
+    words = "4 games of 3 agents, got TeamReplayBuffer of 6 rows"
+    with pytest.warns(UserWarning, match="unpickled"), pytest.raises(ValueError, match=words):
         make_model(toy_env(4)).load_replay_buffer(tmp_path / "buffer")
 
 

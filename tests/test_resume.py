@@ -364,8 +364,13 @@ def foreign(game: type[CounterEnv], n_cpus: int = 1, seed: int | None = 3) -> An
 @pytest.mark.parametrize("n_cpus", [1, 2])
 @pytest.mark.parametrize("game", [LazyEnv, StateEnv])
 def test_games_of_others_go_on_bit_for_bit(game: type[CounterEnv], n_cpus: int, tmp_path: Path) -> None:
-    struck(tmp_path, lambda: foreign(game, n_cpus), 20)
-    model = go_on(tmp_path, foreign(game, n_cpus))
+    struck(tmp_path / "ck", lambda: foreign(game, n_cpus), 20)
+    going_on = foreign(game, n_cpus)
+    going_on.set_logger(configure(str(tmp_path / "log"), ["log"]))
+    model = go_on(tmp_path / "ck", going_on)
+    going_on.logger.close()
+    is_pickled = "they were unpickled from it" in (tmp_path / "log" / "log.txt").read_text()
+    assert is_pickled == (game is LazyEnv)
     assert weights(model) == weights(foreign(game).learn(WHOLE))
     assert model.num_timesteps == WHOLE
 

@@ -32,7 +32,7 @@ from sb3_saf.checkpoints.models import check_model_state, is_off_policy, load_mo
 from sb3_saf.checkpoints.runs import check_descriptions
 from sb3_saf.checkpoints.software import check_software, warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.envs.game_copies import ForeignGamesError, sign_games
+from sb3_saf.envs.game_copies import ForeignGamesError, pickled_games, sign_games
 from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.errors import NonFiniteError
 
@@ -84,6 +84,8 @@ def resume(
     warn_of_differences(tree["software"])
     _load(model, others, tree)
     games = "new episodes begin" if tree["environment"] is None else "the games go on where they were, bit for bit"
+    if any(pickled_games([tree["environment"], tree["callbacks"]])):
+        games += "; they were unpickled from it, as this user signed them"
     model.logger.log(f"Resumed from {loaded.path}: {games}")
     return loaded.path
 

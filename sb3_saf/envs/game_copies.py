@@ -218,15 +218,21 @@ def check_signature(data: npt.NDArray[np.uint8], signed: object) -> None:
         )
 
 
-def sign_games(tree: Any) -> None:
-    """Sign all pickled games of a checkpoint: the user trusts who wrote it."""
+def pickled_games(tree: Any) -> Iterator[dict[str, Any]]:
+    """Find the pickled games of a checkpoint."""
     if isinstance(tree, dict):
         if isinstance(tree.get("pickled"), np.ndarray):
-            tree["signature"] = signature(tree["pickled"])
+            yield tree
         tree = list(tree.values())
     if isinstance(tree, (list, tuple)):
         for part in tree:
-            sign_games(part)
+            yield from pickled_games(part)
+
+
+def sign_games(tree: Any) -> None:
+    """Sign all pickled games of a checkpoint: the user trusts who wrote it."""
+    for game in pickled_games(tree):
+        game["signature"] = signature(game["pickled"])
 
 
 # --- trials -----------------------------------------------------------------------------------------------------------

@@ -153,7 +153,7 @@ class RayEngine(Engine):
         self.address = address
         self.cpus = cpus
         self.gpus = gpus
-        self._ray = require_ray()
+        self._ray = require_ray(is_local=address is None)
         self._is_ours = not self._ray.is_initialized()
         if self._is_ours:
             self._connect(workers)
@@ -259,15 +259,18 @@ def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), type(error).__name__).rstrip(".")
 
 
-def require_ray() -> ModuleType:
+def require_ray(is_local: bool = False) -> ModuleType:
     """
     Return Ray, quiet.
 
+    :param is_local: whether it shall run on this machine alone; then it listens on localhost, and on nothing else
     :raises ValueError: if it is not installed
     """
     # Nothing is reported to anybody, and a future default is taken now, about which Ray would warn.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    if is_local:  # Read when Ray is imported: 0 is its default on systems other than Linux.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         import ray
     except ImportError:

@@ -161,7 +161,7 @@ class TeamRowsPolicy(BasePolicy):
             raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
         arrays = {key: np.asarray(value) for key, value in entries.items()}
         if OBS_KEY in arrays:
-            arrays[OBS_KEY] = _codes(arrays[OBS_KEY], self.team_spaces.own)
+            arrays[OBS_KEY] = _checked_own(_codes(arrays[OBS_KEY], self.team_spaces.own), self.team_spaces.own)
         if AGENT_KEY in arrays:
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
         tensors, is_batch = super().obs_to_tensor(arrays)
@@ -311,6 +311,18 @@ def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
     if observation.shape[-3:] not in ((height, width, atlas.shape[3]), (atlas.shape[3], height, width)):
         return observation
     return pixels_to_codes(observation, atlas).astype(space.dtype)
+
+
+def _checked_own(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
+    """Refuse NaN, and tile codes that the atlas lacks, in what users pass to predict."""
+    if observation.dtype.kind == "f" and not np.isfinite(observation).all():
+        raise ValueError(f"{OBS_KEY!r} must be finite, got {observation[~np.isfinite(observation)][0]}")
+    atlas = getattr(space, "atlas", None)
+    if atlas is not None and observation.shape[-2:] == space.shape:
+        largest = observation.max(initial=0)
+        if observation.min(initial=0) < 0 or largest >= len(atlas):
+            raise ValueError(f"{OBS_KEY!r} must be tile codes in 0..{len(atlas) - 1}, got {largest}")
+    return observation
 
 
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:

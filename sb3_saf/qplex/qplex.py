@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
+import warnings
 from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
@@ -229,6 +230,7 @@ class QPLEX(OffPolicyAlgorithm):
         :param truncate_last_traj: not read, see SB3
         :raises ValueError: if it is of other teams
         """
+        warnings.warn(f"{path} is unpickled, which runs code from it; load what you trust", UserWarning, stacklevel=2)
         before = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
         loaded: Any = self.replay_buffer
