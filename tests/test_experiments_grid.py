@@ -111,7 +111,7 @@ def test_unknown_names() -> None:
     with pytest.raises(ValueError, match=r"unknown experiment 'coordinaton' \(did you mean 'coordination'\?\)"):
         find_experiment("coordinaton")
     with pytest.raises(ValueError, match=r"unknown method 'mapo' \(did you mean 'mappo'\?\)"):
-        grid_of("coordination", selection=Selection((0,), ("mapo",)))
+        Selection((0,), ("mapo",))
 
 
 def test_shards_are_a_partition_and_have_all_methods() -> None:

@@ -39,7 +39,8 @@ IMPATIENT = {
 def test_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("ray")
     words = ["run", "joint", "--size", "smoke", "--address", "auto", "-f", str(tmp_path)]
-    assert cli.main(words) == 2
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(words)
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "no Ray cluster at --address auto" in error
@@ -187,7 +188,8 @@ def test_cells_that_fit_on_no_node_of_a_fresh_ray() -> None:
 
 def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    assert cli.main(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)])
     assert capsys.readouterr().err == (
         "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install "
         "-e '.[ray]', or leave --ray out to run in processes of this machine\n"

@@ -319,7 +319,8 @@ def test_damaged_settings_are_named_and_written_anew(
     folder = shutil.copytree(undisturbed, tmp_path / "copy")
     (folder / "settings.json").write_text(content)
     (folder / "joint" / "selections" / "other.json").write_text(content)
-    assert cli.main(["report", "joint", "-f", str(folder)]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["report", "joint", "-f", str(folder)])
     error = capsys.readouterr().err
     assert str(folder / "settings.json") in error and error.count("\n") == 1
     assert run_inline(folder)[0] == Summary(0, [], [])
@@ -430,5 +431,6 @@ def test_a_cell_can_be_checked(undisturbed: Path, tmp_path: Path, capsys: pytest
     printed = capsys.readouterr().out
     assert "equal, bit for bit: learning curve\n" in printed
     assert "different: returns at c=2, h=2: mean" in printed and "different: weights: differ by up to" in printed
-    assert cli.main(["check", str(folder)]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["check", str(folder)])
     assert "is no finished cell; expected RESULTS/cells/TASK-LEVEL/METHOD/seed-N" in capsys.readouterr().err

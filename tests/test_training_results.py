@@ -139,7 +139,7 @@ def test_a_window_needs_a_display(
         (["--env-kwargs", "coordination:5"], "coordination must be an integer from 1 to 4"),
         (["--env-kwargs", "n_agents:5"], "trained with 4 agents"),
         (["--gif", "film.mp4"], "a file that ends with .gif"),
-        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--episodes", "0"], "--episodes: must be at least 1"),
         (["--gif", "a.gif", "--text"], "not allowed with"),
         (["--gif", "/dev/null/new/a.gif"], "Not a directory"),
     ],

@@ -26,7 +26,6 @@ from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import plain, read_json, write_json
 from sb3_saf.experiments.grid import Cell, RunConfig
-from sb3_saf.training.commands import option_words
 from sb3_saf.training.folders import software_versions
 from sb3_saf.training.run import CHECKPOINTS, RunOptions, load_parameters, train
 from sb3_saf.training.seeds import evaluation_seed
@@ -271,13 +270,7 @@ def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | Non
 def command(cell: Cell, config: RunConfig) -> str:
     """Return the command that trains a cell again."""
     words = ["python", "-m", "sb3_saf.train", "--algo", cell.method, "--env", cell.env]
-    words += ["--size", config.size, "--seed", str(cell.seed)]
-    env_kwargs = {**config.overrides.get("env_kwargs", {}), **cell.level.env_kwargs}
-    own = {key: value for key, value in config.overrides.items() if key not in ("env_kwargs", "game_steps")}
-    words += [*option_words("--env-kwargs", env_kwargs), *option_words("--hyperparams", own)]
-    if "game_steps" in config.overrides:
-        words += ["--game-steps", str(config.overrides["game_steps"])]
-    return shlex.join(words)
+    return shlex.join([*words, *config.words(cell.level), "--seed", str(cell.seed)])
 
 
 def versions(model: BaseAlgorithm | None) -> dict[str, str]:

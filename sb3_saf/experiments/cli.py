@@ -10,15 +10,22 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NoReturn, TypeVar
+from typing import Final, NamedTuple, NoReturn
 
 from hecogrid_envs.task import check_task
 from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, PROGRAM, Experiment, own_experiment
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
 from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
-from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.commands import USAGE_ERROR, CommandError, KeyValues, OneLineParser, check_device, require
+from sb3_saf.training.commands import (
+    OneLineParser,
+    add_key_values,
+    at_least,
+    check_device,
+    require,
+    run_command,
+    user_errors,
+)
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.seeds import check_seed
 from sb3_saf.training.yaml_files import SIZES, Size
@@ -27,30 +34,20 @@ DEFAULT_SIZE: Final[Size] = "small"
 #: Returns of reference teams, which reports draw if the file is there.
 DEFAULT_SCALE: Final = Path("results", "scale.csv")
 #: What a shell reports for a process that Ctrl-C has ended.
-_INTERRUPTED: Final = 130
-_LEVEL_PARAMETERS: Final = ("coordination", "heterogeneity")
-
-Number = TypeVar("Number", int, float, None)
+_INTERRUPTED: Final = 128 + signal.SIGINT
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    :return: 0 if all went well, 1 if cells failed or differ, 2 if the command was wrong, 130 if it was interrupted
+    :return: 0 if all went well, 1 if cells failed or differ, 130 if a run was interrupted
+    :raises SystemExit: with 2 if the command was wrong
     """
     options = _parser().parse_args(arguments)
     if options.command == "cell":  # whose errors are for error.txt, with their traceback
         return _cell(options)
-    try:
-        code: int = options.function(options)
-    except (ValueError, OSError, CommandError) as error:
-        print(f"{PROGRAM} {options.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return USAGE_ERROR
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return _INTERRUPTED
-    return code
+    return run_command(f"{PROGRAM} {options.command}", lambda: user_errors()(options.function)(options))
 
 
 # Options
@@ -87,11 +84,9 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--env", nargs="+", default=[], help="a grid of your own on these environments, as sb3_saf.train takes them"
     )
-    group.add_argument(
+    add_key_values(
+        group,
         "--vary",
-        nargs="+",
-        action=KeyValues,
-        default={},
         metavar="KEY:[VALUES]",
         help="a parameter of these environments and its values, such as N:[2,3]",
     )
@@ -104,23 +99,25 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(seeds=list(DEFAULT_SEEDS))
     group = parser.add_argument_group("how cells are trained and tested (the same for all cells of a folder)")
     group.add_argument(
-        "-n", "--game-steps", type=int, help="game steps (of all games together) to train for; default: the size's"
+        "-n", "--game-steps", type=at_least(1), help="game steps, of all games together; default: the size's"
     )
-    pairs: dict[str, Any] = {"nargs": "+", "action": KeyValues, "default": {}, "metavar": "KEY:VALUE"}
-    group.add_argument("--env-kwargs", **pairs, help="parameters of the environment, beside the levels")
-    group.add_argument("-params", "--hyperparams", **pairs, help="in the place of zoo_configs', for all methods")
-    group.add_argument("--episodes", type=int, default=32, help="team episodes of each test")
+    add_key_values(group, "--env-kwargs", help="parameters of the environment, beside the levels")
+    add_key_values(group, "-params", "--hyperparams", help="in the place of zoo_configs', for all methods")
+    group.add_argument("--episodes", type=at_least(1), default=32, help="team episodes of each test")
     group.add_argument("--deterministic", action="store_true", help="test with the most likely actions")
 
 
 def _add_machine(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("where and how cells run")
-    group.add_argument("--workers", type=int, help="cells at the same time; default: as many as cores allow")
-    group.add_argument("--threads", type=int, default=1, help="threads of each worker")
+    group.add_argument("--workers", type=at_least(1), help="cells at the same time; default: as many as cores allow")
+    group.add_argument("--threads", type=at_least(1), default=1, help="threads of each worker")
     group.add_argument("--device", default="auto", help="as Stable-Baselines3 takes it")
-    group.add_argument("--retries", type=int, default=1, help="further attempts for a cell that fails or is killed")
+    group.add_argument(
+        "--retries", type=at_least(0), default=1, help="further attempts for a cell that fails or is killed"
+    )
     group.add_argument(
         "--resume",
         action=argparse.BooleanOptionalAction,
@@ -146,30 +143,44 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
 # What the options mean
 
 
-def _positive(name: str, value: Number) -> Number:
-    """
-    Return a number above 0, or None.
+class _Asked(NamedTuple):
+    """What a command is about: an experiment, the folder of its results, and the part that was named."""
 
-    :raises ValueError: for any other
-    """
-    if value is not None and not value > 0:
-        raise ValueError(f"{name} must be above 0, got {value:g}")
-    return value
+    experiment: Experiment
+    results: Results
+    selection: Selection
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> _Asked:
+        """
+        Read the options.
+
+        :raises ValueError: for names that do not exist
+        """
+        name = _name(options)
+        results = Results(
+            options.folder or Path("runs", "experiments", _size(options) if name in EXPERIMENTS else name)
+        )
+        if options.env:
+            experiment = own_experiment(name, tuple(dict.fromkeys(options.env)), options.vary)
+        elif options.vary:
+            raise ValueError("--vary is for a grid of your own: give its environments with --env")
+        else:
+            experiment = results.experiment(name)
+        selection = Selection(
+            tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
+            tuple(dict.fromkeys(options.methods)),
+            tuple(dict.fromkeys(_env(task, experiment) for task in options.tasks)),
+            tuple(dict.fromkeys(options.levels)),
+        )
+        return cls(experiment, results, selection)
 
 
 def _size(options: argparse.Namespace) -> Size:
     """Return the size that was named, that of the folder, or the default."""
-    if options.size is not None:
-        size: Size = options.size
-        return size
     stored = None if options.folder is None else Results(options.folder).config()
-    return DEFAULT_SIZE if stored is None else stored.size
-
-
-def _results(options: argparse.Namespace) -> Results:
-    """Return the folder of results, which may not be there yet."""
-    name = _name(options)
-    return Results(options.folder or Path("runs", "experiments", _size(options) if name in EXPERIMENTS else name))
+    size: Size = options.size or (DEFAULT_SIZE if stored is None else stored.size)
+    return size
 
 
 def _name(options: argparse.Namespace) -> str:
@@ -186,31 +197,6 @@ def _name(options: argparse.Namespace) -> str:
     return options.env[0].removesuffix("-v0").replace(":", "-").replace("/", "-") if name is None else name
 
 
-def _experiment(options: argparse.Namespace) -> Experiment:
-    if options.env:
-        return own_experiment(_name(options), tuple(dict.fromkeys(options.env)), options.vary)
-    if options.vary:
-        raise ValueError("--vary is for a grid of your own: give its environments with --env")
-    return _results(options).experiment(_name(options))
-
-
-def _selection(options: argparse.Namespace, experiment: Experiment) -> Selection:
-    """
-    Return the part that was named; empty for what was not.
-
-    :raises ValueError: for names that do not exist
-    """
-    for method in options.methods:
-        if method not in ALGOS:
-            raise unknown_name("method", method, ALGOS)
-    return Selection(
-        tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
-        tuple(dict.fromkeys(options.methods)),
-        tuple(dict.fromkeys(_env(task, experiment) for task in options.tasks)),
-        tuple(dict.fromkeys(options.levels)),
-    )
-
-
 def _env(task: str, experiment: Experiment) -> str:
     """Return the environment of a task; any of HECOGrid's will do for the paper's experiments."""
     if task in experiment.envs:
@@ -224,14 +210,14 @@ def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
     """Return how cells are trained and tested."""
     overrides = dict(options.hyperparams)
     if options.game_steps is not None:
-        overrides["game_steps"] = _positive("--game-steps", options.game_steps)
+        overrides["game_steps"] = options.game_steps
     varied = {name for view in experiment.views for level in view.levels for name in level.env_kwargs}
     for name in options.env_kwargs:
         if name in varied:
             raise ValueError(f"{name} is what the experiment varies; leave it out of --env-kwargs")
     if options.env_kwargs:
         overrides["env_kwargs"] = options.env_kwargs
-    return RunConfig(_size(options), overrides, _positive("--episodes", options.episodes), options.deterministic)
+    return RunConfig(_size(options), overrides, options.episodes, options.deterministic)
 
 
 def _engine(options: argparse.Namespace) -> Engine:
@@ -241,16 +227,12 @@ def _engine(options: argparse.Namespace) -> Engine:
     :raises ValueError: if Ray is asked for and not installed, or not there
     """
     if not (options.ray or options.address is not None):
-        return LocalEngine(_workers(options), options.threads)
-    cpus = _positive("--cpus-per-cell", options.cpus_per_cell)
-    return RayEngine(options.address, cpus, options.gpus_per_cell, options.workers)
-
-
-def _workers(options: argparse.Namespace) -> int:
-    """Return how many cells run at the same time: a batch system may have limited the cores of this process."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers: int = options.workers or max(1, cores // options.threads)
-    return workers
+        # A batch system may have limited the cores of this process.
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return LocalEngine(options.workers or max(1, cores // options.threads), options.threads)
+    if options.cpus_per_cell <= 0:
+        raise ValueError(f"--cpus-per-cell must be above 0, got {options.cpus_per_cell:g}")
+    return RayEngine(options.address, options.cpus_per_cell, options.gpus_per_cell, options.workers)
 
 
 # Commands
@@ -269,33 +251,22 @@ def _list(options: argparse.Namespace) -> int:
 def _plan(options: argparse.Namespace) -> int:
     from sb3_saf.experiments.plan import make_plan
 
-    experiment = _experiment(options)
+    experiment, results, selection = _Asked.of(options)
     if not experiment.is_grid:
         print(f"{experiment.name}: counts weights, trains nothing")
         return 0
-    selection = _with_seeds(_selection(options, experiment))
-    print(make_plan(experiment, selection, _config(options, experiment), _results(options)))
+    print(make_plan(experiment, selection, _config(options, experiment), results))
     return 0
 
 
-def _with_seeds(selection: Selection) -> Selection:
-    return Selection(selection.seeds or DEFAULT_SEEDS, selection.methods, selection.envs, selection.levels)
-
-
 def _run(options: argparse.Namespace) -> int:
-    experiment = _experiment(options)
+    experiment, results, selection = _Asked.of(options)
     if not experiment.is_grid:
         return _print_parameters()
     require("pandas")
     from sb3_saf.experiments.run import RunOptions, run
 
-    results = _results(options)
-    selection, config = _with_seeds(_selection(options, experiment)), _config(options, experiment)
-    shard = Shard.parse(options.shard)
-    for name in ("workers", "threads"):
-        _positive(f"--{name}", getattr(options, name))
-    if options.retries < 0:
-        raise ValueError(f"--retries must be 0 or more, got {options.retries}")
+    config, shard = _config(options, experiment), Shard.parse(options.shard)
     how = RunOptions(
         check_device(options.device), options.threads, options.retries, options.tensorboard, options.resume
     )
@@ -331,8 +302,8 @@ def _sigterm_like_control_c() -> Iterator[None]:
 
 
 def _report(options: argparse.Namespace) -> int:
-    results, name = _results(options), _name(options)
-    experiment = _experiment(options)
+    experiment, results, selection = _Asked.of(options)
+    name = experiment.name
     if not experiment.is_grid:
         return _print_parameters()
     require("pandas", "matplotlib", "rliable")
@@ -346,7 +317,7 @@ def _report(options: argparse.Namespace) -> int:
 
     path = options.scale or (DEFAULT_SCALE if DEFAULT_SCALE.is_file() else None)
     scale = None if path is None else read_scale(path)
-    report = write_report(experiment, results, _selection(options, experiment), scale)
+    report = write_report(experiment, results, selection, scale)
     print(f"page: {report.page}")
     print(f"figures: {', '.join(path.name for path in report.figures)}")
     if report.missing:

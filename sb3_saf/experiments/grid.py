@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
 from sb3_saf.experiments.files import plain
 from sb3_saf.training.algorithms import ALGOS
+from sb3_saf.training.commands import option_words
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.yaml_files import Size
@@ -84,6 +85,15 @@ class RunConfig:
     episodes: int = 32
     deterministic: bool = False
 
+    def words(self, level: Level = Level()) -> list[str]:  # noqa: B008 (immutable)
+        """Return the options of a command line that stand for the settings of a level."""
+        overrides = dict(self.overrides)
+        words = ["--size", self.size]
+        if "game_steps" in overrides:
+            words += ["--game-steps", str(overrides.pop("game_steps"))]
+        words += option_words("--env-kwargs", {**overrides.pop("env_kwargs", {}), **level.env_kwargs})
+        return words + option_words("--hyperparams", overrides)
+
     def settings(self, cell: Cell, level: Level | None = None) -> Settings:
         """
         Return the settings of a cell.
@@ -156,12 +166,18 @@ class Selection:
     :param methods: empty for the experiment's own
     :param envs: empty for the experiment's own
     :param levels: positions on the experiment's axes, as text; empty for all of them
+    :raises ValueError: for methods that are no algorithms
     """
 
     seeds: tuple[int, ...]
     methods: tuple[str, ...] = ()
     envs: tuple[str, ...] = ()
     levels: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for method in self.methods:
+            if method not in ALGOS:
+                raise unknown_name("method", method, ALGOS)
 
     def has(self, cell: Cell, experiment: Experiment) -> bool:
         """Whether a cell belongs to this part, where nothing named is everything. The random team always does."""
@@ -179,9 +195,9 @@ def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> G
     """
     Return the grid of an experiment: its methods and a random team, at every level that fits.
 
-    :raises ValueError: for methods that are no algorithms, levels that it does not have, or if nothing fits
+    :raises ValueError: for levels that it does not have, or if nothing fits
     """
-    methods = check_methods(experiment, selection.methods)
+    methods = selection.methods or experiment.methods
     left_out: list[LeftOut] = []
     trained: list[Cell] = []
     fitting: list[tuple[str, Level, tuple[Level, ...]]] = []
@@ -207,24 +223,6 @@ def merge(cells: Iterable[Cell]) -> list[Cell]:
         known = merged.setdefault(cell.id, cell)
         merged[cell.id] = replace(known, tests=tuple(dict.fromkeys((*known.tests, *cell.tests))))
     return list(merged.values())
-
-
-def check_methods(experiment: Experiment, methods: Sequence[str]) -> tuple[str, ...]:
-    """
-    Return the methods of a run.
-
-    :raises ValueError: for names that are no algorithms
-    """
-    for method in methods:
-        if method not in ALGOS:
-            raise unknown_name("method", method, ALGOS)
-    missing = [method for method in experiment.methods if method not in ALGOS]
-    if missing and not methods:
-        raise ValueError(
-            f"the experiment {experiment.name!r} needs the algorithms {', '.join(missing)}, which this installation "
-            f"does not have; name others with --methods (there are {', '.join(ALGOS)})"
-        )
-    return tuple(dict.fromkeys(methods)) or experiment.methods
 
 
 def _misfits(env: str, levels: Iterable[Level], config: RunConfig) -> Iterator[tuple[Level, str]]:

@@ -277,15 +277,8 @@ def experiment_words(experiment: Experiment) -> list[str]:
 
 def config_words(config: RunConfig) -> list[str]:
     """Return the options of a command line that make a configuration."""
-    overrides = dict(config.overrides)
-    words = ["--size", config.size]
-    if "game_steps" in overrides:
-        words += ["--game-steps", str(overrides.pop("game_steps"))]
-    words += option_words("--env-kwargs", overrides.pop("env_kwargs", {}))
-    words += option_words("--hyperparams", overrides)
-    if config.episodes != RunConfig(config.size).episodes:
-        words += ["--episodes", str(config.episodes)]
-    return words + ["--deterministic"] * config.deterministic
+    episodes = [] if config.episodes == RunConfig.episodes else ["--episodes", str(config.episodes)]
+    return [*config.words(), *episodes, *["--deterministic"] * config.deterministic]
 
 
 def _versions(content: Content) -> str:

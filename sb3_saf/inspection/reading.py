@@ -8,27 +8,28 @@ N agents each, U policies or heads, L slots, P parameters of an action distribut
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.buffers.replay import TeamSteps
-from sb3_saf.envs.teams import STATE_KEY
 from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.critic import JointStates, TeamStates
-from sb3_saf.networks.distributions import masked_parameters, mixture_log_probs
-from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
+from sb3_saf.networks.distributions import mixture_log_probs
+from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
-from sb3_saf.policies.saf import SAFCritic, SAFStates
-from sb3_saf.qplex.heads import q_values
+from sb3_saf.policies.saf import SAFStates
 from sb3_saf.qplex.learning import greedy_q_tot
 from sb3_saf.qplex.policies import QPLEXPolicy, State
 
 Tensors = dict[str, th.Tensor]
+Bools = npt.NDArray[np.bool_]
 #: Policies of this package.
 OurPolicy = TeamPolicy | QPLEXPolicy
 
@@ -116,7 +117,7 @@ class PolicyReader:
     """
     Acts with an actor-critic policy and reads what it computes.
 
-    :param policy: SAF's, MAPPO's, IPPO's, with or without memory and action masks
+    :param policy: SAF's, MAPPO's, IPPO's, with or without action masks
     :param deterministic: whether it takes its most likely actions
     """
 
@@ -128,9 +129,7 @@ class PolicyReader:
         self.deterministic = deterministic
         self.source = _saf_states(policy)
 
-    def step(
-        self, obs: Tensors, starts: npt.NDArray[np.bool_], action_masks: npt.NDArray[np.bool_] | None = None
-    ) -> StepReading:
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
         """
         Act in one step.
 
@@ -140,7 +139,7 @@ class PolicyReader:
         """
         arguments = {} if action_masks is None else {"action_masks": action_masks}
         actions, values, _ = self.policy(obs, deterministic=self.deterministic, **arguments)
-        return self._reading(obs, actions, values, self.policy.extract_features(obs), action_masks, None)
+        return self._reading(obs, actions, values, self.policy.extract_features(obs), action_masks)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """
@@ -154,66 +153,50 @@ class PolicyReader:
         return values.flatten()
 
     def _reading(
-        self,
-        obs: Tensors,
-        actions: th.Tensor,
-        values: th.Tensor,
-        latent: th.Tensor,
-        action_masks: npt.NDArray[np.bool_] | None,
-        starts: th.Tensor | None,
+        self, obs: Tensors, actions: th.Tensor, values: th.Tensor, latent: th.Tensor, action_masks: Bools | None
     ) -> StepReading:
-        space = self.policy.action_space
-        pool = self._pool_reading(obs, latent, action_masks)
+        policy, space = self.policy, self.policy.action_space
+        log_weights, parameters = policy.evaluate_pool(obs, latent, action_masks)
         is_discrete = isinstance(space, spaces.Discrete)
-        probabilities = mixture_log_probs(pool.weights.log(), pool.actions).exp() if is_discrete else None
+        probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
         array = actions.cpu().numpy()
         taken = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
-        source = None if self.source is None else self._source_reading(self.source, obs, starts)
-        is_pool = isinstance(self.policy.actor, PolicyPool)
-        return StepReading(taken, values.flatten(), probabilities, pool if is_pool else None, source)
+        pool = PoolReading(log_weights.exp(), parameters) if isinstance(policy.actor, PolicyPool) else None
+        source = None if self.source is None else self._source_reading(self.source, obs)
+        return StepReading(taken, values.flatten(), probabilities, pool, source)
 
-    def _pool_reading(self, obs: Tensors, latent: th.Tensor, action_masks: npt.NDArray[np.bool_] | None) -> PoolReading:
-        """Read the actor; a single policy is a pool of one."""
-        actor = self.policy.actor
-        log_weights, actions = actor.evaluate(latent, self.policy._agent(obs) if actor.reads_agent else None)
-        legal = self.policy._action_mask(obs)
-        if action_masks is not None:
-            allowed = th.as_tensor(action_masks, dtype=th.bool, device=latent.device).reshape(len(latent), -1)
-            legal = allowed if legal is None else allowed & legal
-        if legal is not None:
-            actions = masked_parameters(self.policy.action_space, actions, legal)
-        return PoolReading(log_weights.exp(), actions)
-
-    def _source_reading(self, source: SAFStates, obs: Tensors, starts: th.Tensor | None) -> SourceReading:
+    def _source_reading(self, source: SAFStates, obs: Tensors) -> SourceReading:
         _, teams = self.policy.encode_teams(obs)
-        known, exchanged = source.communicate(teams.features, teams.members, teams.active)
+        _, exchanged = source.communicate(teams.features, teams.members, teams.active)
         # Rows that are no whole teams in order have equal teams computed once; from here on, games count.
         n_agents = self.policy.team_spaces.n_agents
-        team = th.arange(len(known)) if teams.rows is None else teams.rows[::n_agents] // n_agents
-        states, read = known[team], exchanged.read[team]
-        active = None if teams.active is None else teams.active[team]
-        messages: dict[Replacement, th.Tensor] = {"zero": th.zeros_like(read)}
-        if len(team) > 1:
-            messages["shuffled"] = read.roll(1, dims=0)
-        values = {
-            name: self._values_with(name, obs, source.combine(states, message), active, starts)
-            for name, message in messages.items()
-        }
-        strengths = read.norm(dim=2).flatten()
+        team = th.arange(len(exchanged.read)) if teams.rows is None else teams.rows[::n_agents] // n_agents
+        values: dict[Replacement, th.Tensor] = {}
+        for name in REPLACEMENTS if len(team) > 1 else REPLACEMENTS[:1]:
+            with _other_messages(source, name):
+                values[name] = self._values_with(name, obs)
+        strengths = exchanged.read[team].norm(dim=2).flatten()
         return SourceReading(exchanged.write_attention[team], exchanged.read_attention[team], strengths, values)
 
-    def _values_with(
-        self,
-        name: Replacement,
-        obs: Tensors,
-        states: th.Tensor,
-        active: th.Tensor | None,
-        starts: th.Tensor | None,
-    ) -> th.Tensor:
-        """Compute (B,) values of s^SAF (E, N, d)."""
-        critic = self.policy.value_net
-        assert isinstance(critic, SAFCritic)
-        return self.policy._raw_values(obs, critic.judge(states, active).flatten()).flatten()
+    def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
+        """Compute (B,) values while messages are replaced."""
+        values: th.Tensor = self.policy.predict_values(obs)
+        return values.flatten()
+
+
+@contextmanager
+def _other_messages(source: SAFStates, replacement: Replacement) -> Iterator[None]:
+    """Let a critic read other messages than those that its agents have read."""
+
+    def replaced(_: th.nn.Module, inputs: tuple[th.Tensor, ...]) -> th.Tensor:
+        states, read = inputs[0].chunk(2, dim=2)
+        return th.cat([states, th.zeros_like(read) if replacement == "zero" else read.roll(1, dims=0)], dim=2)
+
+    hook = source.combine_net.register_forward_pre_hook(replaced)
+    try:
+        yield
+    finally:
+        hook.remove()
 
 
 class RecurrentPolicyReader(PolicyReader):
@@ -231,49 +214,29 @@ class RecurrentPolicyReader(PolicyReader):
         super().__init__(policy, deterministic)
         lstm = policy.lstm_actor
         blank = th.zeros(lstm.num_layers, n_rows, lstm.hidden_size, device=policy.device)
-        self._actor_states: LstmStates = (blank, blank)
-        self._critic_states: LstmStates = (blank, blank)
+        self._before = self._states = RNNStates((blank, blank), (blank, blank))
+        self._starts = th.ones(n_rows, device=policy.device)
         self._without: dict[Replacement, LstmStates] = dict.fromkeys(REPLACEMENTS, (blank, blank))
 
-    def step(
-        self, obs: Tensors, starts: npt.NDArray[np.bool_], action_masks: npt.NDArray[np.bool_] | None = None
-    ) -> StepReading:
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
         """See :class:`PolicyReader`."""
-        from sb3_contrib.common.recurrent.type_aliases import RNNStates
-
-        policy = self.policy
-        started = th.as_tensor(starts, dtype=th.float32, device=policy.device)
-        before = RNNStates(self._actor_states, self._critic_states)
-        actions, values, _, after = policy(obs, before, started, deterministic=self.deterministic)
-        latent, _ = policy._process(policy.extract_features(obs), before.pi, started, policy.lstm_actor)
-        self._actor_states, self._critic_states = after.pi, after.vf
-        return self._reading(obs, actions, values, latent, None, started)
+        policy, self._before = self.policy, self._states
+        self._starts = th.as_tensor(starts, dtype=th.float32, device=policy.device)
+        actions, values, _, self._states = policy(obs, self._before, self._starts, deterministic=self.deterministic)
+        latent, _ = policy.remember(policy.extract_features(obs), self._before.pi, self._starts)
+        return self._reading(obs, actions, values, latent, None)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """See :class:`PolicyReader`."""
-        hidden, cell = (states[:, rows].contiguous() for states in self._critic_states)
+        hidden, cell = (states[:, rows].contiguous() for states in self._states.vf)
         going_on = th.zeros(len(rows), device=self.policy.device)
         return self.policy.predict_values(obs, (hidden, cell), going_on).flatten()
 
-    def _values_with(
-        self,
-        name: Replacement,
-        obs: Tensors,
-        states: th.Tensor,
-        active: th.Tensor | None,
-        starts: th.Tensor | None,
-    ) -> th.Tensor:
-        critic = self.policy.value_net
-        if not isinstance(critic, RecurrentCritic):
-            return super()._values_with(name, obs, states, active, starts)
-        assert starts is not None
-        if isinstance(critic.team_states, JointStates):
-            states = critic.team_states.join(states, active)
-        latent, self._without[name] = self.policy._process(
-            states.flatten(0, 1), self._without[name], starts, critic.lstm
-        )
-        agent = self.policy._agent(obs) if critic.head.reads_agent else None
-        return self.policy._raw_values(obs, critic.head(latent, agent)).flatten()
+    def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
+        states = RNNStates(self._before.pi, self._without[name])
+        _, values, _, following = self.policy(obs, states, self._starts, deterministic=True)
+        self._without[name] = following.vf
+        return values.flatten()
 
 
 class QReader:
@@ -290,71 +253,27 @@ class QReader:
         self.policy = policy
         self._state: State | None = None
 
-    def step(
-        self, obs: Tensors, starts: npt.NDArray[np.bool_], action_masks: npt.NDArray[np.bool_] | None = None
-    ) -> StepReading:
-        """
-        Act in one step.
-
-        :param obs: rows of whole teams, game-major
-        :param starts: (B,) whether an episode starts with this step, for policies with memory
-        :param action_masks: not read; legal actions are part of the rows
-        """
-        values, read, self._state = self._q_values(obs, self._state, starts)
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
+        """See :class:`PolicyReader`; ``action_masks`` is not read: legal actions are part of the rows."""
+        values, latents, self._state = self.policy.evaluate(obs, self._state, starts)
         best = values.argmax(dim=1)
         probabilities = th.nn.functional.one_hot(best, values.shape[1]).to(values.dtype)
-        return StepReading(best.cpu().numpy(), self._q_tot(obs, values), probabilities, self._pool(obs, read), None)
+        pool = self._pool(values, latents)
+        return StepReading(best.cpu().numpy(), greedy_q_tot(self.policy, obs, values), probabilities, pool, None)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
-        """
-        Compute the values of last observations, which bootstrap a time limit that is no true end.
-
-        :param obs: rows of the games that ended
-        :param rows: (K,) which rows of the last step they are
-        :return: (K,)
-        """
+        """See :class:`PolicyReader`."""
         state = None if self._state is None else tuple(part[rows] for part in self._state)
-        values, _, _ = self._q_values(obs, state, np.zeros(len(rows), dtype=bool))
-        return self._q_tot(obs, values)
+        return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state).values)
 
-    def _q_values(
-        self, obs: Tensors, state: State | None, starts: npt.NDArray[np.bool_]
-    ) -> tuple[th.Tensor, th.Tensor, State | None]:
-        """Return (B, A) values with -inf for illegal actions, the heads' input (B, H), and the agents' memory."""
-        policy = self.policy
-        if policy.memory is None:
-            return policy.own_q_values(obs), policy.extract_features(obs), None
-        _, state = policy._recall_and_act(policy.memory, obs, state, starts)
-        hidden = th.as_tensor(state[0], device=policy.device)
-        return q_values(policy.actor, hidden, policy._agent(obs), policy._action_mask(obs)), hidden, state
-
-    def _q_tot(self, obs: Tensors, values: th.Tensor) -> th.Tensor:
-        """Return (B,) the value of the joint action of each row's team."""
-        policy, n_agents = self.policy, self.policy.team_spaces.n_agents
-        active = policy._active(obs)
-        states = obs[STATE_KEY][::n_agents] if policy.state_encoder is not None else None
-        steps = TeamSteps(
-            policy._own(obs).unflatten(0, (-1, n_agents)), None, None if active is None else active[::n_agents], states
-        )
-        features = policy.extract_features(obs).view(-1, n_agents, policy.features_dim)
-        q_tot = greedy_q_tot(policy, values.view(-1, n_agents, values.shape[1]), steps, features)
-        return q_tot.repeat_interleave(n_agents)
-
-    def _pool(self, obs: Tensors, read: th.Tensor) -> PoolReading | None:
+    def _pool(self, values: th.Tensor, latents: th.Tensor) -> PoolReading | None:
         """Return the weights with which training draws heads, and each head's best action with probability 1."""
         if not isinstance(self.policy.actor, PolicyPool):
             return None
-        log_weights, of_heads = self.policy.actor.evaluate(read)
-        masks = self.policy._action_mask(obs)
-        if masks is not None:
-            of_heads = of_heads.masked_fill(~masks.unsqueeze(1), -th.inf)
+        log_weights, of_heads = self.policy.actor.evaluate(latents)
+        of_heads = of_heads.masked_fill(values.isneginf().unsqueeze(1), -th.inf)  # illegal actions
         is_best = of_heads == of_heads.max(dim=2, keepdim=True).values
         return PoolReading(log_weights.exp(), th.zeros_like(of_heads).masked_fill(~is_best, -th.inf))
-
-
-def takes_masks(policy: BasePolicy) -> bool:
-    """Return whether the policy asks the environment for action masks, as MaskablePPO does."""
-    return isinstance(policy, TeamMaskablePolicy)
 
 
 def _saf_states(policy: TeamPolicy) -> SAFStates | None:

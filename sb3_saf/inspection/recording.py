@@ -28,8 +28,8 @@ from sb3_saf.inspection.reading import (
     StepReading,
     reader_of,
     require_our_policy,
-    takes_masks,
 )
+from sb3_saf.policies.base import TeamMaskablePolicy
 from sb3_saf.randomness import own_randomness
 
 Floats = npt.NDArray[np.float32]
@@ -185,7 +185,8 @@ class _Recorder:
         policy = self.reader.policy
         counted = np.repeat(self.episodes < self.shares, self.n_agents) & _active(obs, self.n_agents)
         zones = None if self.zones is None else zones_now(self.zones, self.env)
-        masks = get_action_masks(self.env) if takes_masks(policy) and is_masking_supported(self.env) else None
+        asks = isinstance(policy, TeamMaskablePolicy) and is_masking_supported(self.env)
+        masks = get_action_masks(self.env) if asks else None
         reading = self.reader.step(_tensors(policy, obs), starts, masks)
         following, rewards, dones, infos = self.env.step(reading.actions)
         dones = np.asarray(dones, dtype=bool)

@@ -27,8 +27,9 @@ from torch import nn
 from sb3_saf.buffers.later import LaterValues
 from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.envs.teams import ACTIVE_KEY, AGENT_KEY, STATE_KEY
-from sb3_saf.networks.actor import ActionHead, ActorNetwork
+from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
+from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, joined_rows, joined_teams
 from sb3_saf.networks.value_normalizer import ValueNormalizer
@@ -322,11 +323,32 @@ class TeamPolicy(TeamRowsPolicy):
     def _distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None = None) -> Distribution:
         """Over actions that both the rows' own masks and ``action_masks``, (B, M), allow."""
         agent = self._agent(obs) if self.actor.reads_agent else None
-        masks = self._action_mask(obs)
-        if action_masks is not None:
-            allowed = th.as_tensor(action_masks, dtype=th.bool, device=own.features.device).reshape(own.n_rows, -1)
-            masks = allowed if masks is None else masks & allowed
+        masks = self._legal(obs, action_masks, own.features.device)
         return self._distribution_of(lambda module: self.row_encoder.apply(module, own, agent), masks)
+
+    def _legal(self, obs: PyTorchObs, action_masks: Masks | None, device: th.device) -> th.Tensor | None:
+        """(B, M) choices that both the rows' own masks and ``action_masks`` allow; None if all are."""
+        masks = self._action_mask(obs)
+        if action_masks is None:
+            return masks
+        allowed = th.as_tensor(action_masks, dtype=th.bool, device=device)
+        allowed = allowed.reshape(-1, allowed.shape[-1])
+        return allowed if masks is None else masks & allowed
+
+    def evaluate_pool(self, obs: PyTorchObs, latent: th.Tensor, action_masks: Masks | None = None) -> PoolOutput:
+        """
+        Return what actions are drawn from; a single policy is a pool of one.
+
+        :param obs: rows
+        :param latent: (B, H) what the actor reads: features, or what a memory makes of them
+        :param action_masks: (B, M) of MaskablePPO; None allows everything
+        :return: log weights (B, U) and parameters (B, U, P), illegal actions masked
+        """
+        output = self.actor.evaluate(latent, self._agent(obs) if self.actor.reads_agent else None)
+        legal = self._legal(obs, action_masks, latent.device)
+        if legal is None:
+            return output
+        return output._replace(actions=masked_parameters(self.action_space, output.actions, legal))
 
     def _distribution_of(self, apply: Callable[[Head], th.Tensor], masks: th.Tensor | None) -> Distribution:
         """Of the actor, which ``apply`` calls for all rows; masks apply to every policy of a pool."""

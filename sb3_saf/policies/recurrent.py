@@ -207,15 +207,19 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         """
         return self._recall_values(obs, self._encoded(obs), lstm_states, episode_starts)[0]
 
-    def remember(self, features: th.Tensor, lstm_states: LstmStates) -> tuple[th.Tensor, LstmStates]:
+    def remember(
+        self, features: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor | None = None
+    ) -> tuple[th.Tensor, LstmStates]:
         """
-        Take one step of the actor's LSTM within an episode.
+        Take one step of the actor's LSTM.
 
         :param features: (B, d) of own observations
         :param lstm_states: of the actor, (layers, B, H) each
+        :param episode_starts: (B,) 1.0 where an episode starts, which forgets the states; None where none does
         :return: (B, H), which the actor reads, and the next states
         """
-        return self._process(features, lstm_states, th.zeros(len(features), device=features.device), self.lstm_actor)
+        starts = th.zeros(len(features), device=features.device) if episode_starts is None else episode_starts
+        return self._process(features, lstm_states, starts, self.lstm_actor)
 
     # --- memory -----------------------------------------------------------------------------------------------------
 

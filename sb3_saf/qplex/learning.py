@@ -184,17 +184,20 @@ def _mix(
     return mixed
 
 
-def greedy_q_tot(policy: QPLEXPolicy, values: th.Tensor, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
+def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tensor) -> th.Tensor:
     """
     Compute Q_tot of the greedy joint action: each agent's own best one.
 
     :param policy: with its online networks
-    :param values: (G, N, A) Q_i, -inf for illegal actions
-    :param steps: observations of the teams
-    :param features: (G, N, d) of the online encoder
-    :return: (G,)
+    :param obs: rows of whole teams, game-major
+    :param values: (B, A) Q_i, -inf for illegal actions
+    :return: (B,) the same for all rows of a team
     """
-    return _mix(policy, policy.online, values, steps, features, values.argmax(dim=2)).q_tot
+    n_agents = policy.team_spaces.n_agents
+    of_teams = values.view(-1, n_agents, values.shape[1])
+    features = policy.extract_features(obs).view(-1, n_agents, policy.features_dim)
+    mixed = _mix(policy, policy.online, of_teams, policy.team_steps(obs), features, of_teams.argmax(dim=2))
+    return mixed.q_tot.repeat_interleave(n_agents)
 
 
 def _state(policy: QPLEXPolicy, state_encoder: nn.Module | None, steps: TeamSteps, features: th.Tensor) -> th.Tensor:

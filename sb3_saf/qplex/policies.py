@@ -15,7 +15,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.envs.teams import Array
+from sb3_saf.buffers.replay import TeamSteps
+from sb3_saf.envs.teams import STATE_KEY, Array
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
 from sb3_saf.policies.extractors import ObservationEncoder
@@ -44,6 +45,20 @@ class QNetworks(NamedTuple):
     actor: ActorNetwork
     mixer: Mixer
     state_encoder: nn.Module | None
+
+
+class Evaluated(NamedTuple):
+    """
+    One step of the agents' networks.
+
+    :param values: (B, A) Q_i of every action, -inf for illegal ones
+    :param latents: (B, H) what the heads read
+    :param state: what a policy with memory remembers if each agent takes its best action; None without memory
+    """
+
+    values: th.Tensor
+    latents: th.Tensor
+    state: State | None
 
 
 class QPLEXPolicy(TeamRowsPolicy):
@@ -221,14 +236,22 @@ class QPLEXPolicy(TeamRowsPolicy):
         self.set_training_mode(False)
         obs, is_batch = self.obs_to_tensor(observation)
         with th.no_grad():
-            actions, state = self._recall_and_act(self.memory, obs, state, episode_start)
+            values, _, state = self.evaluate(obs, state, episode_start)
+        actions = values.argmax(dim=1).cpu().numpy()
         return (actions if is_batch else actions.squeeze(axis=0)), state
 
-    def _recall_and_act(
-        self, memory: AgentMemory, obs: PyTorchObs, state: State | None, episode_start: np.ndarray | None
-    ) -> tuple[np.ndarray, State]:
-        own = self.encode_own(obs)
+    def evaluate(
+        self, obs: PyTorchObs, state: State | None = None, episode_start: np.ndarray | None = None
+    ) -> Evaluated:
+        """
+        Compute what the greedy actions of one step depend on; arguments as of :meth:`predict`, but tensors.
+
+        :param obs: rows, or own observations alone
+        """
+        memory, own = self.memory, self.encode_own(obs)
         features = own.of_rows()
+        if memory is None:
+            return Evaluated(self.own_q_values(obs), features, None)
         last = th.full((len(features),), -1, dtype=th.long, device=features.device)
         remembered = memory.empty(len(features), features)
         if state is not None:
@@ -241,8 +264,16 @@ class QPLEXPolicy(TeamRowsPolicy):
             last = last_action.long().masked_fill(fresh, -1)
         agent = self._agent(obs)
         hidden, cell = memory(memory.inputs(features, last, agent), remembered)
-        actions = q_values(self.actor, hidden, agent, self._action_mask(obs)).argmax(dim=1).cpu().numpy()
-        return actions, (hidden.cpu().numpy(), cell.cpu().numpy(), actions.copy())
+        values = q_values(self.actor, hidden, agent, self._action_mask(obs))
+        following = (part.cpu().numpy() for part in (hidden, cell, values.argmax(dim=1)))
+        return Evaluated(values, hidden, tuple(following))
+
+    def team_steps(self, obs: dict[str, th.Tensor]) -> TeamSteps:
+        """Return what the mixer may read of rows of whole teams, game-major."""
+        n_agents, active = self.team_spaces.n_agents, self._active(obs)
+        own = self._own(obs).unflatten(0, (-1, n_agents))
+        states = None if self.state_encoder is None else obs[STATE_KEY][::n_agents]
+        return TeamSteps(own, None, None if active is None else active[::n_agents], states)
 
 
 def _optimizer_kwargs(

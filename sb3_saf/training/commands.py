@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import torch as th
 
@@ -18,6 +18,8 @@ from sb3_saf.training.environments import HOW_TO_NAME
 from sb3_saf.training.yaml_files import parse_value
 
 USAGE_ERROR = 2
+
+Result = TypeVar("Result")
 
 
 class CommandError(Exception):
@@ -74,16 +76,37 @@ class KeyValues(argparse.Action):
         setattr(namespace, self.dest, pairs)
 
 
+def add_key_values(
+    parser: argparse._ActionsContainer, *flags: str, help: str, metavar: str = "KEY:VALUE"
+) -> None:  # argparse's own name
+    """Add an option that gives a dict, see :class:`KeyValues`."""
+    parser.add_argument(*flags, nargs="+", action=KeyValues, default={}, metavar=metavar, help=help)
+
+
+def at_least(lowest: int, default: int | None = None) -> Callable[[str], int]:
+    """Return a type for argparse: whole numbers from ``lowest`` on, and ``default``, which stands for no number."""
+
+    def whole_number(text: str) -> int:
+        value = int(text)
+        if value < lowest and value != default:
+            or_default = "" if default is None else f", or {default}"
+            raise argparse.ArgumentTypeError(f"must be at least {lowest}{or_default}, got {value}")
+        return value
+
+    return whole_number
+
+
 def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
     """Return the words that give pairs of plain data to an option of :class:`KeyValues`; none if there are no pairs."""
     return [option, *(f"{key}:{json.dumps(value)}" for key, value in pairs.items())] if pairs else []
 
 
-def run_command(program: str, command: Callable[[], object]) -> None:
+def run_command(program: str, command: Callable[[], Result]) -> Result:
     """Run a command; errors for the user, and of files, are one line on stderr and exit code 2."""
     try:
-        command()
+        result = command()
         sys.stdout.flush()
+        return result
     except BrokenPipeError:  # whoever read along has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
@@ -117,7 +140,7 @@ def import_packages(packages: Sequence[str]) -> None:
 def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -> None:
     """Add ``--env``, ``--env-kwargs`` (with the help ``of_level``) and ``--gym-packages``."""
     parser.add_argument("--env", default="TeamTogether-v0", help=HOW_TO_NAME)
-    parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help=of_level)
+    add_key_values(parser, "--env-kwargs", help=of_level)
     parser.add_argument(
         "--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import, which register environments"
     )

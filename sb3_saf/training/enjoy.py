@@ -16,10 +16,10 @@ from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.weights import load_weights
 from sb3_saf.training.algorithms import ALGOS, find_algorithm
 from sb3_saf.training.commands import (
-    CommandError,
     DefaultsFormatter,
     OneLineParser,
     add_environment_options,
+    at_least,
     import_packages,
     run_command,
     user_errors,
@@ -62,7 +62,7 @@ def make_parser() -> argparse.ArgumentParser:
     which.add_argument("--load-best", action="store_true", help="the model with the best evaluation")
     which.add_argument("--load-checkpoint", metavar="STEPS", type=int, help="the model saved after these game steps")
     which.add_argument("--load-last-checkpoint", action="store_true", help="the model that was saved last on the way")
-    parser.add_argument("--episodes", type=int, default=32, help="team episodes to measure")
+    parser.add_argument("--episodes", type=at_least(1), default=32, help="team episodes to measure")
     parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
     parser.add_argument("--seed", type=int, default=0, help="of the games, none of which was trained on")
     shown = parser.add_mutually_exclusive_group()
@@ -77,8 +77,6 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
     """Measure and show; return the team returns."""
     options = make_parser().parse_args(arguments)
     import_packages(options.gym_packages)
-    if options.episodes < 1:
-        raise CommandError(f"--episodes must be at least 1, got {options.episodes}")
     with user_errors():
         check_seed(options.seed)
         team = load_team(options)

@@ -17,6 +17,7 @@ from sb3_saf.training.commands import (
     DefaultsFormatter,
     OneLineParser,
     add_environment_options,
+    at_least,
     import_packages,
     run_command,
     user_errors,
@@ -47,7 +48,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.set_defaults(env=None)
     parser.add_argument("--algo", default="saf", help=f"of models without the files of their run: {', '.join(ALGOS)}")
     parser.add_argument("--size", default="small", help="of models without the files of their run")
-    parser.add_argument("--episodes", type=int, default=1, help="games to show")
+    parser.add_argument("--episodes", type=at_least(1), default=1, help="games to show")
     parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
     parser.add_argument("--seed", type=int, default=0, help="of the games, none of which was trained on")
     return parser

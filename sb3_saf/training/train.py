@@ -25,9 +25,10 @@ from sb3_saf.training.callbacks import RemainingTime
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
-    KeyValues,
     OneLineParser,
     add_environment_options,
+    add_key_values,
+    at_least,
     check_device,
     import_packages,
     require,
@@ -41,6 +42,11 @@ from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
 
 PROGRAM: Final = "python -m sb3_saf.train"
+#: Options that RunOptions has by the same name, with the same values.
+_SAME_NAMES: Final = (
+    *("eval_freq", "eval_episodes", "n_eval_envs", "deterministic_eval", "save_freq"),
+    *("inspect_freq", "checkpoint_freq", "device", "progress"),
+)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -68,17 +74,14 @@ def _add_what(group: argparse._ArgumentGroup) -> None:
         "--n-timesteps",
         "--game-steps",
         dest="game_steps",
-        type=int,
+        type=at_least(1),
         help="game steps to train for (SB3's total_timesteps, in agent steps, are game steps x agents); by default the "
         "size's",
     )
-    group.add_argument(
+    add_key_values(
+        group,
         "-params",
         "--hyperparams",
-        nargs="+",
-        action=KeyValues,
-        default={},
-        metavar="KEY:VALUE",
         help="settings that win over the file's: learning_rate:lin_7e-4 policy_kwargs:'{n_slots: 8}'",
     )
     group.add_argument("-conf", "--conf-file", type=Path, help="a YAML file in place of zoo_configs/ALGO.yml")
@@ -100,14 +103,14 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
         help="go on, exactly, with the latest run of this command that did not reach its end; without one, begin",
     )
     group.add_argument("--device", default="auto", help="cpu, cuda, ...")
-    group.add_argument("--num-threads", type=int, default=-1, help="threads of torch, -1 for its own choice")
+    group.add_argument("--num-threads", type=at_least(1, -1), default=-1, help="threads of torch, -1 for its own")
     group.add_argument(
         "--vec-env",
         choices=["dummy", "subproc"],
         default="dummy",
         help="subproc steps the games in one process per core; for environments other than HECOGrid, which is compiled",
     )
-    group.add_argument("--verbose", type=int, help="0 or 1; by default 0 with a progress bar, else 1")
+    group.add_argument("--verbose", type=at_least(0), help="0 or 1; by default 0 with a progress bar, else 1")
     group.add_argument(
         "-P",
         "--progress",
@@ -118,16 +121,9 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
 
 def _add_evaluation(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--eval-freq", type=int, help="game steps between evaluations, -1 for none; by default 20 a run")
-    group.add_argument("--eval-episodes", type=int, default=32, help="team episodes of an evaluation")
-    group.add_argument("--n-eval-envs", type=int, default=32, help="parallel games of an evaluation")
-    group.add_argument(
-        "--eval-env-kwargs",
-        nargs="+",
-        action=KeyValues,
-        default={},
-        metavar="KEY:VALUE",
-        help="parameters of the game that evaluation changes",
-    )
+    group.add_argument("--eval-episodes", type=at_least(1), default=32, help="team episodes of an evaluation")
+    group.add_argument("--n-eval-envs", type=at_least(1), default=32, help="parallel games of an evaluation")
+    add_key_values(group, "--eval-env-kwargs", help="parameters of the game that evaluation changes")
     group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
     group.add_argument("--save-freq", type=int, default=-1, help="game steps between saved models, -1 for none")
     group.add_argument("-tb", "--tensorboard-log", type=Path, help="folder for TensorBoard; none by default")
@@ -149,11 +145,15 @@ def _add_tuning(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--storage", help="sqlite:///FILE.db or journal FILE.log that several processes may share")
     group.add_argument("--study-name", help="of the study in the storage")
     group.add_argument("--trial-id", help="train with the settings of this trial of the study, a number or 'best'")
-    group.add_argument("--n-trials", type=int, default=100, help="trials of this process")
-    group.add_argument("--max-total-trials", type=int, help="trials of all processes together")
-    group.add_argument("--n-startup-trials", type=int, default=10, help="random trials before the sampler learns")
-    group.add_argument("--n-evaluations", type=int, default=5, help="evaluations of a trial")
-    group.add_argument("--n-jobs", type=int, default=1, help="trials at once in threads; processes scale better")
+    group.add_argument("--n-trials", type=at_least(1), default=100, help="trials of this process")
+    group.add_argument("--max-total-trials", type=at_least(1), help="trials of all processes together")
+    group.add_argument(
+        "--n-startup-trials", type=at_least(0), default=10, help="random trials before the sampler learns"
+    )
+    group.add_argument("--n-evaluations", type=at_least(1), default=5, help="evaluations of a trial")
+    group.add_argument(
+        "--n-jobs", type=at_least(1, -1), default=1, help="trials at once in threads; processes scale better"
+    )
     group.add_argument("--sampler", choices=["random", "tpe", "auto"], default="tpe", help="Optuna's sampler")
     group.add_argument("--pruner", choices=["halving", "median", "none"], default="median", help="Optuna's pruner")
     group.add_argument(
@@ -176,13 +176,6 @@ def train(arguments: Sequence[str] | None = None) -> None:
 
 # --- options ----------------------------------------------------------------------------------------------------------
 
-#: The lowest value of options that count, beside the -1 for "none" or "by default" that some take.
-_LOWEST: Final = {
-    **dict.fromkeys(("eval_episodes", "n_eval_envs", "n_trials", "n_evaluations"), 1),
-    **dict.fromkeys(("max_total_trials", "game_steps"), 1),
-    **dict.fromkeys(("n_startup_trials", "verbose"), 0),
-}
-
 
 def _check(options: argparse.Namespace) -> None:
     """Say what can be said before anything is made, and fill in the defaults that depend on where we are."""
@@ -190,13 +183,6 @@ def _check(options: argparse.Namespace) -> None:
         if options.seed != -1:
             check_seed(options.seed)
         check_device(options.device)
-    for name, lowest in _LOWEST.items():
-        value = getattr(options, name)
-        if value is not None and value < lowest:
-            raise CommandError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
-    for name in ("num_threads", "n_jobs"):
-        if getattr(options, name) != -1 and getattr(options, name) < 1:
-            raise CommandError(f"--{name.replace('_', '-')} must be at least 1, or -1, got {getattr(options, name)}")
     if options.resume and (options.optimize_hyperparameters or options.trial_id is not None):
         raise CommandError(
             "--resume is for training with settings, without -optimize and --trial-id; a study goes on by itself when "
@@ -243,23 +229,15 @@ def _fixed(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run_options(options: argparse.Namespace, settings: Settings, **more: Any) -> RunOptions:
-    log = options.tensorboard_log
+    log, folder_name = options.tensorboard_log, settings.environment.folder_name
     return RunOptions(
-        eval_freq=options.eval_freq,
-        eval_episodes=options.eval_episodes,
-        n_eval_envs=options.n_eval_envs,
-        deterministic_eval=options.deterministic_eval,
-        save_freq=options.save_freq,
-        inspect_freq=options.inspect_freq,
-        checkpoint_freq=options.checkpoint_freq,
-        tensorboard_log=None if log is None else log / settings.environment.folder_name,
-        model_name=settings.environment.folder_name,
+        **{name: getattr(options, name) for name in _SAME_NAMES},
+        tensorboard_log=None if log is None else log / folder_name,
+        model_name=folder_name,
         initial_model=options.trained_agent,
         log_interval=None if options.log_interval == -1 else max(0, options.log_interval),
-        device=options.device,
         n_cpus=min(os.cpu_count() or 1, settings.n_envs) if options.vec_env == "subproc" else 1,
         num_threads=None if options.num_threads == -1 else options.num_threads,
-        progress=options.progress,
         verbose=min(1, options.verbose),
         **more,
     )
