@@ -9,7 +9,6 @@ import pytest
 
 from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Level, find_experiment, own_experiment
 from sb3_saf.experiments.grid import Cell, Grid, RunConfig, Selection, Shard, expand, merge
-from sb3_saf.experiments.plan import duration
 
 THREE_SEEDS = Selection((0, 1, 2))
 PAPER = RunConfig("paper")
@@ -166,11 +165,3 @@ def test_an_experiment_of_ones_own() -> None:
     for name in ("joint", "../x", ""):
         with pytest.raises(ValueError, match="needs a name of letters"):
             own_experiment(name, ["a.b"], {})
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.2, "1 s"), (59.6, "1 min"), (3_661, "1 h 1 min"), (3_605, "1 h"), (90_000, "1 d 1 h"), (86_460, "1 d")],
-)
-def test_durations(seconds: float, text: str) -> None:
-    assert duration(seconds) == text

@@ -52,7 +52,12 @@ def page(folder: Path) -> str:
 def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> None:
     assert len(read_table(folder / "coordination" / "table.csv")) == N_CELLS
     assert "missing" not in page
-    names = {"levels-coordination.png", "aggregates.png", *(f"curve-{level}.png" for level in LEVELS)}
+    names = {
+        "levels-coordination.png",
+        "differences-coordination.png",
+        "aggregates.png",
+        *(f"curve-{level}.png" for level in LEVELS),
+    }
     assert {path.name for path in (folder / "coordination").glob("*.png")} == names
     assert all(f"({name})" in page for name in names)
     assert "Size `smoke`: 4 agents, 6 treasures, 80 game steps of training. saf, ippo and a random team" in page
@@ -172,9 +177,9 @@ def test_reference_teams_are_drawn_where_they_belong(
     monkeypatch.setattr(Figure, "savefig", labels)
     report(shutil.copytree(folder, tmp_path / "part"), "--scale", str(scale))
     curves = {"saf (2 seeds)", "ippo (2 seeds)", "random (2 seeds)"}
-    assert found["curve-TeamSupport-c1-h1.png"] == {*curves, "scripted"}
+    assert found["curve-TeamSupport-c1-h1.png"] == {*curves, "reference: scripted"}
     assert found["curve-TeamSupport-c2-h1.png"] == found["curve-TeamTogether-c1-h1.png"] == curves
-    assert found["levels-coordination.png"] == {"saf", "ippo", "random", "scripted"}
+    assert found["levels-coordination.png"] == {"saf", "ippo", "random", "reference: scripted"}
     scale.write_text("a,b\n")
     with pytest.raises(ValueError, match=r"is no file of reference teams: .* name, mean is missing"):
         read_scale(scale)

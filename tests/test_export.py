@@ -790,8 +790,8 @@ def test_hostile_models_change_nothing_and_run_nothing(tmp_path: Path) -> None:
     cases = {
         "does not hold tensors alone": saved({**before, name: Bomb(tmp_path / "ran")}),
         "must map names": saved([1, 2]),
-        "lacks the weights": saved({n: t for n, t in before.items() if n != name}),
-        "unlike the model": saved({**before, "zzz": before[name]}),
+        "lacks the tensor": saved({n: t for n, t in before.items() if n != name}),
+        "the network does not have": saved({**before, "zzz": before[name]}),
         "expected ": saved({**before, name: th.zeros(3)}),
         "has NaN": saved({**before, name: before[name] * float("nan")}),
         "no plain tensor": saved({**before, name: 3}),

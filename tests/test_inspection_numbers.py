@@ -10,7 +10,6 @@ import numpy.typing as npt
 import pytest
 from gymnasium import spaces
 
-from sb3_saf.inspection.attention import attention_of
 from sb3_saf.inspection.calibration import calibrate, lambda_returns, reliability
 from sb3_saf.inspection.games import ReturnScale
 from sb3_saf.inspection.pool import (
@@ -21,7 +20,7 @@ from sb3_saf.inspection.pool import (
     zone_dependence,
 )
 from sb3_saf.inspection.recording import EpisodeRecording
-from sb3_saf.inspection.scalars import pool_scalars, targets, team_scalars
+from sb3_saf.inspection.scalars import attention_of, pool_scalars, targets, team_scalars
 
 Array = npt.NDArray[Any]
 

@@ -433,7 +433,7 @@ def test_acting_reads_nothing_but_own_observations() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"mixer": "qmixx"}, "did you mean 'qmix'"),
+        ({"mixer": "qmixx"}, "mixer must be one of 'vdn', 'qmix', 'qplex', got 'qmixx'"),
         ({"batch_size": 300}, "batch_size must be at most buffer_size, got 300 and 200 game steps"),
         ({"train_freq": (1, "episode")}, "number of game steps"),
         ({"train_freq": 0}, "train_freq must be an integer of at least 1"),

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 import torch as th
 
-from sb3_saf.qplex.mixers import JointChoice, Mixer, QMIXMixer, QPLEXMixer, VDNMixer, check_mixer
+from sb3_saf.qplex.mixers import JointChoice, Mixer, QMIXMixer, QPLEXMixer, VDNMixer
 
 STATE_DIM, N_ACTIONS = 6, 3
 
@@ -111,10 +111,3 @@ def test_agents_that_take_no_part_do_not_count(name: str) -> None:
         for x, y, a in ((0.0, 0.0, 0), (-5.0, 7.0, 2))
     ]
     assert th.equal(*totals)
-
-
-def test_unknown_mixers_are_refused_with_the_nearest() -> None:
-    with pytest.raises(ValueError, match="did you mean 'qplex'"):
-        check_mixer("qplx")
-    with pytest.raises(ValueError, match="'vdn', 'qmix', 'qplex', got 3"):
-        check_mixer(3)

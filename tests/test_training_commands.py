@@ -19,6 +19,7 @@ import torch as th
 import yaml
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hecogrid_envs.play import main as play_main
@@ -32,7 +33,9 @@ from sb3_saf.training import train as zoo_train
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.callbacks import GameStepsProgressBar, RemainingTime
 from sb3_saf.training.environments import find_environment
-from sb3_saf.training.settings import load_settings
+from sb3_saf.training.run import CHECKPOINTS, RunOptions
+from sb3_saf.training.run import train as train_settings
+from sb3_saf.training.settings import Settings, load_settings
 
 ENV = "TeamTogether-v0"
 
@@ -55,8 +58,12 @@ def equal(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:
 
 
 @pytest.fixture(scope="module")
-def by_hand() -> dict[str, th.Tensor]:
-    settings = load_settings("saf", ENV, "smoke")
+def settings() -> Settings:
+    return load_settings("saf", ENV, "smoke")
+
+
+@pytest.fixture(scope="module")
+def by_hand(settings: Settings) -> dict[str, th.Tensor]:
     model = settings.make_model(settings.make_env(3), 3)
     model.learn(settings.total_timesteps)
     return weights(model)
@@ -67,9 +74,43 @@ def test_the_command_trains_what_settings_train(by_hand: dict[str, th.Tensor], t
     assert equal(by_hand, weights(PPO.load(run / f"{ENV}.zip")))
 
 
-def test_another_seed_trains_something_else(by_hand: dict[str, th.Tensor], tmp_path: Path) -> None:
-    run = train(tmp_path, "--eval-freq", "-1", "--seed", "4")
-    assert not equal(by_hand, weights(PPO.load(run / f"{ENV}.zip")))
+class Interrupt(BaseCallback):
+    """Raise an error after so many agents' steps."""
+
+    def __init__(self, after: int, error: type[BaseException]) -> None:
+        super().__init__()
+        self.after, self.error = after, error
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.after:
+            raise self.error
+        return True
+
+
+def test_options_do_not_change_what_is_learned(
+    settings: Settings, by_hand: dict[str, th.Tensor], tmp_path: Path
+) -> None:
+    assert equal(by_hand, weights(train_settings(settings, 3)))
+    options = RunOptions(
+        eval_freq=60, eval_episodes=4, save_freq=100, inspect_freq=200, checkpoint_freq=None, tensorboard_log=tmp_path
+    )
+    folder = tmp_path / "run"
+    assert equal(by_hand, weights(train_settings(settings, 3, folder, options)))
+    assert {"model.zip", "best_model.zip", "evaluations.npz", "monitor.csv", "rl_model_400_steps.zip"} <= {
+        path.name for path in folder.iterdir()
+    }
+    assert not (folder / CHECKPOINTS).exists()
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_interrupted_run_goes_on(
+    error: type[BaseException], settings: Settings, by_hand: dict[str, th.Tensor], tmp_path: Path
+) -> None:
+    options = RunOptions(checkpoint_freq=1)
+    with pytest.raises(error):
+        train_settings(settings, 3, tmp_path, options, [Interrupt(900, error)])
+    assert (tmp_path / "model.zip").is_file() == (error is KeyboardInterrupt)
+    assert equal(by_hand, weights(train_settings(settings, 3, tmp_path, options, [Interrupt(10**9, error)])))
 
 
 @pytest.mark.parametrize("algo", ["saf", "qplex"])
@@ -179,6 +220,8 @@ def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str
     again = ("-i", str(first), "-params", "learning_rate:1e-30")
     second = train(tmp_path, "--eval-freq", "-1", "-n", "40", *again) / f"{ENV}.zip"
     assert f"the weights and the optimiser of {first}; no code is loaded" in capsys.readouterr().out
+    other = ["--algo", "mappo", "--size", "smoke", "--env", ENV, "-f", str(tmp_path), "-i", str(first)]
+    assert "do not fit MAPPOPolicy" in failed(other, capsys)
     pairs = zip(*(weights(PPO.load(path)).values() for path in (first, second)), strict=True)
     assert all(th.allclose(a.float(), b.float(), atol=1e-5) for a, b in pairs)
 
@@ -417,6 +460,7 @@ def test_help_tells_defaults_and_units() -> None:
         zoo_enjoy.main,
         *(partial(zoo_plot.main, [kind]) for kind in ("curves", "levels", "aggregate")),
         zoo_plot.main,
+        *(partial(experiments_main, [name]) for name in ("list", "plan", "run", "report", "check", "cell")),
         experiments_main,
         quickstart.main,
         play_main,

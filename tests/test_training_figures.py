@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
 pytest.importorskip("rliable")
@@ -13,7 +14,7 @@ from rliable import metrics
 
 from sb3_saf import confidence_interval
 from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_levels, method_styles
+from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_differences, draw_levels, method_styles
 from sb3_saf.training.statistics import (
     interquartile_means,
     learning_curve,
@@ -143,6 +144,28 @@ def test_aggregates_are_drawn_at_their_values() -> None:
     marks = [line.get_xdata()[0] for line in left.get_lines()]  # type: ignore[index]
     assert marks == pytest.approx([0.5, 0.2])
     assert [line.get_label() for line in right.get_lines()] == ["saf", "mappo"]
+
+
+def test_differences_are_drawn_at_their_values_by_level() -> None:
+    rows = [("ippo", "c=1", 2.0, 1.0, 4.0), ("mappo", "c=1", -1.0, -1.5, -0.5), ("ippo", "c=2", 0.5, np.nan, np.nan)]
+    table = pd.DataFrame(rows, columns=["method", "level", "value", "low", "high"])
+    (axes,) = draw_differences(table).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["c=1", "c=2"]
+    assert axes.get_yticks().tolist() == [0.5, 2.0]
+    drawn = {container.get_label(): container for container in axes.containers}
+    dots, _, (bars,) = drawn["ippo"]
+    assert dots.get_xydata().tolist() == [[2.0, 0.0], [0.5, 2.0]]
+    assert bars.get_segments()[0].tolist() == [[1.0, 0.0], [4.0, 0.0]]
+
+
+def test_reference_teams_are_lines_over_the_bars_of_their_level() -> None:
+    bars = pd.DataFrame({"method": "saf", "seed": 0, "c": [1, 2, 1], "score": 1.0, "task": ["a", "a", "b"]})
+    lines = pd.DataFrame({"name": "script", "c": [1, 2, 3], "score": [5.0, 6.0, 7.0], "task": "a"})
+    with_lines, without = draw_levels(bars, "c", panel="task", references=lines).axes
+    (drawn,) = (each for each in with_lines.collections if each.get_label() == "script")
+    assert isinstance(drawn, LineCollection)
+    assert [segment[0].tolist() for segment in drawn.get_segments()] == [[-0.47, 5.0], [0.53, 6.0]]
+    assert "script" not in [each.get_label() for each in without.collections]
 
 
 def test_methods_keep_their_styles_and_none_looks_like_another() -> None:

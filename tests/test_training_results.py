@@ -24,7 +24,7 @@ from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.runs import Run, describe, find_runs, setting_names, training_curve
-from sb3_saf.training.settings import load_settings, saved_settings
+from sb3_saf.training.settings import load_settings
 from sb3_saf.training.watching import play
 
 ENV = "TeamTogether-v0"
@@ -312,8 +312,3 @@ def test_mistakes_in_plot_are_one_line(
 ) -> None:
     folder = [] if "-f" in options else ["-f", str(logs)]
     assert words in failed(zoo_plot.main, [*options[:1], *folder, *options[1:]], capsys)
-
-
-def test_a_saved_level_can_be_changed(logs: Path) -> None:
-    run = find_runs(logs, ["saf"])[0]
-    assert saved_settings(run.config, {"heterogeneity": 3}).env_kwargs["heterogeneity"] == 3

@@ -11,7 +11,7 @@ import pytest
 import torch as th
 import yaml
 
-from sb3_saf.export.weights import _entry, _tensors
+from sb3_saf.export.weights import read_weights
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.commands import check_device
@@ -52,7 +52,7 @@ def struck(monkeypatch: pytest.MonkeyPatch, error: type[BaseException], evaluati
 
 def left(run: Path) -> dict[str, Any]:
     """What a run leaves."""
-    weights = _tensors(_entry(run / f"{ENV}.zip", 1 << 24), 1 << 24, run)
+    weights = read_weights(run / f"{ENV}.zip")
     with np.load(run / "evaluations.npz") as arrays:
         evaluations = {name: arrays[name].tobytes() for name in arrays.files}
     episodes = [line.rsplit(",", 1)[0] for line in (run / "monitor.csv").read_text().splitlines()[1:]]

@@ -23,7 +23,6 @@ from sb3_saf.suites.registry import suites
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.seeds import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ENV_IDS, SIZES, Settings, load_settings, saved_settings
-from sb3_saf.training.values import algorithm_arguments
 from sb3_saf.training.yaml_files import Size, config_names, load_yaml, read_config
 
 ENV = "TeamTogether-v0"
@@ -165,6 +164,7 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"env_kwargs": {"coordination": 11}}, "coordination must be an integer from 1 to 10"),
         ({"env_kwargs": {"grid_size": 6}}, "n_treasures must be"),
         ({"overrides": {"learning_rat": 1}}, r"unknown setting .* \(did you mean 'learning_rate'\?\)"),
+        ({"overrides": {"seed": 1}}, "unknown setting 'seed'"),  # runs decide it
         ({"overrides": {"n_timesteps": 1, "game_steps": 1}}, "say the same thing"),
         ({"overrides": {"normalize": "yes"}}, "normalize must be true or false or a mapping"),
         ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),
@@ -284,10 +284,6 @@ def test_monitor_is_left_in_the_folder_and_time_limit_reaches_the_wrapper(tmp_pa
     env.step(np.zeros(8, dtype=int))
     assert (tmp_path / "run" / "monitor.csv").is_file()
     env.close()
-
-
-def test_runs_decide_what_settings_cannot_name() -> None:
-    assert {"env", "seed", "device", "verbose", "policy", "tensorboard_log"}.isdisjoint(algorithm_arguments(PPO))
 
 
 def test_every_file_is_installed_with_the_packages() -> None:

@@ -71,11 +71,7 @@ def test_trials_are_evaluated_n_times_in_game_steps(tmp_path: Path) -> None:
     assert trial.state is TrialState.COMPLETE
     assert sorted(trial.intermediate_values) == [1, 2, 3, 4]
     assert trial.value == trial.intermediate_values[4]
-
-
-def test_tuning_leaves_no_run_behind(tmp_path: Path) -> None:
-    tune(tmp_path)
-    assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))
+    assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))  # no run is left behind
     assert list((tmp_path / "logs").glob("saf/report_*.csv"))
 
 
@@ -109,20 +105,15 @@ def test_a_failed_trial_is_never_complete(
     assert (trial.state, trial.value) == (TrialState.PRUNED, None)
 
 
-def test_trial_zero_is_a_trial(tmp_path: Path) -> None:
+def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Path) -> None:
     study = tune(tmp_path)
     options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
     for number, trial in enumerate(("0", "best"), start=1):
         zoo_train.main([*SMOKE, *options, "--trial-id", trial])
         saved = config_of(tmp_path / "logs" / "saf" / f"{ENV}_{number}")["hyperparams"]
         assert saved["learning_rate"] == study.trials[0].params["learning_rate"]
-
-
-def test_what_the_user_gives_wins_over_a_trial(tmp_path: Path) -> None:
-    tune(tmp_path)
-    options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
     zoo_train.main([*SMOKE, *options, "--trial-id", "0", "-params", "learning_rate:0.5"])
-    assert config_of(tmp_path / "logs" / "saf" / f"{ENV}_1")["hyperparams"]["learning_rate"] == 0.5
+    assert config_of(tmp_path / "logs" / "saf" / f"{ENV}_3")["hyperparams"]["learning_rate"] == 0.5
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
-
-import torch as th
 
 from sb3_saf.experiments.cell import Job, run_job, versions
 from sb3_saf.experiments.files import differences, read_json
 from sb3_saf.experiments.grid import Cell
 from sb3_saf.experiments.results import Results
+from sb3_saf.export.weights import read_weights
 
 
 class Check(NamedTuple):
@@ -88,15 +85,8 @@ def _curve(path: Path) -> list[list[str]]:
 def _difference_of_weights(before: Path, after: Path) -> str:
     if not before.exists():
         return "the model is missing"
-    ours, theirs = _weights(before), _weights(after)
+    ours, theirs = read_weights(before), read_weights(after)
     if list(ours) != list(theirs):
         return "other names"
     largest = max(float((ours[name].double() - theirs[name].double()).abs().max()) for name in ours)
     return f"differ by up to {largest:.3g}" if largest > 0 else ""
-
-
-def _weights(path: Path) -> dict[str, th.Tensor]:
-    with zipfile.ZipFile(path) as model:
-        content = io.BytesIO(model.read("policy.pth"))
-    weights: dict[str, th.Tensor] = th.load(content, map_location="cpu", weights_only=True)
-    return weights

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import pandas as pd
@@ -12,7 +12,7 @@ import pandas as pd
 from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experiment, Level, View
 from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.tables import FEWEST_SEEDS, compare, complete, of_view, strata
+from sb3_saf.experiments.tables import FEWEST_SEEDS, comparisons, complete, of_view, strata
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
@@ -52,11 +52,11 @@ def page(content: Content) -> str:
     sections = [
         _head(content),
         _missing(content),
-        _pictures(content, "levels-", "aggregates"),
+        _pictures(content, "levels-", "differences-", "aggregates"),
         *(means(table, view) for view in views),
         *(losses(table, view) for view in views if table["max_return"].notna().all()),  # levels of HECOGrid get harder
         aggregates(content.experiment, table),
-        *(comparisons(table, view) for view in views),
+        *(_comparisons(table, view) for view in views),
         _pictures(content, "curve-"),
         _reproduction(content),
     ]
@@ -213,14 +213,12 @@ def _estimates(head: Sequence[str], methods: Iterable[str], columns: Iterable[Ma
     return _table(head, [[method, *(_show(column[method], 3) for column in found)] for method in methods])
 
 
-def comparisons(table: pd.DataFrame, view: View) -> str:
+def _comparisons(table: pd.DataFrame, view: View) -> str:
     """Return the first method against each other one, seed by seed."""
-    rows = of_view(table, view)
-    methods = list(dict.fromkeys(rows["method"]))
-    if len(methods) < 2:
+    compared = comparisons(table, view)
+    if not compared:
         return ""
-    ours = "saf" if "saf" in methods else methods[0]
-    body = list(_compared(rows, view, ours, [method for method in methods if method != ours]))
+    ours = compared[0].ours
     head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", f"{ours} is"]
     text = (
         "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
@@ -228,18 +226,11 @@ def comparisons(table: pd.DataFrame, view: View) -> str:
         f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner "
         "by chance now and then."
     )
+    body = []
+    for task, level, _, other, found in compared:
+        numbers = [_show(found.first), _show(found.second), _show(found.difference)]
+        body.append([task, str(level), other, ", ".join(map(str, found.seeds)), *numbers, found.verdict])
     return "\n".join([f"## Paired comparisons by {view.axis}{view.suffix}", "", text, "", *_table(head, body)])
-
-
-def _compared(rows: pd.DataFrame, view: View, ours: str, others: Sequence[str]) -> Iterator[list[str]]:
-    names = {level.slug: str(level) for level in view.levels}
-    for (task, level), here in rows.groupby(["task", "level"], sort=False):
-        for other in others:
-            first, second = (here.loc[here["method"] == method, ["seed", "return_mean"]] for method in (ours, other))
-            found = compare(first, second)
-            if found is not None:
-                numbers = [_show(found.first), _show(found.second), _show(found.difference)]
-                yield [str(task), names[level], other, ", ".join(map(str, found.seeds)), *numbers, found.verdict]
 
 
 def _reproduction(content: Content) -> str:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
+from datetime import timedelta
 
 from sb3_saf.experiments.definitions import Experiment
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, expand
 from sb3_saf.experiments.results import Results
-
-_UNITS: Final = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def make_plan(experiment: Experiment, selection: Selection, config: RunConfig, results: Results) -> str:
@@ -34,7 +32,11 @@ def make_plan(experiment: Experiment, selection: Selection, config: RunConfig, r
     if seconds:
         rate = sum(steps[cell.id] for cell in finished) / seconds
         lines.append(f"rate        {rate:,.0f} game steps/s of one worker in the finished cells")
-        lines.append(f"time        about {duration(left / rate)} of one worker at this rate" if left else "")
+        lines.append(
+            f"time        about {timedelta(seconds=round(left / rate))} (h:mm:ss) of one worker at this rate"
+            if left
+            else ""
+        )
     return "\n".join(line for line in lines if line)
 
 
@@ -56,16 +58,3 @@ def _factors(cells: Sequence[Cell]) -> str:
         "seeds": {cell.seed for cell in cells},
     }
     return " x ".join(f"{len(values)} {name}" for name, values in counts.items())
-
-
-def duration(seconds: float) -> str:
-    """Return a time in two units at most: 2 d 3 h."""
-    left = max(1, round(seconds))
-    parts = []
-    for unit, size in _UNITS:
-        if left >= size:
-            parts.append(f"{left // size} {unit}")
-            left %= size
-        elif parts:
-            break
-    return " ".join(parts[:2])

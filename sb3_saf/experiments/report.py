@@ -16,6 +16,7 @@ from sb3_saf.experiments.grid import Cell, RunConfig, Selection
 from sb3_saf.experiments.page import Content, page
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.tables import (
+    comparisons,
     complete,
     frame_of_curves,
     frame_of_tests,
@@ -24,7 +25,7 @@ from sb3_saf.experiments.tables import (
     strata,
     write_table,
 )
-from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_levels
+from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_differences, draw_levels
 from sb3_saf.training.statistics import require_columns, score_matrices
 
 #: Columns of a file of reference teams; all others are parameters of the environment.
@@ -97,7 +98,7 @@ def read_scale(path: Path) -> pd.DataFrame:
 
 
 def _references(scale: pd.DataFrame | None, cells: Iterable[Cell], config: RunConfig) -> pd.DataFrame:
-    """Return the reference teams of the levels of some cells: columns ``task``, ``level``, ``name``, ``mean``."""
+    """Return the reference teams of the levels of some cells: columns ``task``, ``level``, ``name``, ``score``."""
     found = []
     if scale is not None:
         parameters = [name for name in scale.columns if name not in _SCALE_COLUMNS]
@@ -108,7 +109,7 @@ def _references(scale: pd.DataFrame | None, cells: Iterable[Cell], config: RunCo
             for name in parameters:
                 rows = rows[rows[name] == here.get(name)]
             found += [(cell.task, level.slug, row["name"], row["mean"]) for _, row in rows.iterrows()]
-    return pd.DataFrame(found, columns=["task", "level", "name", "mean"])
+    return pd.DataFrame(found, columns=["task", "level", "name", "score"])
 
 
 class _Drawer:
@@ -116,28 +117,37 @@ class _Drawer:
 
     def __init__(self, experiment: Experiment, table: pd.DataFrame, curves: pd.DataFrame, scale: pd.DataFrame) -> None:
         self._experiment, self._table, self._curves = experiment, table, curves
-        known = set(table["method"])
-        self._scale = scale[~scale["name"].isin(known)]
+        others = scale[~scale["name"].isin(set(table["method"]))]
+        self._scale = others.assign(name="reference: " + others["name"].astype(str))
         self._is_hecogrid = bool(table["max_return"].notna().all())
         self._y_label = TEAM_RETURN if self._is_hecogrid else "team return"
 
     def views(self) -> dict[str, Figure]:
-        """Return one bar chart for each axis of levels, with reference teams beside the methods."""
+        """Return, for each axis of levels, a bar chart with reference teams as lines, and the paired differences."""
         figures = {}
         for view in self._experiment.views:
             shown = of_view(self._table, view)
             if shown.empty:
                 continue
-            positions = {level.slug: view.position(level) for level in view.levels}
-            here = self._scale[self._scale["level"].isin(positions) & self._scale["task"].isin(set(shown["task"]))]
-            reference = here.rename(columns={"name": "method", "mean": "score"})
-            reference = reference.assign(seed=0, **{view.axis: reference["level"].map(positions)})
-            columns = ["task", "method", "seed", "score", view.axis]
-            rows = _together(shown.assign(score=shown["return_mean"])[columns], reference[columns])
-            title = f"{self._experiment.name}{view.suffix}"
-            figures[f"levels-{view.axis.replace(' = ', '-')}.png"] = draw_levels(
-                rows, view.axis, title=title, panel="task", y_label=self._y_label
+            name, positions = view.axis.replace(" = ", "-"), {level.slug: view.position(level) for level in view.levels}
+            here = self._scale[self._scale["level"].isin(positions)]
+            figures[f"levels-{name}.png"] = draw_levels(
+                shown.assign(score=shown["return_mean"]),
+                view.axis,
+                title=f"{self._experiment.name}{view.suffix}",
+                panel="task",
+                y_label=self._y_label,
+                references=here.assign(**{view.axis: here["level"].map(positions)}),
             )
+            compared = [one for one in comparisons(self._table, view) if one.other != RANDOM]
+            if compared:
+                rows = [(one.task, one.other, str(one.level), *one.found.difference) for one in compared]
+                figures[f"differences-{name}.png"] = draw_differences(
+                    pd.DataFrame(rows, columns=["task", "method", "level", "value", "low", "high"]),
+                    title=f"{compared[0].ours} minus others, seed by seed{view.suffix}",
+                    panel="task",
+                    x_label="difference of team returns, 95 % interval",
+                )
         return figures
 
     def aggregates(self) -> dict[str, Figure]:
@@ -171,7 +181,7 @@ class _Drawer:
                 title=f"{self._experiment.name}: {task}, {names[level]}",
                 panel="panel",
                 y_label=self._y_label,
-                references=dict(zip(scale["name"], scale["mean"], strict=True)),
+                references=dict(zip(scale["name"], scale["score"], strict=True)),
             )
             figure.axes[1].set_xlabel("processor time of the training (s)")
             slug = str(task).replace(":", "-")

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from textwrap import shorten
 from typing import NamedTuple
 
@@ -21,7 +22,6 @@ from sb3_saf.experiments.definitions import Experiment
 from sb3_saf.experiments.engines import Engine
 from sb3_saf.experiments.files import read_json, write_json, write_text
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
-from sb3_saf.experiments.plan import duration
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.tables import write_table
 
@@ -220,4 +220,4 @@ class _Progress:
         if not played or not left:
             return ""
         rate = played / (time.monotonic() - self._clock)
-        return f"; {rate:,.0f} game steps/s, about {duration(left / rate)} left"
+        return f"; {rate:,.0f} game steps/s, about {timedelta(seconds=round(left / rate))} (h:mm:ss) left"

@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_saf.experiments.definitions import RANDOM, Experiment, View
+from sb3_saf.experiments.definitions import RANDOM, Experiment, Level, View
 from sb3_saf.experiments.files import write_text
 from sb3_saf.experiments.grid import Cell, Grid, expand, merge
 from sb3_saf.experiments.results import Results
@@ -212,20 +212,38 @@ class Comparison(NamedTuple):
     difference: Estimate
 
     @property
-    def sign(self) -> int:
-        """Return 1 if the first is higher, -1 if the second is, 0 if nothing can be said."""
-        if len(self.seeds) < FEWEST_SEEDS:
-            return 0
-        if self.first.low > self.second.high and self.difference.low > 0:
-            return 1
-        return -int(self.first.high < self.second.low and self.difference.high < 0)
-
-    @property
     def verdict(self) -> str:
-        """Return the sign in words."""
+        """Return whether the first is higher or lower, or why nothing can be said."""
         if len(self.seeds) < FEWEST_SEEDS:
             return f"no winner: fewer than {FEWEST_SEEDS} seeds"
-        return {1: "higher", -1: "lower", 0: "no winner: intervals overlap"}[self.sign]
+        if self.first.low > self.second.high and self.difference.low > 0:
+            return "higher"
+        if self.first.high < self.second.low and self.difference.high < 0:
+            return "lower"
+        return "no winner: intervals overlap"
+
+
+class Compared(NamedTuple):
+    """The first method of a view beside another one, at a level of a task."""
+
+    task: str
+    level: Level
+    ours: str
+    other: str
+    found: Comparison
+
+
+def comparisons(table: pd.DataFrame, view: View) -> list[Compared]:
+    """Compare SAF, or the first method where it is not there, with each other one, where they have common seeds."""
+    rows, levels = of_view(table, view), {level.slug: level for level in view.levels}
+    methods = list(dict.fromkeys(rows["method"]))
+    ours = "saf" if "saf" in methods else next(iter(methods), RANDOM)
+    return [
+        Compared(str(task), levels[level], ours, other, found)
+        for (task, level), here in rows.groupby(["task", "level"], sort=False)
+        for other in methods
+        if other != ours and (found := compare(*(here[here["method"] == one] for one in (ours, other)))) is not None
+    ]
 
 
 def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
@@ -236,7 +254,8 @@ def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
     :param second: the same
     :return: None if they have no seed in common
     """
-    pairs = first.merge(second, on="seed", suffixes=("_first", "_second")).sort_values("seed")
+    columns = ["seed", "return_mean"]
+    pairs = first[columns].merge(second[columns], on="seed", suffixes=("_first", "_second")).sort_values("seed")
     if pairs.empty:
         return None
     ours, theirs = (pairs[f"return_mean_{side}"].to_numpy(dtype=np.float64) for side in ("first", "second"))

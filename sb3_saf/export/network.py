@@ -6,6 +6,7 @@ Letters: K rows, d features, N agents, U policies, P parameters of one policy's 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final, get_args
 
 import numpy as np
@@ -201,7 +202,7 @@ def load_network(manifest: Manifest, weights: bytes) -> tuple[AgentNetwork, Arra
     atlas = _taken_atlas(manifest, tensors)
     with th.device("meta"):
         network = AgentNetwork.of(manifest, atlas)
-    _check_tensors(network.tensors(), tensors)
+    check_tensors(network.tensors(), tensors, WEIGHTS_FILE)
     network.load_state_dict({name: tensors[_name_in_file(name)] for name in network.state_dict()}, assign=True)
     return network.requires_grad_(False).eval(), atlas
 
@@ -211,7 +212,7 @@ def _taken_atlas(manifest: Manifest, tensors: dict[str, th.Tensor]) -> Array | N
     reads_pixels = manifest.encoder is not None and manifest.encoder.name != "MLPEncoder"
     if shape is None or (ATLAS not in tensors and not reads_pixels):
         return None
-    _check_tensors({ATLAS: th.empty(shape, dtype=th.uint8, device="meta")}, tensors, all_of_them=False)
+    check_tensors({ATLAS: th.empty(shape, dtype=th.uint8, device="meta")}, tensors, WEIGHTS_FILE, subset=True)
     atlas: Array = np.array(tensors.pop(ATLAS).numpy())
     return atlas
 
@@ -228,17 +229,22 @@ def _check_layers(manifest: Manifest, n_tensors: int) -> None:
         raise ExportError(f"{MANIFEST_FILE} describes at least {needed} tensors, {WEIGHTS_FILE} has {n_tensors}")
 
 
-def _check_tensors(expected: dict[str, th.Tensor], found: dict[str, th.Tensor], all_of_them: bool = True) -> None:
+def check_tensors(
+    expected: Mapping[str, th.Tensor], found: Mapping[Any, Any], source: str, remedy: str = "", subset: bool = False
+) -> None:
+    """Compare tensors of a file, ``source``, with a network's; an ExportError says what is wrong, and the remedy."""
     if missing := sorted(expected.keys() - found.keys()):
-        raise ExportError(f"{WEIGHTS_FILE} lacks the tensor {missing[0]!r}")
-    if all_of_them and (unknown := sorted(found.keys() - expected.keys())):
-        raise ExportError(f"{WEIGHTS_FILE} has a tensor that the actor does not have: {unknown[0][:80]!r}")
+        raise ExportError(f"{source} lacks the tensor {missing[0]!r}{remedy}")
+    if not subset and (unknown := sorted(map(str, found.keys() - expected.keys()))):
+        raise ExportError(f"{source} has a tensor that the network does not have: {unknown[0][:80]!r}{remedy}")
     for name, wanted in expected.items():
         tensor = found[name]
+        if not isinstance(tensor, th.Tensor) or tensor.layout != th.strided or tensor.is_quantized:
+            raise ExportError(f"{source}: {name!r} is no plain tensor")
         if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
             raise ExportError(
-                f"{WEIGHTS_FILE}: expected {name!r} of shape {tuple(wanted.shape)} and {wanted.dtype}, got "
-                f"{tuple(tensor.shape)} and {tensor.dtype}"
+                f"{source}: expected {name!r} of shape {tuple(wanted.shape)} and {wanted.dtype}, got "
+                f"{tuple(tensor.shape)} and {tensor.dtype}{remedy}"
             )
-        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise ExportError(f"{WEIGHTS_FILE}: {name!r} has NaN or infinity")
+        if not bool(tensor.isfinite().all()):
+            raise ExportError(f"{source}: {name!r} has NaN or infinity")

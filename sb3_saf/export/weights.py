@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.errors import ExportError
+from sb3_saf.export.network import check_tensors
 
 _ENTRY: Final = "policy.pth"
 #: What a file of tensors may be longer than the tensors.
@@ -37,13 +38,19 @@ def load_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -
     limit = 2 * sum(tensor.numel() * tensor.element_size() for tensor in own.values()) + _OVERHEAD
     path = Path(path)
     path = path if path.is_file() else path.with_name(f"{path.name}.zip")
-    tensors = _tensors(_entry(path, limit), limit, path)
-    _check(own, tensors, path)
+    tensors = read_weights(path, limit)
+    remedy = "; make the model with the policy and policy_kwargs it was trained with"
+    check_tensors(own, tensors, str(path), remedy)
     policy.load_state_dict(tensors)
 
 
-def _entry(path: Path, limit: int) -> bytes:
-    """Return the policy's file in a model's zip."""
+def read_weights(path: Path, limit: int = 1 << 31) -> dict[str, th.Tensor]:
+    """
+    Return the policy's weights in a model's file; only tensors are read.
+
+    :param limit: bytes that they may take
+    :raises ExportError: if the file is damaged, malformed, or holds anything else
+    """
     if not path.is_file():
         raise ExportError(f"expected a model saved by Stable-Baselines3, found no file {path}")
     try:
@@ -53,10 +60,6 @@ def _entry(path: Path, limit: int) -> bytes:
         raise ExportError(f"{path} is not a model saved by Stable-Baselines3: {error}") from error
     if len(data) > limit:
         raise ExportError(f"{_ENTRY} in {path} has more than {limit} bytes, too many for the model's weights")
-    return data
-
-
-def _tensors(data: bytes, limit: int, path: Path) -> dict[str, th.Tensor]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(info.file_size for info in archive.infolist())
@@ -69,24 +72,3 @@ def _tensors(data: bytes, limit: int, path: Path) -> dict[str, th.Tensor]:
     if not isinstance(tensors, dict):
         raise ExportError(f"{_ENTRY} in {path} must map names to tensors, got {type(tensors).__name__}")
     return tensors
-
-
-def _check(own: dict[str, th.Tensor], tensors: dict[Any, Any], path: Path) -> None:
-    if different := own.keys() ^ tensors.keys():
-        name = min(map(str, different))
-        has = "lacks" if name in own else "has, unlike the model,"
-        raise ExportError(
-            f"{path} {has} the weights {name[:80]!r}; make the model with the policy and policy_kwargs it was trained "
-            "with"
-        )
-    for name, tensor in tensors.items():
-        wanted = own[name]
-        if not isinstance(tensor, th.Tensor) or tensor.layout != th.strided or tensor.is_quantized:
-            raise ExportError(f"{path}: {name!r} is no plain tensor")
-        if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
-            raise ExportError(
-                f"{path}: expected {name!r} of shape {tuple(wanted.shape)} and {wanted.dtype}, got "
-                f"{tuple(tensor.shape)} and {tensor.dtype}; make the model with the policy_kwargs it was trained with"
-            )
-        if not bool(tensor.isfinite().all()):
-            raise ExportError(f"{path}: {name!r} has NaN or infinity")

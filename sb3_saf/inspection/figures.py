@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from sb3_saf.inspection.attention import Attention
 from sb3_saf.inspection.calibration import Calibration, reliability
+from sb3_saf.inspection.scalars import Attention
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

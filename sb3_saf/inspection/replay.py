@@ -47,12 +47,14 @@ class _Episode(NamedTuple):
     :param rewards: (T,) of the team
     :param arrays: packed arrays by name
     :param frames: data URLs of pictures, where there is no grid
+    :param of_team: whether values are the team's
     """
 
     actions: npt.NDArray[Any]
     rewards: npt.NDArray[np.float64]
     arrays: dict[str, Packed | None]
     frames: list[str]
+    of_team: bool = False
 
 
 def replay(
@@ -106,7 +108,7 @@ def replay(
         for game, episode in enumerate(_play(player, env, episodes, seed, deterministic, gamma)):
             title = name if episodes == 1 else f"{name}, game {game + 1}"
             run, grid = _run(title, episode, env, game, seed) if has_grid else (_run_of_frames(title, episode), None)
-            run["of_team"] = episode.arrays.pop("of_team", None) is not None
+            run["of_team"] = episode.of_team
             runs.append({**run, **{key: value for key, value in episode.arrays.items() if value is not None}})
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -152,7 +154,6 @@ def _episode_of(recording: EpisodeRecording, game: int, has_codes: bool) -> _Epi
     zero = recording.values_without.get("zero")
     rewards = recording.rewards[steps, rows]
     arrays: dict[str, Packed | None] = {
-        "of_team": {} if recording.of_team else None,
         "actions": _packed(recording.actions[steps, rows], "u1") if recording.actions.ndim == 2 else None,
         "probabilities": _share(recording.action_probabilities, steps, rows),
         "weights": _share(recording.pool_weights, steps, rows),
@@ -166,7 +167,7 @@ def _episode_of(recording: EpisodeRecording, game: int, has_codes: bool) -> _Epi
         arrays["views"] = _packed(recording.observations[steps, rows], "u1")
     team = rewards[:, 0] if recording.of_team else rewards.sum(axis=1)
     frames = [_data_url(frame) for frame in recording.pictures[steps]] if game == 0 else []
-    return _Episode(recording.actions[steps, rows], team.astype(np.float64), arrays, frames)
+    return _Episode(recording.actions[steps, rows], team.astype(np.float64), arrays, frames, recording.of_team)
 
 
 def _share(shares: npt.NDArray[Any] | None, steps: slice, rows: slice | int) -> Packed | None:

@@ -6,17 +6,24 @@ Tags are ``group/name``; a group is one box of the page. What a policy or an env
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_saf.evaluation import confidence_interval
-from sb3_saf.inspection.attention import Attention, attention_of
 from sb3_saf.inspection.calibration import calibrate, lambda_returns, rmse
 from sb3_saf.inspection.games import ReturnScale
-from sb3_saf.inspection.pool import chosen_by, differences, mean_difference, selection_entropy, zone_dependence
+from sb3_saf.inspection.pool import (
+    chosen_by,
+    differences,
+    entropy,
+    mean_difference,
+    selection_entropy,
+    zone_dependence,
+)
 from sb3_saf.inspection.reading import Replacement
 from sb3_saf.inspection.recording import EpisodeRecording
 
@@ -26,6 +33,39 @@ _TAG_WITHOUT: Final[dict[Replacement, str]] = {
     "zero": "message/value_error_zeroed",
     "shuffled": "message/value_error_shuffled",
 }
+
+
+class Attention(NamedTuple):
+    """
+    Attention of queries over sources, over many teams.
+
+    :param mean: (Q, S) mean weights; rows sum to 1
+    :param entropy: mean entropy of one query's weights, divided by log S: 0 for a single source, 1 for all alike; None
+        for a single source
+    :param entropy_of_mean: entropy of a query's mean weights, divided by log S, mean over queries; None for a single
+        source. Higher than ``entropy`` where the source that is attended to changes
+    """
+
+    mean: npt.NDArray[np.float64]
+    entropy: float | None
+    entropy_of_mean: float | None
+
+
+def attention_of(weights: npt.NDArray[np.floating[Any]]) -> Attention:
+    """
+    Sum up attention.
+
+    :param weights: (n, Q, S); queries without any source (zeros) are left out
+    """
+    shown = weights.sum(axis=2) > 0
+    n_sources = weights.shape[2]
+    with np.errstate(invalid="ignore"):
+        mean = weights.sum(axis=0, dtype=np.float64) / shown.sum(axis=0)[:, np.newaxis]
+    if n_sources == 1 or not shown.any():
+        return Attention(mean, None, None)
+    scale = math.log(n_sources)
+    seen = shown.any(axis=0)
+    return Attention(mean, float(entropy(weights)[shown].mean()) / scale, float(entropy(mean[seen]).mean()) / scale)
 
 
 def counted_agents(recording: EpisodeRecording) -> npt.NDArray[np.int64]:

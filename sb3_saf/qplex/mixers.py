@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from difflib import get_close_matches
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple, get_args
 
@@ -234,16 +233,3 @@ class QPLEXMixer(Mixer):
             actions = actions * choice.active.unsqueeze(2)
         weights: th.Tensor = self.kernels(state, th.cat([state, actions.flatten(1)], dim=1))
         return weights
-
-
-def check_mixer(name: object) -> None:
-    """
-    Check a mixer's name.
-
-    :raises ValueError: with the names, and the one that was probably meant
-    """
-    if name in MIXER_NAMES:
-        return
-    meant = get_close_matches(name.lower(), MIXER_NAMES, n=1) if isinstance(name, str) else []
-    hint = f"; did you mean {meant[0]!r}?" if meant else ""
-    raise ValueError(f"mixer must be one of {', '.join(map(repr, MIXER_NAMES))}, got {name!r}{hint}")

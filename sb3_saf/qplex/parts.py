@@ -14,7 +14,7 @@ from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
 from sb3_saf.policies.parts import check_choice
 from sb3_saf.qplex.heads import AgentMemory
-from sb3_saf.qplex.mixers import Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer, check_mixer
+from sb3_saf.qplex.mixers import MIXER_NAMES, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class QPLEXParts:
     burn_in: int = 8
 
     def __post_init__(self) -> None:
-        check_mixer(self.mixer)
+        check_choice("mixer", self.mixer, MIXER_NAMES)
         check_choice("heads", self.heads, get_args(Heads))
         for name in ("n_policies", "latent_dim", "mixer_hidden", "n_kernels", "sequence_length"):
             check_count(name, getattr(self, name))

@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
+from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -40,12 +41,11 @@ from sb3_saf.envs.teams import (
     check_whole_teams,
 )
 from sb3_saf.qplex.learning import TeamError, team_errors
-from sb3_saf.qplex.mixers import MixerName, check_mixer
+from sb3_saf.qplex.mixers import MixerName
 from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy, State
 
 SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
 
-_TERMINAL_OBSERVATION: Final = "terminal_observation"
 _STORED_KEYS: Final[tuple[str, ...]] = (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACTIVE_KEY, STATE_KEY)
 
 
@@ -130,7 +130,6 @@ class QPLEX(OffPolicyAlgorithm):
             names = ", ".join(repr(name) for name, kind in self.policy_aliases.items() if name == kind.__name__)
             raise ValueError(f"expected one of QPLEX's policies, {names}, got {policy!r}; PPO trains the others")
         if mixer is not None:
-            check_mixer(mixer)
             policy_kwargs = {**(policy_kwargs or {}), "mixer": mixer}
         super().__init__(
             policy,
@@ -372,7 +371,7 @@ class QPLEX(OffPolicyAlgorithm):
             after = {key: part.copy() for key, part in after.items()}
             for row in ended.tolist():
                 for key in keys:
-                    after[key][row] = infos[row][_TERMINAL_OBSERVATION][key]
+                    after[key][row] = infos[row][TERMINAL_OBSERVATION][key]
         replay_buffer.add(
             self._last_obs, after, buffer_action, reward, dones, infos, episode_starts=self._last_episode_starts
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,7 +42,8 @@ _COLOURS: Final = {
     "vdn": "#332288",
     "random": "#666666",
 }
-_WITH_MEMORY: Final = "-lstm"
+#: Line and hatch of variants of a method, which have its colour: with memory, with weights of each agent's own.
+_VARIANTS: Final = {"-lstm": ("--", "//"), "-separate": ("-.", "xx")}
 #: Horizontal lines of reference teams.
 _REFERENCE: Final = "#222222"
 _REFERENCE_LINES: Final = ("-.", ":", (0, (1, 3)), (0, (5, 5)))
@@ -63,7 +65,7 @@ class Style(NamedTuple):
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, Style]:
-    """Return one style per method. Known methods always have theirs, those with memory the colour of those without."""
+    """Return one style per method. Known methods always have theirs, variants the colour of what they vary."""
     styles = {method: _style(method) for method in methods}
     taken = {_COLOURS["random"], *(style.colour for style in styles.values() if style is not None)}
     free = [colour for colour in _COLOURS.values() if colour not in taken] or list(_COLOURS.values())
@@ -75,8 +77,9 @@ def method_styles(methods: Sequence[str]) -> dict[str, Style]:
 def _style(method: str) -> Style | None:
     if method == "random":
         return Style(_COLOURS[method], "--")
-    if method.endswith(_WITH_MEMORY) and method.removesuffix(_WITH_MEMORY) in _COLOURS:
-        return Style(_COLOURS[method.removesuffix(_WITH_MEMORY)], "--", "//")
+    for ending, (line, hatch) in _VARIANTS.items():
+        if method.endswith(ending) and method.removesuffix(ending) in _COLOURS:
+            return Style(_COLOURS[method.removesuffix(ending)], line, hatch)
     return Style(_COLOURS[method]) if method in _COLOURS else None
 
 
@@ -155,8 +158,8 @@ def draw_curves(
             steps = curve["game_steps"]
             ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
             ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
-        for index, (label, score) in enumerate((references or {}).items()):
-            ax.axhline(score, color=_REFERENCE, linestyle=_REFERENCE_LINES[index % len(_REFERENCE_LINES)], label=label)
+        for (label, score), line in zip((references or {}).items(), cycle(_REFERENCE_LINES), strict=False):
+            ax.axhline(score, color=_REFERENCE, linestyle=line, label=label)
         ax.set(xlabel="game steps", ylabel=y_label, title=name)
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         _start_at_zero(ax, rows["score"].to_numpy())
@@ -169,6 +172,7 @@ def draw_levels(
     title: str | None = None,
     panel: str | None = None,
     y_label: str = TEAM_RETURN,
+    references: pd.DataFrame | None = None,
 ) -> Figure:
     """
     Draw bars of the return against a level: mean and 95 % interval (Student's t) over seeds.
@@ -177,6 +181,8 @@ def draw_levels(
         (episodes) are averaged
     :param level: for instance ``"coordination"``
     :param panel: column whose values get a panel each, for instance ``"task"``
+    :param references: horizontal lines over the bars of a level, for instance of scripted teams: columns ``name``,
+        ``score`` and those named by ``level`` and ``panel``
     """
     require_columns(results, ("method", "seed", level, "score"))
     panels = _panels(results, panel)
@@ -184,6 +190,8 @@ def draw_levels(
     figure, all_axes = _figure(len(panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
         _draw_bars(ax, rows, level, styles)
+        if references is not None:
+            _draw_lines(ax, references if panel is None else references[references[panel] == name], level, rows)
         ax.set(xlabel=level, ylabel=y_label, title=name)
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
@@ -208,6 +216,44 @@ def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, St
         ax.errorbar(places, values, yerr=margins, fmt="none", ecolor="black", capsize=3, linewidth=1)
     ax.set_xticks(range(len(levels)), [str(value) for value in levels])
     ax.set_xlim(-0.6, len(levels) - 0.4)
+
+
+def _draw_lines(ax: Axes, references: pd.DataFrame, level: str, rows: pd.DataFrame) -> None:
+    """Draw the reference teams of one panel, each at its level."""
+    places = {value: place for place, value in enumerate(sorted(rows[level].unique()))}
+    for (name, of_name), line in zip(references.groupby("name", sort=False), cycle(_REFERENCE_LINES), strict=False):
+        here = of_name[of_name[level].isin(places)]
+        at = here[level].map(places).to_numpy(dtype=float)
+        ax.hlines(here["score"], at - 0.47, at + 0.47, color=_REFERENCE, linestyle=line, label=str(name))
+
+
+def draw_differences(
+    compared: pd.DataFrame, title: str | None = None, panel: str | None = None, x_label: str = "difference"
+) -> Figure:
+    """
+    Draw paired differences with their intervals, a group of lines for each level, which favour one where they do not
+    touch 0.
+
+    :param compared: columns ``method``, ``level``, ``value``, ``low``, ``high`` (NaN where one run cannot tell)
+    :param panel: column whose values get a panel each, for instance ``"task"``
+    """
+    require_columns(compared, ("method", "level", "value", "low", "high"))
+    panels, styles = _panels(compared, panel), method_styles(_methods_of(compared))
+    figure, all_axes = _figure(len(panels), height=1.4 + 0.25 * max(len(rows) for _, rows in panels))
+    for ax, (name, rows) in zip(all_axes, panels, strict=True):
+        places = rows.assign(place=range(len(rows)))
+        for method, here in places.groupby("method", sort=False):
+            value, low, high, place = here[["value", "low", "high", "place"]].to_numpy(dtype=float).T
+            colour = styles[str(method)].colour
+            ax.errorbar(
+                value, place, xerr=[value - low, high - value], fmt="o", color=colour, capsize=3, label=str(method)
+            )
+        middles = places.groupby("level", sort=False)["place"].mean()
+        ax.set_yticks(middles.to_numpy(), middles.index)
+        ax.axvline(0, color="black", linewidth=1)
+        ax.invert_yaxis()
+        ax.set(xlabel=x_label, title=name)
+    return _finish(figure, all_axes, title)
 
 
 def draw_aggregates(

@@ -20,7 +20,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.make import make_team_env
-from sb3_saf.envs.team_reward import TeamReward
 from sb3_saf.suites.registry import suites
 from sb3_saf.training.algorithms import ALGOS, AlgorithmSpec, find_algorithm
 from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
@@ -38,15 +37,7 @@ _OWN_KEYS: Final[dict[str, Any]] = {
     "time_limit": TimeLimit,
     "env_kwargs": dict[str, Any],
     "policy_kwargs": dict[str, Any],
-    "env_wrapper": str | list[Any] | dict[str, Any] | None,
-    "vec_env_wrapper": str | list[Any] | dict[str, Any] | None,
-    "callback": str | list[Any] | dict[str, Any] | None,
-    "normalize": bool | dict[str, Any],
-    "frame_stack": int,
-    "curriculum": list[Any],
-    "team_reward": TeamReward,
-    "state": bool,
-    "algorithm": str,
+    **WRAPPER_KEYS,
 }
 #: What files and command lines call ``algorithm``: a class that trains the method's policy, in the place of its own.
 _ALGO: Final = "algo"

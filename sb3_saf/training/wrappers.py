@@ -24,22 +24,23 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.team_reward import SharedReward
+from sb3_saf.envs.team_reward import SharedReward, TeamReward
 from sb3_saf.envs.teams import OBS_KEY
 from sb3_saf.training.environments import import_by_name
 
-#: Keys of settings that name wrappers; each may be left out.
-WRAPPER_KEYS: Final = (
-    "env_wrapper",
-    "vec_env_wrapper",
-    "frame_stack",
-    "normalize",
-    "callback",
-    "curriculum",
-    "team_reward",
-    "state",
-    "algorithm",
-)
+_NAMES = str | list[Any] | dict[str, Any] | None
+#: Keys of settings that say how games are wrapped and what trains, with their types; each may be left out.
+WRAPPER_KEYS: Final[dict[str, Any]] = {
+    "env_wrapper": _NAMES,
+    "vec_env_wrapper": _NAMES,
+    "frame_stack": int,
+    "normalize": bool | dict[str, Any],
+    "callback": _NAMES,
+    "curriculum": list[Any],
+    "team_reward": TeamReward,
+    "state": bool,
+    "algorithm": str,
+}
 NORMALIZATION_FILE: Final = "vecnormalize.npz"
 
 
