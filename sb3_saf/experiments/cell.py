@@ -60,11 +60,7 @@ class Job:
 
     @classmethod
     def read(cls, folder: Path) -> Job:
-        """
-        Return the job of a folder.
-
-        :raises ValueError: if there is none
-        """
+        """Return the job of a folder; a ValueError if there is none."""
         content = read_json(folder / "job.json")
         if content is None:
             raise ValueError(f"there is no job.json in {folder}; expected an unfinished cell of `experiments run`")

@@ -184,11 +184,7 @@ def _size(options: argparse.Namespace) -> Size:
 
 
 def _name(options: argparse.Namespace) -> str:
-    """
-    Return the name of the experiment.
-
-    :raises ValueError: if there is none
-    """
+    """Return the name of the experiment; a ValueError if there is none."""
     name: str | None = options.name
     if name is None and len(options.env) != 1:
         example = f"{PROGRAM} {options.command} coordination, or --env mpe2.simple_spread_v3"
@@ -221,11 +217,7 @@ def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
 
 
 def _engine(options: argparse.Namespace) -> Engine:
-    """
-    Return what runs cells.
-
-    :raises ValueError: if Ray is asked for and not installed, or not there
-    """
+    """Return what runs cells; a ValueError if Ray is asked for and not installed, or not there."""
     if not (options.ray or options.address is not None):
         # A batch system may have limited the cores of this process.
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

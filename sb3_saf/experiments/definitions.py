@@ -211,11 +211,7 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 
 
 def find_experiment(name: str) -> Experiment:
-    """
-    Return an experiment of the paper by name.
-
-    :raises ValueError: with the nearest name that exists
-    """
+    """Return an experiment of the paper; a ValueError says the nearest name that exists."""
     if name not in EXPERIMENTS:
         raise unknown_name("experiment", name, EXPERIMENTS)
     return EXPERIMENTS[name]

@@ -42,11 +42,7 @@ def plain(value: Any) -> Any:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """
-    Return what a file holds; None if it is not there.
-
-    :raises ValueError: naming the file, if it holds no JSON object
-    """
+    """Return what a file holds, None if it is not there; a ValueError names a file without a JSON object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -73,11 +69,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], most: int = 3) -> str:
-    """
-    Return what differs between two mappings, with dotted names.
-
-    :param most: named differences
-    """
+    """Name what differs between two mappings, with dotted names, and ``most`` differences at most."""
     before, after = dict(_flat(old)), dict(_flat(new))
     changed = [key for key in {**before, **after} if before.get(key) != after.get(key)]
     named = [f"{key} was {before.get(key)!r}, now {after.get(key)!r}" for key in changed[:most]]

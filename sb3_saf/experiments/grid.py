@@ -247,11 +247,7 @@ class Shard(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """
-        Read ``3/8``.
-
-        :raises ValueError: for anything that is no part
-        """
+        """Read ``3/8``; a ValueError for anything that is no part."""
         number, slash, parts = text.partition("/")
         if not (slash and number.isdecimal() and parts.isdecimal() and 1 <= int(number) <= int(parts)):
             raise ValueError(f"expected a part such as 3/8 (the third of eight), got {text!r}")

@@ -84,11 +84,7 @@ def write_report(
 
 
 def read_scale(path: Path) -> pd.DataFrame:
-    """
-    Return the returns of reference teams: columns ``task``, ``name``, ``mean`` and parameters of the environment.
-
-    :raises ValueError: if the file has other columns
-    """
+    """Return reference teams: columns ``task``, ``name``, ``mean`` and parameters; a ValueError if there are others."""
     try:
         scale = pd.read_csv(path)
         require_columns(scale, ("task", "name", "mean"))

@@ -77,11 +77,7 @@ class Results:
         return None if stored is None else RunConfig(**{name: stored[name] for name in _SETTINGS})
 
     def agree(self, config: RunConfig, cells: Iterable[Cell] = ()) -> None:
-        """
-        Check that the folder and its finished cells have these settings. Nothing is written.
-
-        :raises ValueError: with what differs
-        """
+        """Check that the folder and its finished cells have these settings; a ValueError says what differs."""
         stored = self.config()
         if stored is not None and plain(asdict(stored)) != plain(asdict(config)):
             changed = differences(asdict(stored), plain(asdict(config)))
@@ -184,11 +180,7 @@ class Results:
     # What was asked for
 
     def add_selection(self, experiment: Experiment, selection: Selection) -> None:
-        """
-        Remember what was asked for.
-
-        :raises ValueError: if another experiment has the same name here
-        """
+        """Remember what was asked for."""
         folder = self.folder / experiment.name / "selections"
         folder.mkdir(parents=True, exist_ok=True)
         if experiment.name not in EXPERIMENTS:
@@ -204,11 +196,7 @@ class Results:
         return sorted((Selection(**{name: tuple(entry[name]) for name in _SELECTION}) for entry in stored), key=astuple)
 
     def check_experiment(self, experiment: Experiment) -> None:
-        """
-        Check that no other experiment has the same name here.
-
-        :raises ValueError: with what differs
-        """
+        """Check that no other experiment has the same name here; a ValueError says what differs."""
         stored = self._read(self.folder / experiment.name / "experiment.json", {"envs": list, "vary": dict})
         if stored is not None and stored != _own(experiment):
             raise ValueError(
@@ -217,11 +205,7 @@ class Results:
             )
 
     def experiment(self, name: str) -> Experiment:
-        """
-        Return an experiment by name: of the paper, or one of one's own in this folder.
-
-        :raises ValueError: with the nearest name that exists
-        """
+        """Return an experiment of the paper, or one's own in this folder; a ValueError says the nearest name."""
         if name in EXPERIMENTS:
             return EXPERIMENTS[name]
         path = self.folder / name / "experiment.json"

@@ -76,11 +76,7 @@ def read_results(folder: str | Path, name: str) -> Frames:
 
 
 def requested(experiment: Experiment, results: Results) -> Grid:
-    """
-    Return all cells that were ever asked for in a folder, random teams last.
-
-    :param results: a folder with settings
-    """
+    """Return all cells that were ever asked for in a folder with settings, random teams last."""
     config = results.config()
     assert config is not None
     grids = [expand(experiment, selection, config) for selection in results.selections(experiment.name)]

@@ -85,12 +85,7 @@ def lambda_returns(
 
 
 def calibrate(values: Floats, returns: Floats) -> Calibration:
-    """
-    Compare values with returns.
-
-    :param values: (n,)
-    :param returns: (n,)
-    """
+    """Compare values (n,) with returns (n,)."""
     v, g = np.asarray(values, dtype=np.float64), np.asarray(returns, dtype=np.float64)
     error = v - g
     var_v, var_g = v.var(), g.var()
@@ -103,23 +98,12 @@ def calibrate(values: Floats, returns: Floats) -> Calibration:
 
 
 def reliability(values: Floats, returns: Floats, n_bins: int = 10) -> list[Bin]:
-    """
-    Compute the mean return by size of the value, in bins of equally many values.
-
-    :param values: (n,)
-    :param returns: (n,)
-    :param n_bins: at most this many
-    """
+    """Compute the mean return by size of the value, values and returns (n,), in ``n_bins`` of equally many at most."""
     order = np.argsort(values, kind="stable")
     parts = np.array_split(order, min(n_bins, len(order)))
     return [Bin(float(values[part].mean()), float(returns[part].mean()), float(returns[part].std())) for part in parts]
 
 
 def rmse(values: Floats, returns: Floats) -> float:
-    """
-    Compute the root mean square error of values.
-
-    :param values: (n,)
-    :param returns: (n,)
-    """
+    """Compute the root mean square error of values (n,) beside returns (n,)."""
     return float(np.sqrt(((np.asarray(values, dtype=np.float64) - returns) ** 2).mean()))

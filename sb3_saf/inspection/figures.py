@@ -81,12 +81,7 @@ def _numbers(count: int) -> list[str]:
 
 
 def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
-    """
-    How often each policy is chosen in each zone.
-
-    :param table: (K, U)
-    :param colours: of the zones
-    """
+    """Draw how often each policy is chosen in each zone, (K, U); ``colours`` are those of the zones."""
     n_zones, n_policies = table.shape
     figure, (axes,) = _figure(5.6, 1.8 + 0.55 * max(3, n_zones), title="Which policy acts in which zone")
     _heat_map(axes, table, "chosen", vmax=1.0)
@@ -102,11 +97,7 @@ def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
 
 
 def chosen_by_agent(table: Doubles) -> Figure:
-    """
-    How often each policy is chosen by each agent.
-
-    :param table: (N, U)
-    """
+    """Draw how often each policy is chosen by each agent, (N, U)."""
     n_agents, n_policies = table.shape
     figure, (axes,) = _figure(5.6, min(12.0, 1.8 + 0.42 * max(3, n_agents)), title="Which policy acts for which agent")
     _heat_map(axes, table, "chosen", vmax=1.0)
@@ -116,11 +107,7 @@ def chosen_by_agent(table: Doubles) -> Figure:
 
 
 def policy_differences(table: Doubles) -> Figure:
-    """
-    How differently policies act.
-
-    :param table: (U, U) Hellinger distances
-    """
+    """Draw how differently policies act: Hellinger distances (U, U)."""
     names = [f"policy {policy}" for policy in range(len(table))]
     figure, (axes,) = _figure(5.6, 4.4, title="How differently policies act (0 alike, 1 never alike)")
     _heat_map(axes, table, "Hellinger distance", vmax=1.0, percent=False)
@@ -129,12 +116,7 @@ def policy_differences(table: Doubles) -> Figure:
 
 
 def attention(write: Attention, read: Attention) -> Figure:
-    """
-    Who writes to which slot, and who reads which.
-
-    :param write: (L, N)
-    :param read: (N, L)
-    """
+    """Draw who writes to which slot, (L, N), and who reads which, (N, L)."""
     n_slots, n_agents = write.mean.shape
     width, height = min(14.0, 4.2 + 0.28 * n_agents), 2.4 + 0.7 * n_slots
     figure, (above, below) = _figure(width, height, 2, title="Knowledge source: mean attention")
@@ -149,11 +131,7 @@ def attention(write: Attention, read: Attention) -> Figure:
 
 
 def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
-    """
-    Who writes to which slot, step by step, in one episode.
-
-    :param write: (T, L, N)
-    """
+    """Draw who writes to which slot, step by step in one episode, (T, L, N)."""
     n_steps, n_slots, n_agents = write.shape
     n_shown = min(n_slots, 6)
     height = 1.4 + n_shown * (0.35 + 0.12 * min(n_agents, 20))

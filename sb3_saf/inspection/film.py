@@ -20,12 +20,7 @@ _COLOURS: Final = 64
 
 
 def strip(pictures: Sequence[Picture]) -> Picture:
-    """
-    Join six moments, evenly spread from the first to the last, in two rows; fewer in one where there are no more.
-
-    :param pictures: (height, width, 3) each
-    :return: (height, width, 3)
-    """
+    """Join six of (height, width, 3) pictures, evenly spread, in two rows; all in one row where there are fewer."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, _N_MOMENTS).round().astype(int))
     moments = [_scaled(pictures[index]) for index in chosen]
     rows = [moments] if len(moments) < _N_MOMENTS else [moments[:_PER_ROW], moments[_PER_ROW:]]

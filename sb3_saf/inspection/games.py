@@ -52,11 +52,7 @@ class ReturnScale(NamedTuple):
 
 
 def check_zones(zones: object) -> None:
-    """
-    Check the argument ``zones``.
-
-    :raises ValueError: if it is neither None, False nor a function
-    """
+    """Check the argument ``zones``; a ValueError if it is neither None, False nor a function."""
     if zones is not None and zones is not False and not callable(zones):
         raise ValueError(
             "zones must be a function from the environment to the zone of each row, None to ask the environment for "
@@ -65,13 +61,7 @@ def check_zones(zones: object) -> None:
 
 
 def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
-    """
-    Choose the function that gives the agents' zones.
-
-    :param env: rows of teams
-    :param zones: as the user gave it
-    :return: None if there are no zones
-    """
+    """Return what gives the zones of rows of teams, as the user's ``zones`` say; None if there are none."""
     if zones is False:
         return None
     if zones is not None:
@@ -80,21 +70,12 @@ def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
 
 
 def zones_by_attribute(env: VecEnv) -> Ints:
-    """
-    Return the games' attribute ``agent_zones``.
-
-    :return: (B,)
-    """
+    """Return (B,) the games' attribute ``agent_zones``."""
     return np.concatenate([np.asarray(zones, dtype=np.int64) for zones in _of_games(env, "agent_zones")])
 
 
 def zones_now(zones: ZoneFunction, env: VecEnv) -> Ints:
-    """
-    Return the zone of each row, checked.
-
-    :return: (B,)
-    :raises ValueError: if they are not (B,) whole numbers of at least -1
-    """
+    """Return (B,) the zone of each row; a ValueError if they are not (B,) whole numbers of at least -1."""
     found = np.asarray(zones(env))
     if found.shape != (env.num_envs,) or found.dtype.kind not in "iu" or (found < _NO_ZONE).any():
         raise ValueError(

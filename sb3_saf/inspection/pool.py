@@ -32,11 +32,7 @@ class SelectionEntropy(NamedTuple):
 
 
 def selection_entropy(weights: Floats) -> SelectionEntropy:
-    """
-    Entropies of the choice.
-
-    :param weights: (n, U)
-    """
+    """Compute entropies of the choice from weights (n, U)."""
     scale = math.log(weights.shape[1])
     return SelectionEntropy(
         float(entropy(weights).mean()) / scale, float(entropy(weights.mean(axis=0, dtype=np.float64))) / scale
@@ -44,12 +40,7 @@ def selection_entropy(weights: Floats) -> SelectionEntropy:
 
 
 def entropy(probabilities: Floats) -> npt.NDArray[np.float64]:
-    """
-    In nats, along the last axis.
-
-    :param probabilities: (..., U)
-    :return: (...)
-    """
+    """Compute (...) entropies in nats of probabilities (..., U)."""
     p = np.asarray(probabilities, dtype=np.float64)
     return -(p * np.log(np.where(p > 0, p, 1.0))).sum(axis=-1)
 
@@ -113,11 +104,7 @@ def differences(action_space: spaces.Space[Any], actions: Floats) -> npt.NDArray
 
 
 def mean_difference(table: npt.NDArray[np.float64]) -> float:
-    """
-    Mean over pairs of different policies.
-
-    :param table: (U, U), of :func:`differences`
-    """
+    """Return the mean of :func:`differences`, (U, U), over pairs of different policies."""
     return float(table[np.triu_indices(len(table), k=1)].mean())
 
 

@@ -85,11 +85,7 @@ class StepReading(NamedTuple):
 
 
 def require_our_policy(policy: BasePolicy) -> OurPolicy:
-    """
-    Check that a policy can be inspected.
-
-    :raises ValueError: if it is none of this package's policies
-    """
+    """Return the policy; a ValueError if it is none of this package's and cannot be inspected."""
     if isinstance(policy, (TeamPolicy, QPLEXPolicy)):
         return policy
     raise ValueError(

@@ -52,11 +52,7 @@ class Attention(NamedTuple):
 
 
 def attention_of(weights: npt.NDArray[np.floating[Any]]) -> Attention:
-    """
-    Sum up attention.
-
-    :param weights: (n, Q, S); queries without any source (zeros) are left out
-    """
+    """Sum up attention (n, Q, S); queries without any source (zeros) are left out."""
     shown = weights.sum(axis=2) > 0
     n_sources = weights.shape[2]
     with np.errstate(invalid="ignore"):

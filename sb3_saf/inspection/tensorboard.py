@@ -180,11 +180,7 @@ class Page:
             writer.add_custom_scalars(layout(tags, value_based))
 
     def write(self, step: int) -> None:
-        """
-        Write what was recorded.
-
-        :param step: agents' steps, as everything that SB3 writes; the x-axis counts game steps
-        """
+        """Write what was recorded; ``step`` counts agents' steps, as SB3's do, the x-axis game steps."""
         self._logger.dump(step)
         for line, value in self._lines.items():
             for board in self._writers:

@@ -221,13 +221,7 @@ class QPLEXMixer(Mixer):
         return Mixed((chosen + advantages * (weights - 1.0)).sum(dim=1), weights)
 
     def advantage_weights(self, state: th.Tensor, choice: JointChoice) -> th.Tensor:
-        """
-        Lambda of joint actions.
-
-        :param state: (G, S)
-        :param choice: its ``actions`` and ``active`` are read
-        :return: (G, N)
-        """
+        """Compute (G, N) lambda at states (G, S); of the choice, ``actions`` and ``active`` are read."""
         actions = nn.functional.one_hot(choice.actions, self.n_actions).to(state.dtype)
         if choice.active is not None:
             actions = actions * choice.active.unsqueeze(2)

@@ -93,13 +93,7 @@ class QPLEXParts:
         return AgentMemory(features_dim, action_space, n_agents, self.lstm_hidden_size)
 
     def make_mixer(self, state_dim: int, n_agents: int, n_actions: int) -> Mixer:
-        """
-        Make the mixer.
-
-        :param state_dim: size of the state that it reads
-        :param n_agents: N
-        :param n_actions: A
-        """
+        """Make the mixer of N agents with as many actions each, for states of size S."""
         if self.mixer == "vdn":
             return VDNMixer()
         if self.mixer == "qmix":

@@ -94,11 +94,7 @@ class TeamEnvironment:
         return len(agents)
 
     def make_game(self, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> Any:
-        """
-        Make one game, whose agents have equal spaces.
-
-        :raises ValueError: if it refuses its parameters, or is no ParallelEnv
-        """
+        """Make one game of agents with equal spaces; a ValueError if it refuses its parameters or is no ParallelEnv."""
         kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
         if self.make is None:
             assert self.task is not None
