@@ -12,8 +12,9 @@ from typing import Any
 
 from sb3_saf.experiments.cell import Job, run_job
 from sb3_saf.experiments.engines import Engine
-from sb3_saf.experiments.tables import TIME_COLUMNS
 
+#: Columns that differ between two runs of the same cells; all others are equal, bit for bit.
+TIME_COLUMNS = ("processor_seconds", "wall_seconds_training", "wall_seconds_test")
 #: A worker without the package's imports, which does what ``order.txt`` in its folder says.
 WORKER = (sys.executable, str(Path(__file__).parent / "experiments_worker.py"))
 

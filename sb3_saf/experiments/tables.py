@@ -35,8 +35,6 @@ from sb3_saf.experiments.grid import Cell, Grid, expand, merge
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.statistics import Estimate, mean_over_seeds
 
-#: Columns that differ between two runs of the same cells; all others are equal, bit for bit.
-TIME_COLUMNS: Final = ("processor_seconds", "wall_seconds_training", "wall_seconds_test")
 #: Two seeds may agree by chance, and an interval then has no width.
 FEWEST_SEEDS: Final = 3
 

@@ -62,6 +62,7 @@ def check_zones(zones: object) -> None:
 
 def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
     """Return what gives the zones of rows of teams, as the user's ``zones`` say; None if there are none."""
+    check_zones(zones)
     if zones is False:
         return None
     if zones is not None:

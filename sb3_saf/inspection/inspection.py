@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_saf.inspection import figures, film
 from sb3_saf.inspection import scalars as numbers
 from sb3_saf.inspection.calibration import calibrate
-from sb3_saf.inspection.games import Picture, ReturnScale, Zones, check_zones, return_scale, zone_colours
+from sb3_saf.inspection.games import Picture, ReturnScale, Zones, return_scale, zone_colours
 from sb3_saf.inspection.pool import chosen_by, differences
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 
@@ -126,7 +126,6 @@ def inspect_team(
     :param observations: whether to keep the agents' own observations
     :raises ValueError: if the policy is none of this package's or ``eval_env`` is not made of teams
     """
-    check_zones(zones)
     recording = record_episodes(
         model.policy,
         eval_env,

@@ -318,16 +318,11 @@ class QPLEX(OffPolicyAlgorithm):
         log_interval: int | None = None,
     ) -> RolloutReturn:
         """
-        Play one step of all games.
+        Play one step of all games, and count game steps and team episodes; see SB3.
 
-        :param env: the training environment
-        :param callback: called after the step
         :param train_freq: always one step
-        :param replay_buffer: where to
         :param action_noise: not used
         :param learning_starts: game steps of random actions
-        :param log_interval: team episodes between logs
-        :return: game steps played, team episodes ended, and whether training goes on
         """
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
@@ -440,16 +435,7 @@ class QPLEX(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfQPLEX:
-        """
-        Train.
-
-        :param total_timesteps: rows: game steps times N
-        :param callback: called after every step of all games
-        :param log_interval: team episodes between logs
-        :param tb_log_name: name of the run for TensorBoard
-        :param reset_num_timesteps: whether to count from zero
-        :param progress_bar: whether to show one
-        """
+        """Train as SB3 does; ``total_timesteps`` counts rows: game steps times N, ``log_interval`` team episodes."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
