@@ -1,7 +1,7 @@
 """
 Any configuration, any actions: what is true of every game.
 
-Ten thousand examples: ``python -m pytest tests/test_invariants.py --hypothesis-profile thorough --timeout 3600``.
+Ten thousand examples: ``EXAMPLES=10000 python -m pytest tests/test_invariants.py --timeout 3600``.
 """
 
 from __future__ import annotations
