@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import shutil
 import signal
@@ -410,6 +411,17 @@ def test_pickled_games_of_strangers_are_not_read(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
     model = resumable_learn(foreign(LazyEnv), WHOLE, tmp_path / "trusted", [Lightning(-1)], trust_games=True)
     assert weights(model) == undisturbed
+
+
+def test_a_clock_that_is_set_back_all_the_time_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    undisturbed = weights(go_on(tmp_path / "undisturbed", make()))
+    seconds = itertools.count(2_000_000_000, -60)
+    monkeypatch.setattr("time.time", lambda: float(next(seconds)))
+    monkeypatch.setattr("time.time_ns", lambda: next(seconds) * 10**9)
+    struck(tmp_path / "run", make, after_calls=20)
+    newest = max((tmp_path / "run").glob("*.ckpt"))
+    assert newest.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"  # not by the time of day
+    assert weights(go_on(tmp_path / "run", make())) == undisturbed
 
 
 def test_lines_of_a_monitor_file_are_kept(tmp_path: Path) -> None:
