@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import Any, Literal, get_args
+from numbers import Integral
+from typing import Any, Literal, TypeVar, cast, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from hecogrid_envs.batch import GameBatch, check_actions
 from hecogrid_envs.constants import N_ACTIONS, RenderMode
-from hecogrid_envs.core.rng import game_seeds
+from hecogrid_envs.core.rng import fresh_seed, game_seeds
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import state_option
@@ -25,14 +26,118 @@ from hecogrid_envs.tiles import observation_space
 
 Backend = Literal["native", "supersuit"]
 U8 = npt.NDArray[np.uint8]
+Value = TypeVar("Value")
 
 
-class NativeVecEnv(VecEnv):
+def chosen_indices(indices: int | Iterable[int] | None, n: int, kind: str = "row") -> list[int]:
     """
-    E games of N agents as B = E N rows, driven by the batched core.
+    Return which of n rows (or games) are meant.
 
-    Row ``e * N + i`` is agent ``i`` of game ``e``. Games reset by themselves at their time limit; the last observation
-    is then in ``infos[row]["terminal_observation"]`` and ``infos[row]["TimeLimit.truncated"]`` is True.
+    :param indices: one, several, or None for all; negative ones count from the end
+    :param n: how many there are
+    :param kind: what they are, for the message
+    :raises ValueError: for one that is not there
+    """
+    listed = range(n) if indices is None else [indices] if isinstance(indices, Integral) else indices
+    chosen = [int(index) for index in cast(Iterable[int], listed)]
+    for index in chosen:
+        if not -n <= index < n:
+            raise ValueError(f"there is no {kind} {index}: expected 0 to {n - 1}")
+    return [index % n for index in chosen]
+
+
+class TeamVecEnv(VecEnv):
+    """
+    Base of games of a team as rows: E games of N agents, row ``e * N + i`` is agent ``i`` of game ``e``.
+
+    :param n_games: E
+    :param n_agents: N
+    :param observation_space: of a row
+    :param action_space: of a row
+    :param seed: see :meth:`seed`
+    """
+
+    def __init__(
+        self,
+        n_games: int,
+        n_agents: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        seed: int | None,
+    ) -> None:
+        self.n_games = n_games
+        self.n_agents = n_agents
+        super().__init__(n_games * n_agents, observation_space, action_space)
+        self.seed(seed)
+
+    def per_row(self, of_games: Iterable[Value]) -> list[Value]:
+        """Repeat what is one per game for each of its rows."""
+        return [value for value in of_games for _ in range(self.n_agents)]
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Choose the seeds of the games, for the next reset; later episodes go on with each game's own random stream.
+
+        :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None for fresh entropy
+        :return: (B,) the seed of each row's game
+        """
+        chosen = game_seeds(fresh_seed() if seed is None else seed, self.n_games)
+        #: Seeds of the games as they were last chosen, by which evaluation is told from training; None for fresh ones.
+        self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
+        #: For the next reset; None goes on with the games' own random streams.
+        self._next_seeds: list[int] | None = chosen
+        return self.per_row(chosen)
+
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """
+        Set the options of the next reset.
+
+        :param options: for all games, or a list with those for each row, where a game takes those of its first row
+        """
+        if isinstance(options, (list, tuple)) and len(options) != self.num_envs:
+            raise ValueError(
+                f"expected a dict for all games or a list of {self.num_envs} dicts, one per row ({self.n_games} games "
+                f"of {self.n_agents} agents), got {len(options)}"
+            )
+        super().set_options(options)
+
+    def game_method(
+        self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of games, once each.
+
+        :param method_name: of the game
+        :param args: positional arguments
+        :param games: which games, None for all
+        :param kwargs: keyword arguments
+        :return: one result per game
+        """
+        raise NotImplementedError
+
+    def get_images(self) -> Sequence[npt.NDArray[Any] | None]:
+        """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
+        return self.per_row(self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games)
+
+    def render(self, mode: str | None = None) -> npt.NDArray[Any] | None:
+        """
+        Draw every game once.
+
+        :param mode: None, or the environment's own
+        :return: one picture of all games for ``"rgb_array"``, else None
+        """
+        if self.render_mode is None or mode not in (None, self.render_mode):
+            return super().render(mode)  # which explains what is wrong
+        pictures = self.game_method("render")
+        return tile_images(pictures) if self.render_mode == "rgb_array" else None
+
+
+class NativeVecEnv(TeamVecEnv):
+    """
+    Games driven by the batched core.
+
+    Games reset by themselves at their time limit; the last observation is then in
+    ``infos[row]["terminal_observation"]`` and ``infos[row]["TimeLimit.truncated"]`` is True.
 
     :param batch: the games
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
@@ -42,31 +147,14 @@ class NativeVecEnv(VecEnv):
     def __init__(self, batch: GameBatch, seed: int | None = None, render_mode: RenderMode | None = None):
         self.batch = batch
         self.params = batch.params
-        self.n_games = batch.n_games
-        self.n_agents = batch.params.n_agents
         env_class = TASKS[batch.task]
         self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
         self._actions: U8 | None = None
         self._running = False
-        #: Seeds of the games as they were last chosen, by which evaluation is told from training.
-        self.seeded_with: tuple[int | None, ...] = (None,) * batch.n_games
         own_space = observation_space(batch.task, batch.params)
         #: Where the batch leaves the last views of episodes, (E, N, *observation shape).
-        self._last: U8 = np.empty((self.n_games, self.n_agents, *own_space.shape), dtype=np.uint8)
-        super().__init__(self.n_games * self.n_agents, own_space, spaces.Discrete(N_ACTIONS))
-        if seed is not None:
-            self.seed(seed)
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """
-        Choose the seeds of the games at the next reset.
-
-        :return: (B,) the seed of each row's game
-        """
-        per_game: list[int | None] = [None] * self.n_games if seed is None else [*game_seeds(seed, self.n_games)]
-        self.seeded_with = tuple(per_game)
-        self._seeds = [game_seed for game_seed in per_game for _ in range(self.n_agents)]
-        return self._seeds
+        self._last: U8 = np.empty((batch.n_games, batch.params.n_agents, *own_space.shape), dtype=np.uint8)
+        super().__init__(batch.n_games, batch.params.n_agents, own_space, spaces.Discrete(N_ACTIONS), seed)
 
     def reset(self) -> U8:
         """
@@ -75,12 +163,12 @@ class NativeVecEnv(VecEnv):
         :return: (B, *observation shape)
         """
         states = [state_option(options, self.params) for options in self._options[:: self.n_agents]]
-        self.batch.reset(seeds=self._seeds[:: self.n_agents])
+        self.batch.reset(seeds=self._next_seeds)
         for game, state in enumerate(states):
             if state is not None:
                 self.batch.set_state(state, game)
             self.games[game].agents = list(self.games[game].possible_agents)
-        self._reset_seeds()
+        self._next_seeds = None
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._running = True
@@ -138,7 +226,7 @@ class NativeVecEnv(VecEnv):
             "params": {name: _plain(value) for name, value in asdict(self.params).items()},
             "n_games": self.n_games,
             "running": self._running,
-            "seeds": list(self._seeds),
+            "seeds": self.per_row(self._next_seeds or [None] * self.n_games),
             "games": self.batch.snapshot(),
         }
 
@@ -176,7 +264,8 @@ class NativeVecEnv(VecEnv):
         self.check_checkpoint_state(state)
         self.batch.restore(state["games"])
         self._running = state["running"]
-        self._seeds = list(state["seeds"])
+        seeds = state["seeds"][:: self.n_agents]
+        self._next_seeds = None if None in seeds else seeds
         for env in self.games:
             env.agents = list(env.possible_agents) if self._running else []
 
@@ -185,25 +274,8 @@ class NativeVecEnv(VecEnv):
         for env in self.games:
             env.close()
 
-    def get_images(self) -> Sequence[U8 | None]:
-        """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
-        pictures = self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games
-        return [picture for picture in pictures for _ in range(self.n_agents)]
-
-    def render(self, mode: str | None = None) -> U8 | None:
-        """
-        Draw every game once.
-
-        :param mode: None, or the environment's own
-        :return: one picture of all games for ``"rgb_array"``, else None
-        """
-        if self.render_mode is None or mode not in (None, self.render_mode):
-            return super().render(mode)  # which explains what is wrong
-        pictures = self.game_method("render")
-        return tile_images(pictures) if self.render_mode == "rgb_array" else None
-
     def _games_of(self, indices: VecEnvIndices) -> list[HECOGridEnv]:
-        return [self.games[row // self.n_agents] for row in self._get_indices(indices)]
+        return [self.games[row // self.n_agents] for row in chosen_indices(indices, self.num_envs)]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Attribute of each row's game."""
@@ -220,14 +292,16 @@ class NativeVecEnv(VecEnv):
         """Call a method of each row's game, once per row; :meth:`game_method` calls it once per game."""
         return [getattr(env, method_name)(*method_args, **kwargs) for env in self._games_of(indices)]
 
-    def game_method(self, method_name: str, *args: Any, games: Sequence[int] | None = None, **kwargs: Any) -> list[Any]:
-        """Call a method of each game once."""
-        chosen = range(self.n_games) if games is None else games
+    def game_method(
+        self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method of games, once each (see the base class)."""
+        chosen = chosen_indices(games, self.n_games, "game")
         return [getattr(self.games[game], method_name)(*args, **kwargs) for game in chosen]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No row is wrapped in a Gymnasium wrapper."""
-        return [False for _ in self._get_indices(indices)]
+        return [False for _ in chosen_indices(indices, self.num_envs)]
 
 
 def _check_seeds(seeds: Any, n_games: int, n_agents: int) -> None:

@@ -184,8 +184,8 @@ WRONG_CALLS: list[tuple[Callable[[], Any], str]] = [
         lambda: hecogrid_envs.parallel_env("Pong"),
         "unknown task 'Pong'; the tasks are TeamTogether, TeamSupport, KeyForTreasure",
     ),
-    (lambda: small_env().reset(seed=-1), "seed must be an integer of at least 0 or None, got -1"),
-    (lambda: small_env().reset(seed=1.5), "seed must be an integer of at least 0 or None, got 1.5"),  # type: ignore[arg-type]
+    (lambda: small_env().reset(seed=-1), "seed must be an integer of at least 0, or None, got -1"),
+    (lambda: small_env().reset(seed=1.5), "seed must be an integer of at least 0, or None, got 1.5"),  # type: ignore[arg-type]
     (lambda: small_env().render(), "no render_mode was given; create the environment with render_mode='rgb_array'"),
     (stepped_without_reset, "the episode has not begun or is over: call reset() before step()"),
     (stepped_after_the_end, "the episode has not begun or is over: call reset() before step()"),

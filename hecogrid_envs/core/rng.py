@@ -8,6 +8,7 @@ neighbours are.
 from __future__ import annotations
 
 import secrets
+from numbers import Integral
 
 import numpy as np
 import numpy.typing as npt
@@ -34,13 +35,25 @@ def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
     :param n_games: E, number of games
     :param first: index of the first game
     :return: E integers below 2**63
+    :raises ValueError: for a seed that is none
     """
+    check_seed(seed)
     return [_game_seed(seed, index) for index in range(first, first + n_games)]
 
 
 def _game_seed(seed: int, index: int) -> int:
     words = np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)
     return int(words[0]) >> (64 - _SEED_BITS)
+
+
+def check_seed(seed: object) -> None:
+    """
+    Check that a value is a seed.
+
+    :raises ValueError: unless it is None or an integer of at least 0
+    """
+    if seed is not None and (isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0):
+        raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
 
 
 def generator_word(seed: int) -> np.uint64:
@@ -50,8 +63,7 @@ def generator_word(seed: int) -> np.uint64:
     :param seed: 0 or larger, of any size
     :raises ValueError: for anything else
     """
-    if isinstance(seed, (bool, np.bool_)) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ValueError(f"seed must be an integer of at least 0 or None, got {seed!r}")
+    check_seed(seed)
     word: np.uint64 = np.random.SeedSequence(int(seed)).generate_state(1, np.uint64)[0]
     return word
 

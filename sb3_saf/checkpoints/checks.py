@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.envs.teams import bounds_of
 
 _LARGEST: Final = 2**63
 
@@ -137,15 +138,7 @@ def check_observations(value: Tree, space: spaces.Space[Any], n_rows: int, where
 
 
 def _check_in(value: npt.NDArray[Any], space: spaces.Space[Any], where: str) -> None:
-    if isinstance(space, spaces.Box):
-        low, high = space.low, space.high
-    elif isinstance(space, spaces.MultiBinary):
-        low, high = np.zeros(1), np.ones(1)
-    elif isinstance(space, spaces.MultiDiscrete):
-        low, high = space.start, space.start + space.nvec - 1
-    else:
-        assert isinstance(space, spaces.Discrete)
-        low, high = np.array(space.start), np.array(space.start + space.n - 1)
+    low, high = bounds_of(space)
     if ((value < low) | (value > high)).any():
         raise refused(where, f"in {space}", f"{value.min()} to {value.max()}")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +13,7 @@ from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, chec
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.envs.curriculum import Curriculum
+from sb3_saf.envs.teams import layers
 
 
 @runtime_checkable
@@ -31,14 +32,6 @@ class Stateful(Protocol):
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Go on from there."""
         ...
-
-
-def layers(venv: VecEnv) -> Iterator[VecEnv]:
-    """The environment's wrappers, outermost first, and what they wrap."""
-    yield venv
-    while isinstance(venv, VecEnvWrapper):
-        venv = venv.venv
-        yield venv
 
 
 def environment_state(venv: VecEnv) -> list[Tree]:

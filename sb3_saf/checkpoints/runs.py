@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.checkpoints.checks import check_keys, check_list, check_text
 from sb3_saf.checkpoints.data import Tree
-from sb3_saf.checkpoints.environments import layers
 from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.envs.teams import game_seeds_of
 
 #: Arguments that have to be those of the first start. Schedules are compared by their values.
 _ARGUMENTS: Final = (
@@ -64,7 +64,7 @@ def description(model: BaseAlgorithm) -> dict[str, Tree]:
         **values,
         **{f"policy's {name}": _plain(value) for name, value in model.policy_kwargs.items()},
         **{f"parameter {name}": [str(p.dtype), *p.shape] for name, p in model.policy.state_dict().items()},
-        "the seeds of the games": game_seeds(env),
+        "the seeds of the games": _game_seeds(env),
     }
 
 
@@ -78,15 +78,8 @@ def _callback_arguments(callback: BaseCallback) -> dict[str, Tree]:
     found = {name: _plain(getattr(callback, name)) for name in names}
     if isinstance(callback, EvalCallback):
         found["number of rows"] = callback.eval_env.num_envs
-        found["seeds of the games"] = game_seeds(callback.eval_env)
+        found["seeds of the games"] = _game_seeds(callback.eval_env)
     return found
-
-
-def game_seeds(venv: VecEnv) -> list[int | None] | None:
-    """The seeds that games were given last; None if the environment does not tell."""
-    *_, innermost = layers(venv)
-    seeds = getattr(innermost, "seeded_with", None)
-    return None if seeds is None else [None if seed is None else int(seed) for seed in seeds]
 
 
 def check_descriptions(
@@ -133,6 +126,11 @@ def _check_callbacks(own: list[Tree], saved: Tree) -> None:
                     f"{other['arguments'][name]!r} there and {value!r} here; make it as for the first start, or give "
                     "this run a folder of its own"
                 )
+
+
+def _game_seeds(venv: VecEnv) -> list[int | None] | None:
+    seeds = game_seeds_of(venv)
+    return None if seeds is None else [None if seed is None else int(seed) for seed in seeds]
 
 
 def _class_name(value: object) -> str | None:

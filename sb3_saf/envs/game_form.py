@@ -12,14 +12,13 @@ from pettingzoo import AECEnv, ParallelEnv
 from sb3_saf.envs import parallel_calls
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.space_reader import (
-    FIXED_SHAPE,
     FlatReader,
     SpaceReader,
     can_be_flattened,
     counted_from_zero,
     leaves_of,
 )
-from sb3_saf.envs.teams import ACTION_MASK_KEY
+from sb3_saf.envs.teams import ACTION_MASK_KEY, FIXED_SHAPE
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
@@ -31,6 +30,21 @@ AskMasks: TypeAlias = Literal["auto"] | bool
 
 #: Where an agent's own observation is in observations of PettingZoo's form for masks.
 OBSERVATION: Final = "observation"
+
+
+class Signals(NamedTuple):
+    """
+    What rows shall show beside own observations; see :class:`~sb3_saf.envs.supersuit_vec_env.SuperSuitVecEnv`.
+
+    :param active: whether agents take part
+    :param action_masks: ``"auto"`` for masks where there are any, True to insist on them, False for none; None for
+        observations as they are
+    :param state: the game's state
+    """
+
+    active: bool = False
+    action_masks: AskMasks | None = None
+    state: bool = False
 
 
 class GameForm(NamedTuple):
@@ -61,24 +75,16 @@ class GameForm(NamedTuple):
         return (FlatReader if self.is_flattened else SpaceReader)(self.own, notes)
 
 
-def game_form(
-    example: Any,
-    first_infos: Callable[[], Mapping[Any, Any]],
-    active: bool = False,
-    action_masks: AskMasks | None = None,
-    state: bool = False,
-) -> GameForm:
+def game_form(example: Any, first_infos: Callable[[], Mapping[Any, Any]], signals: Signals) -> GameForm:
     """
     Find out the form of a game.
 
     :param example: the game
     :param first_infos: returns the infos of a reset of a copy; called if it may tell of masks
-    :param active: whether rows tell if their agent takes part
-    :param action_masks: ``"auto"`` for masks where there are any, True to insist on them, False for none; None for
-        observations as they are
-    :param state: whether rows have the game's state
+    :param signals: asked for
     :raises ValueError: if agents differ in their spaces, a space cannot be in rows, or a signal is not there
     """
+    active, action_masks, state = signals
     agents = tuple(example.possible_agents)
     observation_space = _common_space("observation", agents, example.observation_space)
     action_space = _common_space("action", agents, example.action_space)

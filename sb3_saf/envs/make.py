@@ -5,31 +5,45 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final, Literal, TypeAlias, get_args
+from typing import Any, Final, Literal, NamedTuple, TypeAlias, get_args
 
 import gymnasium as gym
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from hecogrid_envs.core.rng import check_seed
 from sb3_saf.envs.curriculum import Curriculum, Stage
+from sb3_saf.envs.game_form import AnyParallelEnv, AskMasks, Signals
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.team_game import make_team_game, team_game
 from sb3_saf.envs.team_reward import TeamReward, check_team_reward, share_reward
-from sb3_saf.envs.teams import check_count, check_seed
+from sb3_saf.envs.teams import check_count
 from sb3_saf.suites.registry import SuiteTask, find_task
 
 Backend = Literal["native", "supersuit"]
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
-#: Whether to look for action masks: where there are any, always, never.
-AskMasks: TypeAlias = Literal["auto"] | bool
-
 #: What the names of modules and functions have, and those of tasks have not.
 _NAMES_OF_CODE: Final = frozenset(".:")
 
-AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 EnvFactory: TypeAlias = "Callable[..., AnyParallelEnv]"
+
+
+class Request(NamedTuple):
+    """
+    How games are asked for.
+
+    :param n_envs: E
+    :param backend: None for the usual one
+    :param n_cpus: processes
+    :param signals: beside own observations
+    """
+
+    n_envs: int
+    backend: Backend | None
+    n_cpus: int
+    signals: Signals
 
 
 def make_team_env(
@@ -96,19 +110,19 @@ def make_team_env(
     _check_backend(backend)
     if team_reward is not None:
         check_team_reward(team_reward)
-    signals = {"active": active is not False, "action_masks": action_masks, "state": state}
+    request = Request(n_envs, backend, n_cpus, Signals(active is not False, action_masks, state))
     task = find_task(env) if isinstance(env, str) else None
     if isinstance(env, str) and _NAMES_OF_CODE.intersection(env):
         env = _imported(env)
     make: Callable[[int | None, dict[str, Any]], VecEnv]
     if task is not None:
         task.warn_if_competitive()
-        make = partial(_suite, task, n_envs, backend=backend or "supersuit", n_cpus=n_cpus, signals=signals)
+        make = partial(_suite, task, request)
     elif isinstance(env, str):
         _refuse_signals(active, action_masks, state)
-        make = partial(_hecogrid, env, n_envs, backend=backend or "native", n_cpus=n_cpus)
+        make = partial(_hecogrid, env, request)
     else:
-        make = partial(_foreign, env, n_envs, backend=backend or "supersuit", n_cpus=n_cpus, signals=signals)
+        make = partial(_foreign, env, request)
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
         os.makedirs(monitor_dir, exist_ok=True)
@@ -163,9 +177,7 @@ def _in_stages(
     return staged
 
 
-def _hecogrid(
-    task: str, n_envs: int, seed: int | None, params: dict[str, Any], backend: Backend, n_cpus: int
-) -> VecEnv:
+def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
     from hecogrid_envs import make_vec_env
     from hecogrid_envs.task import check_task
@@ -177,50 +189,43 @@ def _hecogrid(
             f"{error}. For any other environment pass a task of a suite (python -m sb3_saf.suites lists them), a "
             "PettingZoo ParallelEnv, or a factory that returns one, for instance simple_spread_v3.parallel_env"
         ) from None
-    if n_cpus != 1:
+    backend = request.backend or "native"
+    if request.n_cpus != 1:
         if backend == "native":
             raise ValueError(
-                f"n_cpus={n_cpus} divides games among SuperSuit's processes, but backend='native' steps all games at "
-                "once; leave n_cpus out (native has n_threads) or use backend='supersuit'"
+                f"n_cpus={request.n_cpus} divides games among SuperSuit's processes, but backend='native' steps all "
+                "games at once; leave n_cpus out (native has n_threads) or use backend='supersuit'"
             )
-        params = {**params, "n_cpus": n_cpus}
-    return make_vec_env(name, n_envs, seed=seed, backend=backend, **{"observation": "tiles", **params})
+        params = {**params, "n_cpus": request.n_cpus}
+    return make_vec_env(name, request.n_envs, seed=seed, backend=backend, **{"observation": "tiles", **params})
 
 
-def _suite(
-    one: SuiteTask,
-    n_envs: int,
-    seed: int | None,
-    params: dict[str, Any],
-    backend: Backend,
-    n_cpus: int,
-    signals: dict[str, Any],
-) -> VecEnv:
+def _suite(one: SuiteTask, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """A task of a suite: its own engine, or games through SuperSuit."""
     suite = one.suite
     if suite.vec_env is None:
         assert suite.game is not None
-        return _foreign(_Named(one.id, partial(suite.game, one.task)), n_envs, seed, params, backend, n_cpus, signals)
-    if backend == "native" or n_cpus != 1:
+        return _foreign(_Named(one.id, partial(suite.game, one.task)), request, seed, params)
+    if request.backend == "native" or request.n_cpus != 1:
         raise ValueError(
             f"{one.id} has an engine of its own, which steps all games at once; leave backend and n_cpus out"
         )
     try:
-        venv = suite.vec_env(one.task, n_envs, seed, state=signals["state"], **params)
+        venv = suite.vec_env(one.task, request.n_envs, seed, state=request.signals.state, **params)
     except TypeError as error:  # most often an argument that it does not have
         raise ValueError(f"{one.id} cannot be made with {params}: {error}") from error
-    _check_signals(one.id, RowSpaces.of(venv.observation_space, venv.action_space), signals)
+    _check_signals(one.id, RowSpaces.of(venv.observation_space, venv.action_space), request.signals)
     return venv
 
 
-def _check_signals(name: str, rows: RowSpaces, signals: dict[str, Any]) -> None:
+def _check_signals(name: str, rows: RowSpaces, signals: Signals) -> None:
     has_masks = rows.n_masked_actions is not None
-    if signals["action_masks"] != "auto" and signals["action_masks"] != has_masks:
+    if signals.action_masks not in ("auto", has_masks):
         raise ValueError(
-            f"{name} {'gives' if has_masks else 'has no'} action masks, got action_masks={signals['action_masks']}; "
+            f"{name} {'gives' if has_masks else 'has no'} action masks, got action_masks={signals.action_masks}; "
             "leave it out"
         )
-    if signals["state"] and rows.state is None:
+    if signals.state and rows.state is None:
         raise ValueError(f"{name} has no state, got state=True; leave it out")
 
 
@@ -238,24 +243,16 @@ class _Named:
             raise ValueError(f"{self.__qualname__} cannot be made with {params}: {error}") from error
 
 
-def _foreign(
-    env: AnyParallelEnv | EnvFactory,
-    n_envs: int,
-    seed: int | None,
-    params: dict[str, Any],
-    backend: Backend,
-    n_cpus: int,
-    signals: dict[str, Any],
-) -> VecEnv:
+def _foreign(env: AnyParallelEnv | EnvFactory, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """Any ParallelEnv, through SuperSuit."""
     from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 
-    if backend == "native":
+    if request.backend == "native":
         raise ValueError(
             f"backend='native' is the compiled core of HECOGrid, got it with {_name(env)}; leave backend out or use "
             "backend='supersuit'"
         )
-    return SuperSuitVecEnv(_bound(env, params), n_envs, seed, n_cpus, **signals)
+    return SuperSuitVecEnv(_bound(env, params), request.n_envs, seed, request.n_cpus, *request.signals)
 
 
 def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:

@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_saf.envs.teams import Array
-
-#: Spaces whose samples have one shape and dtype.
-FIXED_SHAPE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+from sb3_saf.envs.teams import FIXED_SHAPE, Array, bounds_of
 
 
 def parts_of(space: spaces.Space[Any]) -> dict[Any, spaces.Space[Any]]:
@@ -53,18 +51,6 @@ def counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
 def first_value(space: spaces.Space[Any]) -> Any:
     """Return the ``start`` of Discrete and MultiDiscrete, 0 for other spaces."""
     return space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else 0
-
-
-def bounds_of(space: spaces.Space[Any]) -> tuple[Any, Any]:
-    """Return the smallest and the largest value of each entry, both included; the space has a fixed shape."""
-    if isinstance(space, spaces.Discrete):
-        return space.start, space.start + space.n - 1
-    if isinstance(space, spaces.MultiDiscrete):
-        return space.start, space.start + space.nvec - 1
-    if isinstance(space, spaces.MultiBinary):
-        return 0, 1
-    assert isinstance(space, spaces.Box)
-    return space.low, space.high
 
 
 class SpaceReader:
@@ -229,6 +215,49 @@ def can_be_flattened(space: spaces.Space[Any]) -> bool:
     return space not in leaves and all(
         isinstance(leaf, FIXED_SHAPE) and (len(leaf.shape or ()) <= 1 or _is_picture(leaf)) for leaf in leaves
     )
+
+
+def checked_actions(space: spaces.Space[Any], agents: Sequence[Any], n_rows: int, actions: npt.ArrayLike) -> Array:
+    """
+    Bring the actions of all rows into the dtype of their space.
+
+    :param space: of the actions of a row
+    :param agents: N names, for messages
+    :param n_rows: B
+    :param actions: (B, ...)
+    :return: a copy
+    :raises ValueError: naming the first row with actions that are not in the space
+    """
+    array = np.asarray(actions)
+    shape = (n_rows, *(space.shape or ()))
+    dtype = np.dtype(space.dtype)
+    if array.shape != shape or array.dtype.kind not in _kinds_of_actions(space):
+        raise ValueError(
+            f"expected actions from {space} for {shape[0]} rows, {dtype} of shape {shape}, "
+            f"got {array.dtype} of shape {array.shape}"
+        )
+    if dtype.kind == "f":  # bounds are rounded to the dtype, so actions must be before they are compared
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype, copy=False)
+    elif array.dtype.kind == "f" and isinstance(space, spaces.Box):
+        array = np.rint(array)
+    low, high = bounds_of(space)
+    inside = (array >= low) & (array <= high)
+    if isinstance(space, spaces.MultiBinary):
+        inside &= (array == 0) | (array == 1)
+    outside = np.argwhere(~inside)
+    if len(outside):
+        row = int(outside[0, 0])
+        game, agent = divmod(row, len(agents))
+        raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
+    return np.array(array, dtype=dtype)  # a copy: the caller may go on to use its array
+
+
+def _kinds_of_actions(space: spaces.Space[Any]) -> str:
+    """Return which kinds of numbers may be actions; SB3's policies give floats for MultiBinary and for every Box."""
+    if isinstance(space, spaces.MultiBinary):
+        return "biuf"
+    return "fiu" if isinstance(space, spaces.Box) else "iu"
 
 
 def _as_array(value: Any) -> Array:

@@ -6,41 +6,33 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from numbers import Integral
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
-from stable_baselines3.common.vec_env.base_vec_env import (
-    VecEnv,
-    VecEnvIndices,
-    VecEnvObs,
-    VecEnvStepReturn,
-    tile_images,
-)
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from hecogrid_envs.core.rng import game_seeds
+from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
 from sb3_saf.envs.game_copies import check_signature, signature
-from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, check_is_parallel, first_infos_of, game_form
+from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, Signals, check_is_parallel, first_infos_of, game_form
 from sb3_saf.envs.game_source import GameSource
-from sb3_saf.envs.space_reader import bounds_of, counted_from_zero, first_value
-from sb3_saf.envs.supersuit_game import Info
+from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
 from sb3_saf.envs.supersuit_games import Question, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
-from sb3_saf.envs.teams import Array, check_count, check_seed
+from sb3_saf.envs.teams import Array, check_count
 
 
-class SuperSuitVecEnv(VecEnv):
+class SuperSuitVecEnv(TeamVecEnv):
     """
     Games of a PettingZoo ParallelEnv as rows of one VecEnv, flattened by SuperSuit.
 
-    Rows are game-major, then agent: row ``game * N + agent``, agents in the order of ``possible_agents``. An episode
-    is a team's: its N rows are done together, when its last agent has ended. The row of an agent that ended earlier
-    (or has not joined) shows zeros, gets no reward, and its infos hold ``"active": False``; the info of the step at
-    which it ended holds its ``"terminal_observation"``.
+    Agents of rows are in the order of ``possible_agents``. An episode is a team's: its N rows are done together, when
+    its last agent has ended. The row of an agent that ended earlier (or has not joined) shows zeros, gets no reward,
+    and its infos hold ``"active": False``; the info of the step at which it ended holds its
+    ``"terminal_observation"``.
 
     Infos of done rows hold ``"terminal_observation"`` and ``"TimeLimit.truncated"`` (True if that row's agent was
     truncated and not terminated at that step); reset infos are in ``reset_infos`` only. A game's own infos named
@@ -90,58 +82,27 @@ class SuperSuitVecEnv(VecEnv):
         action_masks: AskMasks | None = None,
         state: bool = False,
     ) -> None:
-        self.n_games = check_count("n_games", n_games)
-        n_cpus = min(check_count("n_cpus", n_cpus), self.n_games)
-        check_seed(seed)
-        source, form = _source_and_form(make_env, n_cpus, active, action_masks, state)
+        n_games = check_count("n_games", n_games)
+        n_cpus = min(check_count("n_cpus", n_cpus), n_games)
+        source, form = _source_and_form(make_env, n_cpus, Signals(active, action_masks, state))
         self.possible_agents = list(form.agents)
-        self.n_agents = len(self.possible_agents)
         self._game_action_space = form.action_space
         self._closed = self._begun = self._has_warned = False
         self._actions: Array | None = None
         self._games = (
-            TeamConcatVecEnv(source, form, range(self.n_games))
+            TeamConcatVecEnv(source, form, range(n_games))
             if n_cpus == 1
-            else WorkerGames(source, form, self.n_games, n_cpus)
+            else WorkerGames(source, form, n_games, n_cpus)
         )
         try:
-            super().__init__(self.n_games * self.n_agents, form.rows.to_space(), counted_from_zero(form.action_space))
-            self.seed(seed)
+            super().__init__(
+                n_games, len(form.agents), form.rows.to_space(), counted_from_zero(form.action_space), seed
+            )
         except BaseException:
             self.close()
             raise
-        self._next_options: list[Info | None] = [None] * self.n_games
 
     # ---- episodes
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """
-        Seed all games, at the next reset; later episodes go on with each game's own random stream.
-
-        :param seed: game ``i`` gets ``game_seeds(seed, E)[i]``, whatever the number of processes; None for fresh
-            entropy
-        :return: for each row, the seed of its game
-        """
-        check_seed(seed)
-        chosen = game_seeds(int(cast(int, np.random.SeedSequence().entropy) if seed is None else seed), self.n_games)
-        #: Seeds of the games as they were last chosen, by which evaluation is told from training; None for fresh ones.
-        self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
-        self._next_seeds: list[int | None] = list(chosen)
-        return [game_seed for game_seed in chosen for _ in range(self.n_agents)]
-
-    def set_options(self, options: list[Info] | Info | None = None) -> None:
-        """
-        Set the options of the next reset.
-
-        :param options: for all games, or a list with those for each row, where a game takes those of its first row
-        """
-        if isinstance(options, (list, tuple)) and len(options) != self.num_envs:
-            raise ValueError(
-                f"expected a dict for all games or a list of {self.num_envs} dicts, one per row ({self.n_games} games "
-                f"of {self.n_agents} agents), got {len(options)}"
-            )
-        by_row = options if isinstance(options, (list, tuple)) else [options] * self.num_envs
-        self._next_options = [own or None for own in by_row[:: self.n_agents]]
 
     def reset(self) -> VecEnvObs:
         """
@@ -151,8 +112,10 @@ class SuperSuitVecEnv(VecEnv):
         """
         self._check_open()
         self._begun, self._actions = False, None
-        observations, self.reset_infos = self._games.reset_all(self._next_seeds, self._next_options)
-        self._next_seeds, self._next_options = [None] * self.n_games, [None] * self.n_games
+        options = [own or None for own in self._options[:: self.n_agents]]
+        observations, self.reset_infos = self._games.reset_all(self._seeds_of_games(), options)
+        self._next_seeds = None
+        self._reset_options()
         self._begun = True
         return cast(VecEnvObs, observations)
 
@@ -166,7 +129,7 @@ class SuperSuitVecEnv(VecEnv):
         self._check_open()
         if not self._begun:
             raise RuntimeError("no episode has begun (or one was stopped by an error): call reset() before step()")
-        self._actions = _checked_actions(self.action_space, self.possible_agents, self.n_games, actions)
+        self._actions = checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -193,6 +156,9 @@ class SuperSuitVecEnv(VecEnv):
             self._closed = True
             self._games.close()
 
+    def _seeds_of_games(self) -> list[int | None]:
+        return [None] * self.n_games if self._next_seeds is None else [*self._next_seeds]
+
     def _check_open(self) -> None:
         if self._closed:
             raise RuntimeError("the vector environment is closed (it was closed); make a new one")
@@ -213,7 +179,7 @@ class SuperSuitVecEnv(VecEnv):
                 snapshot["signature"] = signature(snapshot["pickled"])
         return {
             "seeds": list(self.seeded_with),
-            "next_seeds": list(self._next_seeds),
+            "next_seeds": self._seeds_of_games(),
             "begun": self._begun,
             "warned": self._has_warned,
             "games": snapshots if self._begun else [],
@@ -254,7 +220,8 @@ class SuperSuitVecEnv(VecEnv):
         self.check_checkpoint_state(state)
         if state["begun"]:
             self._games.restore(state["games"])
-        self.seeded_with, self._next_seeds = tuple(state["seeds"]), list(state["next_seeds"])
+        self.seeded_with = tuple(state["seeds"])
+        self._next_seeds = None if None in state["next_seeds"] else list(state["next_seeds"])
         self._begun, self._has_warned, self._actions = state["begun"], state["warned"], None
         self.reset_infos = [{} for _ in range(self.num_envs)]
 
@@ -265,13 +232,9 @@ class SuperSuitVecEnv(VecEnv):
         answers = self._games.ask(questions)
         return [answers[place] for place in range(len(questions))]
 
-    def _rows(self, indices: VecEnvIndices) -> list[int]:
-        listed = range(self.num_envs) if indices is None else [indices] if isinstance(indices, Integral) else indices
-        return _checked_indices("row", cast(Iterable[int], listed), self.num_envs)
-
     def _ask_rows(self, indices: VecEnvIndices, question: str, *args: Any) -> list[Any]:
         """Ask the games of some rows, once each; return for each row the answer of its game."""
-        games = [row // self.n_agents for row in self._rows(indices)]
+        games = [row // self.n_agents for row in chosen_indices(indices, self.num_envs)]
         asked = list(dict.fromkeys(games))
         answers = dict(zip(asked, self._ask([(game, question, args) for game in asked]), strict=True))
         return [answers[game] for game in games]
@@ -316,7 +279,7 @@ class SuperSuitVecEnv(VecEnv):
         :param method_kwargs: keyword arguments
         :return: one result per row
         """
-        rows = self._rows(indices)
+        rows = chosen_indices(indices, self.num_envs)
         if method_name == "action_masks" and not method_args and not method_kwargs:
             masks = self._ask_rows(rows, "action_masks")
             return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
@@ -326,17 +289,8 @@ class SuperSuitVecEnv(VecEnv):
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
-        """
-        Call a method of games, once each.
-
-        :param method_name: of the game, or of a wrapper around it
-        :param args: positional arguments
-        :param games: which games, None for all
-        :param kwargs: keyword arguments
-        :return: one result per game
-        """
-        listed = range(self.n_games) if games is None else [games] if isinstance(games, Integral) else games
-        chosen = _checked_indices("game", cast(Iterable[int], listed), self.n_games)
+        """Call a method of games, once each (see the base class)."""
+        chosen = chosen_indices(games, self.n_games, "game")
         return self._ask([(game, "call", (method_name, args, kwargs)) for game in chosen])
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
@@ -349,89 +303,21 @@ class SuperSuitVecEnv(VecEnv):
         """
         return self._ask_rows(indices, "is_wrapped", wrapper_class.__module__, wrapper_class.__qualname__)
 
-    def get_images(self) -> Sequence[npt.NDArray[Any] | None]:
-        """
-        Draw every game.
 
-        :return: one picture per row; rows of one game share it. None if the render mode is not ``"rgb_array"``
-        """
-        pictures = self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games
-        return [picture for picture in pictures for _ in range(self.n_agents)]
-
-    def render(self, mode: str | None = None) -> npt.NDArray[Any] | None:
-        """
-        Draw every game once.
-
-        :param mode: None, or the environment's own
-        :return: one picture of all games for ``"rgb_array"``, else None
-        """
-        if self.render_mode is None or mode not in (None, self.render_mode):
-            return super().render(mode)  # which explains what is wrong
-        pictures = self.game_method("render")
-        return tile_images(pictures) if self.render_mode == "rgb_array" else None
-
-
-def _source_and_form(
-    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks | None, state: bool
-) -> tuple[GameSource, GameForm]:
+def _source_and_form(make_env: MakeEnv, n_cpus: int, signals: Signals) -> tuple[GameSource, GameForm]:
     """Look at an example of the game, and keep what games are made of."""
     is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
     example: Any = make_env() if is_factory else make_env
     check_is_parallel(example, is_factory)
     try:
         source = GameSource(make_env, is_factory, n_cpus)
-        form = game_form(example, partial(first_infos_of, source.build), active, action_masks, state)
+        form = game_form(example, partial(first_infos_of, source.build), signals)
     finally:
         if is_factory:
             # Games may rely on having been reset before they are closed; this one has only been looked at.
             with suppress(Exception):
                 example.close()
     return source, form
-
-
-def _checked_indices(kind: str, indices: Iterable[int], n: int) -> list[int]:
-    """Count negative indices from the end."""
-    listed = [int(index) for index in indices]
-    for index in listed:
-        if not -n <= index < n:
-            raise ValueError(f"there is no {kind} {index}: expected 0 to {n - 1}")
-    return [index % n for index in listed]
-
-
-def _checked_actions(
-    space: spaces.Space[Any], agents: Sequence[Any], n_games: int, actions: npt.ArrayLike
-) -> npt.NDArray[Any]:
-    """Bring the actions of all rows into the dtype of their space, or say what is wrong with them."""
-    array = np.asarray(actions)
-    shape = (n_games * len(agents), *cast(tuple[int, ...], space.shape))
-    dtype = np.dtype(space.dtype)
-    if array.shape != shape or array.dtype.kind not in _kinds_of_actions(space):
-        raise ValueError(
-            f"expected actions from {space} for {shape[0]} rows, {dtype} of shape {shape}, "
-            f"got {array.dtype} of shape {array.shape}"
-        )
-    if dtype.kind == "f":  # bounds are rounded to the dtype, so actions must be before they are compared
-        with np.errstate(over="ignore"):
-            array = array.astype(dtype, copy=False)
-    elif array.dtype.kind == "f" and isinstance(space, spaces.Box):
-        array = np.rint(array)
-    low, high = bounds_of(space)
-    inside = (array >= low) & (array <= high)
-    if isinstance(space, spaces.MultiBinary):
-        inside &= (array == 0) | (array == 1)
-    outside = np.argwhere(~inside)
-    if len(outside):
-        row = int(outside[0, 0])
-        game, agent = divmod(row, len(agents))
-        raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
-    return np.array(array, dtype=dtype)  # a copy: the caller may go on to use its array
-
-
-def _kinds_of_actions(space: spaces.Space[Any]) -> str:
-    """Return which kinds of numbers may be actions; SB3's policies give floats for MultiBinary and for every Box."""
-    if isinstance(space, spaces.MultiBinary):
-        return "biuf"
-    return "fiu" if isinstance(space, spaces.Box) else "iu"
 
 
 def _in_games_form(space: spaces.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -8,6 +8,7 @@ Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from numbers import Integral
 from typing import Any, Final, Literal, NamedTuple, get_args
 
@@ -19,6 +20,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from hecogrid_envs.vec_env import chosen_indices
 from sb3_saf.errors import NonFiniteError
 
 TeamKey = Literal["obs", "team", "agent"]
@@ -44,6 +46,9 @@ OPTIONAL_KEYS: Final[tuple[OptionalKey, ...]] = get_args(OptionalKey)
 ALL_KEYS: Final[frozenset[str]] = frozenset(TEAM_KEYS + OPTIONAL_KEYS)
 
 Array = npt.NDArray[Any]
+
+#: Spaces whose samples have one shape and dtype.
+FIXED_SHAPE: Final = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
 
 #: Attributes by which a vector environment of flattened teams tells its shape.
 _TEAM_ATTRIBUTES: Final = ("n_agents", "n_games")
@@ -89,7 +94,7 @@ class TeamSpaces(NamedTuple):
         :param state: space of the game's state if rows have it
         :raises ValueError: if ``own`` is of another kind
         """
-        low, high = _bounds(own)
+        low, high = bounds_of(own)
         team = spaces.Box(
             np.repeat(low[np.newaxis], n_agents, axis=0),
             np.repeat(high[np.newaxis], n_agents, axis=0),
@@ -162,25 +167,30 @@ class TeamSpaces(NamedTuple):
 
 
 def _checked_state(state: spaces.Space[Any]) -> spaces.Space[Any]:
-    if isinstance(state, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+    if isinstance(state, FIXED_SHAPE):
         return state
     raise ValueError(
         f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {state}; flatten it first"
     )
 
 
-def _bounds(own: spaces.Space[Any]) -> tuple[Array, Array]:
-    """Lowest and highest value of each entry of a space, in the space's dtype."""
-    if isinstance(own, spaces.Box):
-        return own.low, own.high
-    if isinstance(own, (spaces.Discrete, spaces.MultiDiscrete)):
-        low = np.asarray(own.start, dtype=own.dtype)
-        count = own.n if isinstance(own, spaces.Discrete) else own.nvec
-        return low, (low + np.asarray(count) - 1).astype(own.dtype)
-    if isinstance(own, spaces.MultiBinary):
-        return np.zeros(own.shape, dtype=own.dtype), np.ones(own.shape, dtype=own.dtype)
+def bounds_of(space: spaces.Space[Any]) -> tuple[Array, Array]:
+    """
+    Return the lowest and the highest value of each entry, both included, in the space's shape and dtype.
+
+    :param space: of fixed shape
+    :raises ValueError: for another
+    """
+    if isinstance(space, spaces.Box):
+        return space.low, space.high
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        low = np.asarray(space.start, dtype=space.dtype)
+        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        return low, (low + np.asarray(count) - 1).astype(space.dtype)
+    if isinstance(space, spaces.MultiBinary):
+        return np.zeros(space.shape, dtype=space.dtype), np.ones(space.shape, dtype=space.dtype)
     raise ValueError(
-        f"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got {own}; "
+        f"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got {space}; "
         "flatten it in a wrapper of the environment, for instance with gymnasium.spaces.flatten"
     )
 
@@ -194,6 +204,14 @@ def _not_a_team_space(found: str) -> str:
     )
 
 
+def layers(venv: VecEnv) -> Iterator[VecEnv]:
+    """Return an environment's wrappers, outermost first, and what they wrap."""
+    yield venv
+    while isinstance(venv, VecEnvWrapper):
+        venv = venv.venv
+        yield venv
+
+
 def find_n_agents(venv: VecEnv) -> int | None:
     """
     N of a vector environment of flattened teams, through any wrappers.
@@ -203,10 +221,9 @@ def find_n_agents(venv: VecEnv) -> int | None:
     :param venv: any vector environment
     :return: N, or None if no layer states it
     """
-    layer = venv
-    while isinstance(layer, VecEnvWrapper) and not _has_own(layer, "n_agents"):
-        layer = layer.venv
-    value = getattr(layer, "n_agents", None)
+    *_, innermost = layers(venv)
+    stating = (layer for layer in layers(venv) if _has_own(layer, "n_agents"))
+    value = getattr(next(stating, innermost), "n_agents", None)
     return None if value is None else check_count("n_agents", value)
 
 
@@ -247,16 +264,6 @@ def check_count(name: str, value: object) -> int:
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
-
-
-def check_seed(seed: object) -> None:
-    """
-    Check that a value is a seed of a run.
-
-    :raises ValueError: unless it is None or an integer of at least 0
-    """
-    if seed is not None and (isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0):
-        raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
 
 
 def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:
@@ -308,7 +315,7 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
     :param evaluation: the other
     :raises ValueError: if the seed of a game is in both
     """
-    common = _seeds_of(training) & _seeds_of(evaluation)
+    common = set(game_seeds_of(training) or ()) & set(game_seeds_of(evaluation) or ()) - {None}
     if common:
         raise ValueError(
             f"expected games of evaluation that are not trained on, got {len(common)} with seeds of training games; "
@@ -317,11 +324,10 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
         )
 
 
-def _seeds_of(venv: VecEnv) -> set[int]:
-    layer = venv
-    while isinstance(layer, VecEnvWrapper):
-        layer = layer.venv
-    return {seed for seed in getattr(layer, "seeded_with", ()) if seed is not None}
+def game_seeds_of(venv: VecEnv) -> tuple[int | None, ...] | None:
+    """Return the seeds that games were given last, None for fresh ones; None if the environment does not tell."""
+    *_, innermost = layers(venv)
+    return getattr(innermost, "seeded_with", None)
 
 
 def check_finite(name: str, values: Array, n_agents: int, step: int, first_game: int = 0) -> None:
@@ -392,7 +398,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """See the base class; the team's shape is answered here, whether the environments know it or not."""
         if attr_name in _TEAM_ATTRIBUTES and attr_name in vars(self):
-            return [vars(self)[attr_name] for _ in self._get_indices(indices)]
+            return [vars(self)[attr_name] for _ in chosen_indices(indices, self.num_envs)]
         return super().get_attr(attr_name, indices)
 
     def env_is_wrapped(
@@ -402,7 +408,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         if wrapper_class is not Monitor:
             return super().env_is_wrapped(wrapper_class, indices)
         self._warn_of_rows()
-        return [False for _ in self._get_indices(indices)]
+        return [False for _ in chosen_indices(indices, self.num_envs)]
 
     def _warn_of_rows(self) -> None:
         if self._warned_of_rows or self.n_agents == 1:

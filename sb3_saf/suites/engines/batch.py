@@ -10,13 +10,13 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from hecogrid_envs.core.rng import game_seeds
+from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.row_spaces import RowSpaces
-from sb3_saf.envs.teams import Array, check_count, check_seed
+from sb3_saf.envs.space_reader import checked_actions
+from sb3_saf.envs.teams import Array, check_count
 
 #: SB3's name for "the episode was won", of which it logs ``rollout/success_rate``.
 IS_SUCCESS = "is_success"
@@ -96,7 +96,7 @@ class ResumableBatch(Batch):
         """Go on from a snapshot of equal names, shapes and dtypes."""
 
 
-class BatchVecEnv(VecEnv):
+class BatchVecEnv(TeamVecEnv):
     """
     A batch of games as rows: row ``e * N + i`` is agent ``i`` of game ``e``.
 
@@ -114,30 +114,13 @@ class BatchVecEnv(VecEnv):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None here, got {render_mode!r}")
         self.batch = batch
-        self.n_games = check_count("n_envs", batch.n_games)
         self.possible_agents = list(batch.agents)
-        self.n_agents = len(batch.agents)
         self.render_mode = render_mode
         self.metadata = {"render_modes": ["rgb_array"]}
         self._actions: Array | None = None
         self._running = False
-        super().__init__(self.n_games * self.n_agents, batch.rows.to_space(), batch.action_space)
-        self.seed(seed)
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """
-        Seed all games, at the next reset.
-
-        :param seed: of the run; None for fresh entropy
-        :return: (B,) the seed of each row's game
-        """
-        check_seed(seed)
-        fresh = np.random.SeedSequence().entropy if seed is None else seed
-        chosen = game_seeds(int(fresh), self.n_games)  # type: ignore[arg-type]
-        #: Seeds of the games as they were last chosen, by which evaluation is told from training; None for fresh ones.
-        self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
-        self._next_seeds: list[int] | None = chosen
-        return [game_seed for game_seed in chosen for _ in range(self.n_agents)]
+        n_games = check_count("n_envs", batch.n_games)
+        super().__init__(n_games, len(batch.agents), batch.rows.to_space(), batch.action_space, seed)
 
     def reset(self) -> dict[str, Array]:
         """
@@ -164,7 +147,7 @@ class BatchVecEnv(VecEnv):
         """
         if not self._running:
             raise ValueError("the games have not begun: call reset() before step()")
-        self._actions = _checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
+        self._actions = checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -199,13 +182,12 @@ class BatchVecEnv(VecEnv):
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
         """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
         games = range(self.n_games)
-        pictures = [self.batch.picture(game) if self.render_mode == "rgb_array" else None for game in games]
-        return [picture for picture in pictures for _ in range(self.n_agents)]
+        return self.per_row(self.batch.picture(game) if self.render_mode == "rgb_array" else None for game in games)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Attribute of the suite's environment, which all rows share."""
         value = self.render_mode if attr_name == "render_mode" else getattr(self.batch.env, attr_name)
-        return [value for _ in self._get_indices(indices)]
+        return [value for _ in chosen_indices(indices, self.num_envs)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refuse: all games share one engine, which is made for its parameters."""
@@ -217,7 +199,7 @@ class BatchVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No row is wrapped in a Gymnasium wrapper."""
-        return [False for _ in self._get_indices(indices)]
+        return [False for _ in chosen_indices(indices, self.num_envs)]
 
 
 class ResumableBatchVecEnv(BatchVecEnv):
@@ -291,31 +273,3 @@ def _differences(own: Mapping[str, Array], found: Mapping[str, Any]) -> Iterator
         other = found[name]
         if getattr(other, "shape", None) != array.shape or other.dtype != array.dtype:
             yield f"expected {name!r} of shape {array.shape} and dtype {array.dtype}, got {other!r:.80}"
-
-
-def _checked_actions(
-    space: spaces.Space[Any], agents: Sequence[str], n_rows: int, actions: npt.ArrayLike
-) -> npt.NDArray[Any]:
-    """Bring actions into the dtype of their space, or say what is wrong with them."""
-    array = np.asarray(actions)
-    shape = (n_rows, *(space.shape or ()))
-    kinds = "fiu" if isinstance(space, spaces.Box) else "iu"
-    if array.shape != shape or array.dtype.kind not in kinds:
-        raise ValueError(f"expected actions from {space}, shape {shape}, got {array.dtype} of shape {array.shape}")
-    low, high = _action_bounds(space)
-    array = array.astype(space.dtype)
-    inside = ((array >= low) & (array <= high)).reshape(n_rows, -1).all(axis=1)
-    if not inside.all():
-        row = int(np.flatnonzero(~inside)[0])
-        game, agent = divmod(row, len(agents))
-        raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
-    return array
-
-
-def _action_bounds(space: spaces.Space[Any]) -> tuple[Any, Any]:
-    if isinstance(space, spaces.Box):
-        return space.low, space.high
-    if isinstance(space, spaces.MultiDiscrete):
-        return 0, space.nvec - 1
-    assert isinstance(space, spaces.Discrete)
-    return 0, space.n - 1
