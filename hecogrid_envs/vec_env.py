@@ -162,12 +162,14 @@ class NativeVecEnv(TeamVecEnv):
 
         :return: (B, *observation shape)
         """
-        states = [state_option(options, self.params) for options in self._options[:: self.n_agents]]
+        options = enumerate(self._options[:: self.n_agents])
+        states = {game: state_option(given, self.params) for game, given in options if given}
         self.batch.reset(seeds=self._next_seeds)
-        for game, state in enumerate(states):
+        for game, state in states.items():
             if state is not None:
                 self.batch.set_state(state, game)
-            self.games[game].agents = list(self.games[game].possible_agents)
+        for env in self.games:
+            env.agents = list(env.possible_agents)
         self._next_seeds = None
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]

@@ -28,7 +28,6 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.callbacks.finite import FiniteCallback
     from sb3_saf.callbacks.game_steps import GameStepsCallback
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
-    from sb3_saf.checkpoints.errors import CheckpointError
     from sb3_saf.checkpoints.learning import resumable_learn, resume
     from sb3_saf.envs.curriculum import Curriculum, Stage
     from sb3_saf.envs.gymnasium_team import GymnasiumTeam
@@ -37,7 +36,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.envs.monitor import TeamMonitor
     from sb3_saf.envs.team_game import EqualSpaces
     from sb3_saf.envs.turns import TurnsInParallel
-    from sb3_saf.errors import NonFiniteError
+    from sb3_saf.errors import CheckpointError, NonFiniteError
     from sb3_saf.evaluation import (
         EvaluationResult,
         RandomPolicy,

@@ -296,7 +296,7 @@ def test_team_size_that_only_the_wrapper_knows() -> None:
         ),
         (
             lambda: CentralizedValueWrapper(TeamVenv(), time_limit="truncate"),  # type: ignore[arg-type]
-            "time_limit must be 'terminal' or 'bootstrap', got 'truncate'",
+            "time_limit must be one of 'terminal', 'bootstrap', got 'truncate'",
         ),
         (
             lambda: CentralizedValueWrapper(CentralizedValueWrapper(TeamVenv())),

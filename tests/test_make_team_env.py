@@ -151,7 +151,7 @@ class Walk(gym.Env[Array, int]):
         ),
         (
             lambda: make_team_env("TeamTogether", backend="gpu"),  # type: ignore[arg-type]
-            "backend must be 'native', 'supersuit' or None, got 'gpu'",
+            "backend must be one of 'native', 'supersuit', got 'gpu'",
         ),
         (
             lambda: make_team_env(CounterEnv, backend="native"),
@@ -160,7 +160,7 @@ class Walk(gym.Env[Array, int]):
         ),
         (
             lambda: make_team_env("TeamTogether", time_limit="never", **SMALL),  # type: ignore[arg-type]
-            "time_limit must be 'terminal' or 'bootstrap', got 'never'",
+            "time_limit must be one of 'terminal', 'bootstrap', got 'never'",
         ),
         (
             lambda: make_team_env("TeamTogeter"),

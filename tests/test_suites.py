@@ -332,7 +332,7 @@ def test_rewards_are_shared_and_returns_stay_in_the_unit_of_the_games() -> None:
         steps = [env.step(np.array([0, 1])) for _ in range(3)]
         found[team_reward] = (steps[0][1].tolist(), steps[2][3][0]["episode"]["r"])
     assert found == {"given": ([1, 2], 9), "sum": ([3, 3], 9), "mean": ([1.5, 1.5], 9)}
-    with pytest.raises(ValueError, match="team_reward must be 'given', 'sum', 'mean' or None, got 'max'"):
+    with pytest.raises(ValueError, match="team_reward must be one of 'given', 'sum', 'mean', got 'max'"):
         make_team_env(PickUp, team_reward="max")  # type: ignore[arg-type]
 
 

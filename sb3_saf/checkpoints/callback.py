@@ -17,14 +17,13 @@ from sb3_saf.checkpoints.callbacks import all_callbacks, callback_states
 from sb3_saf.checkpoints.checks import check_keys, check_text, check_whole
 from sb3_saf.checkpoints.data import Tree, encode, write_tree
 from sb3_saf.checkpoints.environments import environment_state
-from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.generators import generator_states
 from sb3_saf.checkpoints.logs import logger_state
 from sb3_saf.checkpoints.models import is_off_policy, model_state, require_resumable
-from sb3_saf.checkpoints.runs import callback_descriptions, description
-from sb3_saf.checkpoints.software import software
+from sb3_saf.checkpoints.runs import callback_descriptions, description, software
 from sb3_saf.checkpoints.store import CheckpointFolder, Loaded
 from sb3_saf.envs.teams import check_count, require_n_agents
+from sb3_saf.errors import CheckpointError
 
 
 class Run(NamedTuple):

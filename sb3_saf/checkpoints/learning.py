@@ -25,16 +25,14 @@ from sb3_saf.checkpoints.callbacks import all_callbacks, check_callback_states, 
 from sb3_saf.checkpoints.checks import refused
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import check_environment_state, load_environment_state
-from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.generators import check_generator_states, load_generator_states
 from sb3_saf.checkpoints.logs import check_logger_state, continue_logs
 from sb3_saf.checkpoints.models import check_model_state, is_off_policy, load_model_state, require_resumable
-from sb3_saf.checkpoints.runs import check_descriptions
-from sb3_saf.checkpoints.software import check_software, warn_of_differences
+from sb3_saf.checkpoints.runs import check_descriptions, check_software, warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.envs.game_copies import ForeignGamesError, pickled_games, sign_games
 from sb3_saf.envs.teams import require_n_agents
-from sb3_saf.errors import NonFiniteError
+from sb3_saf.errors import CheckpointError, NonFiniteError
 
 #: Torch's own words for distributions of actions that weights too large have made of NaN.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)

@@ -31,7 +31,7 @@ from sb3_saf.checkpoints.checks import (
 )
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import check_stateful
-from sb3_saf.checkpoints.errors import CheckpointError
+from sb3_saf.errors import CheckpointError
 from sb3_saf.qplex.qplex import QPLEX
 
 _COUNTERS: Final = (

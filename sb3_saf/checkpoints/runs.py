@@ -1,10 +1,19 @@
-"""What makes a run another run: everything that is compared before a checkpoint is used, by name."""
+"""
+What makes a run another run: everything that is compared before a checkpoint is used, by name.
+
+Versions and hardware, which only the last bits of a run depend on, may differ.
+"""
 
 from __future__ import annotations
 
+import platform
+import warnings
 from collections.abc import Iterable
 from typing import Final
 
+import numpy as np
+import stable_baselines3
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -16,10 +25,10 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.checkpoints.checks import check_keys, check_list, check_text
+from sb3_saf.checkpoints.checks import check_keys, check_list, check_text, refused
 from sb3_saf.checkpoints.data import Tree
-from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.envs.teams import game_seeds_of
+from sb3_saf.errors import CheckpointError
 
 #: Arguments that have to be those of the first start. Schedules are compared by their values.
 _ARGUMENTS: Final = (
@@ -146,3 +155,39 @@ def _plain(value: object) -> Tree:
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     return str(getattr(value, "__qualname__", type(value).__qualname__))
+
+
+def software() -> dict[str, str]:
+    """Return versions and the number of threads."""
+    from sb3_saf import __version__  # the package imports this module
+
+    return {
+        "sb3_saf": __version__,
+        "stable_baselines3": stable_baselines3.__version__,
+        "torch": th.__version__,
+        "numpy": np.__version__,
+        "processor": platform.machine(),
+        "torch threads": str(th.get_num_threads()),
+    }
+
+
+def check_software(saved: Tree) -> None:
+    """Check that a checkpoint names versions as :func:`software` does."""
+    if not isinstance(saved, dict):
+        raise refused("the versions of software", "a dict", repr(saved)[:80])
+    for name, value in saved.items():
+        check_text(name, "the name of a software")
+        check_text(value, f"the version of {name}")
+
+
+def warn_of_differences(saved: dict[str, str]) -> None:
+    """Say what may change the last bits of the weights."""
+    own = software()
+    different = [f"{name} {saved.get(name)} there, {own[name]} here" for name in own if own[name] != saved.get(name)]
+    if different:
+        warnings.warn(
+            f"the checkpoint was made under other conditions ({'; '.join(different)}): the run goes on, but its "
+            "weights may differ from those of the undisturbed run",
+            UserWarning,
+            stacklevel=3,
+        )

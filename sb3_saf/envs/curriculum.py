@@ -11,6 +11,7 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_saf.checkpoints.checks import check_whole
 from sb3_saf.envs.teams import TeamVecEnvWrapper, check_count
 
 
@@ -117,9 +118,9 @@ class Curriculum(TeamVecEnvWrapper):
         """
         if state["ends"] != list(self.ends):
             raise ValueError(f"expected stages that end at game steps {list(self.ends)}, got {state['ends']!r:.80}")
-        steps = state["game_steps"]
-        if isinstance(steps, bool) or not isinstance(steps, int) or not 0 <= steps < 2**63 or steps % self.n_games:
-            raise ValueError(f"expected game_steps to be a multiple of {self.n_games}, got {steps!r}")
+        check_whole(state["game_steps"], "the game steps of a curriculum")
+        if state["game_steps"] % self.n_games:
+            raise ValueError(f"expected game_steps to be a multiple of {self.n_games}, got {state['game_steps']}")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """

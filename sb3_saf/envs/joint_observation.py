@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from hecogrid_envs.vec_env import chosen_indices
+from sb3_saf.checkpoints.checks import check_array, check_range, check_whole
 from sb3_saf.envs.row_spaces import RowSpaces, channels_first
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
@@ -25,6 +26,7 @@ from sb3_saf.envs.teams import (
     Array,
     TeamSpaces,
     TeamVecEnvWrapper,
+    check_choice,
     check_finite,
     require_n_agents,
     team_dones,
@@ -80,8 +82,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, n_agents: int | None = None, time_limit: TimeLimit = "terminal") -> None:
-        if time_limit not in TIME_LIMITS:
-            raise ValueError(f"time_limit must be {' or '.join(map(repr, TIME_LIMITS))}, got {time_limit!r}")
+        check_choice("time_limit", time_limit, TIME_LIMITS)
         raw = RowSpaces.of(venv.observation_space, venv.action_space)
         team = TeamSpaces.of(
             channels_first(raw.own),
@@ -142,14 +143,11 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
         :raises ValueError: naming the part that does not fit
         """
-        steps, masks = state["n_steps"], state["masks_shown"]
-        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
-            raise ValueError(f"expected 'n_steps' to be a whole number, got {steps!r}")
-        n_actions = self._raw.n_masked_actions
-        if masks is not None and (n_actions is None or np.shape(masks) != (self.num_envs, n_actions)):
-            raise ValueError(f"expected action masks of {self.num_envs} rows and {n_actions} actions")
-        if masks is not None and not np.isin(masks, (0, 1)).all():
-            raise ValueError("expected action masks of 0 and 1")
+        check_whole(state["n_steps"], "the steps of CentralizedValueWrapper")
+        if (masks := state["masks_shown"]) is not None:
+            shape = (self.num_envs, self._raw.n_masked_actions or 0)
+            check_array(masks, shape, np.int8, "the action masks of CentralizedValueWrapper")
+            check_range(masks, 0, 1, "the action masks of CentralizedValueWrapper")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a state (see :meth:`checkpoint_state`)."""

@@ -12,14 +12,16 @@ from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from hecogrid_envs.core.rng import check_seed
+from hecogrid_envs.task import check_task
+from hecogrid_envs.vec_env import make_vec_env
 from sb3_saf.envs.curriculum import Curriculum, Stage
 from sb3_saf.envs.game_form import AnyParallelEnv, AskMasks, Signals
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.team_game import make_team_game, team_game
-from sb3_saf.envs.team_reward import TeamReward, check_team_reward, share_reward
-from sb3_saf.envs.teams import check_count
+from sb3_saf.envs.team_reward import TEAM_REWARDS, SharedReward, TeamReward
+from sb3_saf.envs.teams import check_choice, check_count
 from sb3_saf.suites.registry import SuiteTask, find_task
 
 Backend = Literal["native", "supersuit"]
@@ -107,11 +109,12 @@ def make_team_env(
     check_count("n_envs", n_envs)
     check_count("n_cpus", n_cpus)
     check_seed(seed)
-    _check_backend(backend)
+    if backend is not None:
+        check_choice("backend", backend, BACKENDS)
     if team_reward is not None:
-        check_team_reward(team_reward)
+        check_choice("team_reward", team_reward, TEAM_REWARDS)
     request = Request(n_envs, backend, n_cpus, Signals(active is not False, action_masks, state))
-    task = find_task(env) if isinstance(env, str) else None
+    task = find_task(env) if isinstance(env, str) and "/" in env else None
     if isinstance(env, str) and _NAMES_OF_CODE.intersection(env):
         env = _imported(env)
     make: Callable[[int | None, dict[str, Any]], VecEnv]
@@ -126,10 +129,12 @@ def make_team_env(
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
         os.makedirs(monitor_dir, exist_ok=True)
-    monitor = TeamMonitor(venv, filename=monitor_dir, team_return="sum" if task is None else task.suite.team_return)
+    venv = TeamMonitor(venv, filename=monitor_dir, team_return="sum" if task is None else task.suite.team_return)
     if team_reward is None:
         team_reward = "given" if task is None else task.suite.team_reward
-    return CentralizedValueWrapper(share_reward(monitor, team_reward), time_limit=time_limit)
+    if team_reward != "given":
+        venv = SharedReward(venv, team_reward)
+    return CentralizedValueWrapper(venv, time_limit=time_limit)
 
 
 def _imported(name: str) -> EnvFactory:
@@ -139,11 +144,6 @@ def _imported(name: str) -> EnvFactory:
     make = find_environment(name).make
     assert make is not None, "only HECOGrid's environments have none, whose names have no dots"
     return make
-
-
-def _check_backend(backend: Backend | None) -> None:
-    if backend is not None and backend not in BACKENDS:
-        raise ValueError(f"backend must be {', '.join(map(repr, BACKENDS))} or None, got {backend!r}")
 
 
 def _refuse_signals(active: bool | None, action_masks: AskMasks, state: bool) -> None:
@@ -179,9 +179,6 @@ def _in_stages(
 
 def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
-    from hecogrid_envs import make_vec_env
-    from hecogrid_envs.task import check_task
-
     try:
         name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))
     except ValueError as error:

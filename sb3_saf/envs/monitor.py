@@ -14,10 +14,14 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.envs.opposition import OppositionDetector
-from sb3_saf.envs.teams import TeamVecEnvWrapper, check_finite, team_dones
+from sb3_saf.checkpoints.checks import check_array, check_real, check_whole
+from sb3_saf.envs.teams import Array, TeamVecEnvWrapper, check_finite, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
+#: Game steps after which rewards are judged.
+_N_STEPS: Final = 2000
+#: Correlation of the rewards of two agents below which they oppose each other.
+_OPPOSED: Final = -0.5
 
 
 class TeamMonitor(TeamVecEnvWrapper):
@@ -176,15 +180,10 @@ class TeamMonitor(TeamVecEnvWrapper):
         :raises ValueError: naming the part that does not fit
         """
         for name, own in (("returns", self._returns), ("lengths", self._lengths)):
-            found = state[name]
-            if np.shape(found) != own.shape or getattr(found, "dtype", None) != own.dtype:
-                raise ValueError(f"expected {name!r} of {self.n_games} games, got {found!r:.80}")
+            check_array(state[name], own.shape, own.dtype, f"{name!r} of the monitor")
         for name in ("episode_count", "n_steps", "file_size"):
-            count = state[name]
-            if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count < 2**63:
-                raise ValueError(f"expected {name!r} to be a whole number, got {count!r}")
-        if isinstance(state["t_start"], bool) or not isinstance(state["t_start"], float):
-            raise ValueError(f"expected 't_start' to be a time, got {state['t_start']!r}")
+            check_whole(state[name], f"{name!r} of the monitor")
+        check_real(state["t_start"], "'t_start' of the monitor")
         self._check_file(state["file_size"], state["episode_count"])
 
     def _check_file(self, size: int, episode_count: int) -> None:
@@ -252,3 +251,51 @@ def _cut(file: IO[Any], size: int) -> None:
         )
         return
     os.truncate(file.fileno(), size)
+
+
+class OppositionDetector:
+    """
+    Warn once if two agents' rewards oppose each other: their correlation over the first game steps is below -0.5.
+
+    Agents share parameters, and QPLEX maximises the sum of their rewards: what was made for one team. Self-play is the
+    use that opponents may have of it.
+
+    :param n_agents: N
+    """
+
+    def __init__(self, n_agents: int) -> None:
+        self._sum = np.zeros(n_agents)
+        self._products = np.zeros((n_agents, n_agents))
+        self._n_steps = 0
+
+    def see(self, rewards: Array) -> None:
+        """
+        Take the rewards of a step.
+
+        :param rewards: (E, N)
+        """
+        if self._n_steps >= _N_STEPS:
+            return
+        rewards = rewards.astype(np.float64)
+        self._sum += rewards.sum(axis=0)
+        self._products += rewards.T @ rewards
+        self._n_steps += len(rewards)
+        if self._n_steps >= _N_STEPS:
+            self._judge()
+
+    def _judge(self) -> None:
+        means = self._sum / self._n_steps
+        covariances = self._products / self._n_steps - np.outer(means, means)
+        scales = np.sqrt(np.maximum(np.diag(covariances), 0.0))
+        scale = np.outer(scales, scales)
+        correlations = np.divide(covariances, scale, out=np.zeros_like(scale), where=scale > 1e-12)
+        first, second = np.unravel_index(int(np.argmin(correlations)), correlations.shape)
+        if correlations[first, second] < _OPPOSED:
+            warnings.warn(
+                f"the rewards of agents {first} and {second} oppose each other (correlation "
+                f"{correlations[first, second]:.2f} over {self._n_steps} game steps): they are opponents, but all "
+                "agents are trained as one team with shared parameters. Where that is meant as self-play, ignore "
+                "this warning; else make a team of one side and play the other inside the environment",
+                UserWarning,
+                stacklevel=4,
+            )

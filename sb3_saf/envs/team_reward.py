@@ -51,18 +51,3 @@ class SharedReward(TeamVecEnvWrapper):
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Do nothing."""
-
-
-def check_team_reward(team_reward: object) -> None:
-    """
-    Check a word for what agents learn from.
-
-    :raises ValueError: if it is none of ``TEAM_REWARDS``
-    """
-    if team_reward not in TEAM_REWARDS:
-        raise ValueError(f"team_reward must be {', '.join(map(repr, TEAM_REWARDS))} or None, got {team_reward!r}")
-
-
-def share_reward(venv: VecEnv, team_reward: TeamReward) -> VecEnv:
-    """Wrap a monitored VecEnv of teams, if there is anything to do."""
-    return venv if team_reward == "given" else SharedReward(venv, team_reward)

@@ -8,7 +8,7 @@ Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from numbers import Integral
 from typing import Any, Final, Literal, NamedTuple, get_args
 
@@ -264,6 +264,16 @@ def check_count(name: str, value: object) -> int:
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """
+    Check an argument that is one of a few words.
+
+    :raises ValueError: with the choices
+    """
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
 
 
 def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:

@@ -20,9 +20,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_saf import RandomPolicy, evaluate_team
-from sb3_saf.checkpoints.errors import CheckpointError
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.envs.teams import require_n_agents
+from sb3_saf.errors import CheckpointError
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import plain, read_json, write_json
 from sb3_saf.experiments.grid import Cell, RunConfig

@@ -9,7 +9,7 @@ import torch as th
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
-from sb3_saf.envs.teams import STATE_KEY
+from sb3_saf.envs.teams import STATE_KEY, check_choice
 from sb3_saf.networks.critic import (
     JointStates,
     JointValueHead,
@@ -27,7 +27,6 @@ from sb3_saf.policies.parts import (
     Declaration,
     PaperTable,
     TeamParts,
-    check_choice,
     team_policies,
 )
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy

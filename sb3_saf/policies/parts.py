@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_saf.envs.teams import check_choice
 from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.layers import NetworkSpec
@@ -141,13 +142,3 @@ def team_policies(policy: type[BasePolicy], recurrent: type[BasePolicy], maskabl
         RecurrentPPO: (recurrent,),
         MaskablePPO: (maskable,),
     }
-
-
-def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    """
-    Check an argument that is one of a few words.
-
-    :raises ValueError: with the choices
-    """
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")

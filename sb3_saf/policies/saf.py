@@ -10,7 +10,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from torch import nn
 
-from sb3_saf.envs.teams import check_count
+from sb3_saf.envs.teams import check_choice, check_count
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
 from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
@@ -23,7 +23,6 @@ from sb3_saf.policies.parts import (
     Declaration,
     PaperTable,
     TeamParts,
-    check_choice,
     team_policies,
 )
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy

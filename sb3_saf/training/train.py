@@ -18,8 +18,7 @@ from typing import Any, Final
 
 import yaml
 
-from sb3_saf.checkpoints.errors import CheckpointError
-from sb3_saf.errors import NonFiniteError
+from sb3_saf.errors import CheckpointError, NonFiniteError
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.callbacks import RemainingTime
 from sb3_saf.training.commands import (
