@@ -23,7 +23,7 @@ from hecogrid_envs.core.rng import fresh_seed, generator_word
 from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.snapshots import check_snapshot, load_snapshot, take_snapshot
-from hecogrid_envs.state import StateMapping, check_state
+from hecogrid_envs.state import StateMapping, check_state, state_of
 from hecogrid_envs.task import TaskName, check_task
 from hecogrid_envs.tiles import INVISIBLE
 
@@ -272,19 +272,8 @@ class GameBatch:
     def get_state(self, game: int = 0) -> StateMapping:
         """Copy the state of one game (see :class:`~hecogrid_envs.state.StateMapping`)."""
         game = self._checked(game)
-        games, width = self._games, self.params.grid_size
-        terrain = games.terrain[game].reshape(width, width).T
-        treasures = np.zeros((width, width), dtype=np.uint8)
-        treasures[terrain == Terrain.TREASURE] = TreasureState.AVAILABLE
-        treasures[terrain == Terrain.COLLECTED] = TreasureState.COLLECTED
-        return StateMapping(
-            walls=terrain == Terrain.WALL,
-            treasures=treasures,
-            keys=terrain == Terrain.KEY,
-            agent_pos=np.stack([games.x[game], games.y[game]], axis=1).astype(np.int64),
-            agent_dir=games.direction[game].astype(np.int64),
-            agent_has_key=games.has_key[game].astype(bool),
-        )
+        games = self._games
+        return state_of(*(each[game] for each in (games.terrain, games.x, games.y, games.direction, games.has_key)))
 
     def set_state(self, mapping: object, game: int = 0) -> None:
         """

@@ -12,8 +12,9 @@ import re
 import select
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import fields
+from importlib.util import find_spec
 from typing import Any, Final, Literal, TextIO, get_args, get_type_hints
 
 import numpy as np
@@ -197,7 +198,7 @@ def play_window(session: Session, tile_size: int | None = None, echo: Callable[[
     """
     tile = tile_size or fit_tile_size(session.env.params.grid_size, 840)
     echo(KEYS_HELP)
-    with HumanWindow(f"HECOGrid: {session.env.task}", fps=_WINDOW_FPS) as window:
+    with closing(HumanWindow(f"HECOGrid: {session.env.task}", fps=_WINDOW_FPS)) as window:
         picture = session.picture(tile)
         while True:
             window.show(picture)
@@ -219,10 +220,10 @@ def play_text(session: Session, stdin: TextIO, stdout: TextIO) -> None:
     :param stdin: keys
     :param stdout: where the game is written
     """
-    terminal = stdin.isatty() and _has_termios()
+    terminal = stdin.isatty() and find_spec("termios") is not None  # not on Windows
     colour = stdout.isatty() and "NO_COLOR" not in os.environ
     clear = "\x1b[2J\x1b[H" if terminal and stdout.isatty() else ""
-    mode: AbstractContextManager[object] = _SingleKeys(stdin) if terminal else nullcontext()
+    mode: AbstractContextManager[object] = _single_keys(stdin) if terminal else nullcontext()
     with mode:
         print(clear + session.text(colour), file=stdout, flush=True)
         for key in terminal_keys(stdin.fileno()) if terminal else line_keys(stdin):
@@ -249,7 +250,7 @@ def terminal_keys(descriptor: int) -> Iterator[str]:
     Read keys from a terminal in single key mode; arrow keys arrive as escape sequences, Esc as a lone escape.
 
     :param descriptor: file descriptor to read bytes from
-    :return: names as :class:`~hecogrid_envs.rendering.HumanWindow` gives them, until the input ends
+    :return: names as :class:`~hecogrid_envs.window.HumanWindow` gives them, until the input ends
     """
     names = {"\t": "tab", " ": "space", "\x04": "quit"}
     while True:
@@ -266,31 +267,18 @@ def terminal_keys(descriptor: int) -> Iterator[str]:
             yield names.get(key, key.lower())
 
 
-def _has_termios() -> bool:
+@contextmanager
+def _single_keys(stdin: TextIO) -> Iterator[None]:
+    """Let a terminal hand over keys one by one without printing them, and repair it at the end."""
+    import termios
+    import tty
+
+    before = termios.tcgetattr(stdin.fileno())
+    tty.setcbreak(stdin.fileno())
     try:
-        import termios  # noqa: F401  (not on Windows)
-    except ImportError:
-        return False
-    return True
-
-
-class _SingleKeys:
-    """Makes a terminal hand over keys one by one without printing them, and repairs it at the end."""
-
-    def __init__(self, stdin: TextIO) -> None:
-        self.descriptor = stdin.fileno()
-
-    def __enter__(self) -> None:
-        import termios
-        import tty
-
-        self.before = termios.tcgetattr(self.descriptor)
-        tty.setcbreak(self.descriptor)
-
-    def __exit__(self, *_: object) -> None:
-        import termios
-
-        termios.tcsetattr(self.descriptor, termios.TCSADRAIN, self.before)
+        yield
+    finally:
+        termios.tcsetattr(stdin.fileno(), termios.TCSADRAIN, before)
 
 
 # --- the command line

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.arrays import empty_games
-from hecogrid_envs.constants import AGENT_PALETTE, Terrain, TreasureState
+from hecogrid_envs.constants import AGENT_PALETTE, Terrain
 from hecogrid_envs.core.occupancy import arrive
 from hecogrid_envs.core.types import Games, World
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.state import check_state
+from hecogrid_envs.state import check_state, state_of
 
 Snapshot = Mapping[str, npt.NDArray[Any]]
 
@@ -100,24 +100,13 @@ def _check_values(snapshot: Snapshot, n_agents: int) -> None:
 
 
 def _check_game(snapshot: Snapshot, game: int, params: HECOGridParams) -> None:
-    width = params.grid_size
-    terrain = snapshot["terrain"][game].reshape(width, width).T
-    treasures = np.zeros((width, width), dtype=np.uint8)
-    treasures[terrain == Terrain.TREASURE] = TreasureState.AVAILABLE
-    treasures[terrain == Terrain.COLLECTED] = TreasureState.COLLECTED
-    mapping = {
-        "walls": terrain == Terrain.WALL,
-        "treasures": treasures,
-        "keys": terrain == Terrain.KEY,
-        "agent_pos": np.stack([snapshot["x"][game], snapshot["y"][game]], axis=1),
-        "agent_dir": snapshot["direction"][game],
-        "agent_has_key": snapshot["has_key"][game],
-    }
+    names = ("terrain", "x", "y", "direction", "has_key")
+    mapping = state_of(*(snapshot[name][game] for name in names))
     try:
         check_state(mapping, params)
     except ValueError as error:
         raise ValueError(f"a snapshot has a game {game} that no rules allow: {error}") from error
-    cells = snapshot["y"][game] * width + snapshot["x"][game]
+    cells = snapshot["y"][game] * params.grid_size + snapshot["x"][game]
     for cell in np.unique(cells):
         ranks = np.sort(snapshot["rank"][game][cells == cell])
         if not np.array_equal(ranks, np.arange(len(ranks))):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import TreasureState
+from hecogrid_envs.constants import Terrain, TreasureState
 from hecogrid_envs.params import HECOGridParams
 
 Bools = npt.NDArray[np.bool_]
@@ -72,6 +73,37 @@ def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
     _check_board(state)
     _check_agents(state)
     return state
+
+
+def state_of(
+    terrain: npt.NDArray[Any],
+    x: npt.NDArray[Any],
+    y: npt.NDArray[Any],
+    direction: npt.NDArray[Any],
+    has_key: npt.NDArray[Any],
+) -> StateMapping:
+    """
+    Return the state of a game of a batch.
+
+    :param terrain: (W * H,) :class:`~hecogrid_envs.constants.Terrain`, row by row
+    :param x: (N,) columns of the agents
+    :param y: (N,) their rows
+    :param direction: (N,)
+    :param has_key: (N,)
+    """
+    width = math.isqrt(terrain.size)
+    terrain = terrain.reshape(width, width).T
+    treasures = np.zeros((width, width), dtype=np.uint8)
+    treasures[terrain == Terrain.TREASURE] = TreasureState.AVAILABLE
+    treasures[terrain == Terrain.COLLECTED] = TreasureState.COLLECTED
+    return StateMapping(
+        walls=terrain == Terrain.WALL,
+        treasures=treasures,
+        keys=terrain == Terrain.KEY,
+        agent_pos=np.stack([x, y], axis=1).astype(np.int64),
+        agent_dir=direction.astype(np.int64),
+        agent_has_key=has_key.astype(bool),
+    )
 
 
 def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> StateMapping | None:

@@ -218,11 +218,7 @@ class NativeVecEnv(TeamVecEnv):
         return self._rows(views), rewards, dones, infos
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """
-        All that the future depends on, as plain data.
-
-        :return: for :meth:`load_checkpoint_state` of an environment that was made with the same arguments
-        """
+        """All that the future depends on, as plain data."""
         return {
             "task": self.batch.task,
             "params": {name: _plain(value) for name, value in asdict(self.params).items()},
@@ -233,12 +229,7 @@ class NativeVecEnv(TeamVecEnv):
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that these games could be in a state.
-
-        :param state: what :meth:`checkpoint_state` gave
-        :raises ValueError: naming the first difference, if the state is that of other games or one that no game reaches
-        """
+        """Check that these games could be in a state."""
         own = self.checkpoint_state()
         if different := sorted(own.keys() ^ state.keys()):
             raise ValueError(f"expected the state of games with {', '.join(own)}, they differ in {different[0]!r}")
@@ -257,12 +248,7 @@ class NativeVecEnv(TeamVecEnv):
             raise ValueError("expected running games to have begun, got a state in which one has not")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Go on from there; observations of the present are those of before.
-
-        :param state: what :meth:`checkpoint_state` gave
-        :raises ValueError: see :meth:`check_checkpoint_state`
-        """
+        """Go on from there; observations of the present are those of before."""
         self.check_checkpoint_state(state)
         self.batch.restore(state["games"])
         self._running = state["running"]

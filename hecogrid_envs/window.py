@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
@@ -39,14 +39,6 @@ class HumanWindow:
         self._screen: Any = None
         self._clock: Any = None
         self._keys: list[str] = []
-
-    def __enter__(self) -> HumanWindow:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def is_open(self) -> bool:

@@ -6,6 +6,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import pairwise
 from typing import Any
 
@@ -331,7 +332,7 @@ def pygame(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def test_window_shows_the_picture(pygame: Any) -> None:
     picture = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    with HumanWindow("title") as window:
+    with closing(HumanWindow("title")) as window:
         assert not window.is_open
         window.show(picture)
         assert window.is_open
@@ -345,7 +346,7 @@ def test_window_shows_the_picture(pygame: Any) -> None:
 
 
 def test_window_hands_over_keys_once(pygame: Any) -> None:
-    with HumanWindow() as window:
+    with closing(HumanWindow()) as window:
         assert window.poll() == []
         window.show(np.zeros((4, 4, 3), dtype=np.uint8))
         for key in (pygame.K_LEFT, pygame.K_SPACE, pygame.K_p, pygame.K_3, pygame.K_KP4, pygame.K_TAB, pygame.K_ESCAPE):
@@ -355,7 +356,7 @@ def test_window_hands_over_keys_once(pygame: Any) -> None:
 
 
 def test_closed_window_stays_closed(pygame: Any) -> None:
-    with HumanWindow() as window:
+    with closing(HumanWindow()) as window:
         window.show(np.zeros((4, 4, 3), dtype=np.uint8))
         pygame.event.post(pygame.event.Event(pygame.QUIT))
         assert window.poll() == ["quit"]

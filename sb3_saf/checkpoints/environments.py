@@ -21,8 +21,9 @@ class Stateful(Protocol):
     """
     What a VecEnv, a wrapper or a callback has to offer for its state to be in checkpoints.
 
-    It may have a method ``check_checkpoint_state(state)``, too, which raises ValueError for a state that it could not
-    be in. All parts of a run are checked before the first one is loaded.
+    States are plain data, for a layer or callback that was made with the same arguments. It may have a method
+    ``check_checkpoint_state(state)``, too, which raises ValueError for a state that it could not be in, naming the
+    first part that does not fit. All parts of a run are checked before the first one is loaded.
     """
 
     def checkpoint_state(self) -> Mapping[str, Any]:

@@ -186,7 +186,7 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
     :param again: how to go on
     """
     signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
-    with _handled(signals, _Stopper(checkpoints, at_rollout)):
+    with _handled(signals, _stopper(checkpoints, at_rollout)):
         try:
             yield
         except (KeyboardInterrupt, SystemExit):
@@ -205,23 +205,18 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
             raise NonFiniteError(f"{what}; {last}") from error
 
 
-class _Stopper:
-    """
-    What a signal does: it raises, at once or at the start of the next rollout; the second one at once.
+def _stopper(checkpoints: TeamCheckpointCallback, at_rollout: bool) -> Callable[[int, FrameType | None], None]:
+    """Return what a signal does: it stops at once or at the start of the next rollout; the second one at once."""
+    waits = at_rollout
 
-    :param checkpoints: of the run
-    :param at_rollout: whether the first one waits
-    """
-
-    def __init__(self, checkpoints: TeamCheckpointCallback, at_rollout: bool) -> None:
-        self._checkpoints = checkpoints
-        self._waits = at_rollout
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if not self._waits:
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal waits
+        if not waits:
             _stop(number)
-        self._waits = False
-        self._checkpoints.stop_soon(partial(_stop, number))
+        waits = False
+        checkpoints.stop_soon(partial(_stop, number))
+
+    return handle
 
 
 def _stop(number: int) -> NoReturn:

@@ -102,20 +102,11 @@ class Curriculum(TeamVecEnvWrapper):
         self.venv = self.stages[stage]
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """
-        How far the curriculum is; the state of the games is theirs to give.
-
-        :return: plain data for :meth:`load_checkpoint_state`
-        """
+        """How far the curriculum is; the state of the games is theirs to give."""
         return {"ends": list(self.ends), "game_steps": self.game_steps}
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that this curriculum could be there.
-
-        :param state: what :meth:`checkpoint_state` gave
-        :raises ValueError: naming the difference
-        """
+        """Check that this curriculum could be there."""
         if state["ends"] != list(self.ends):
             raise ValueError(f"expected stages that end at game steps {list(self.ends)}, got {state['ends']!r:.80}")
         check_whole(state["game_steps"], "the game steps of a curriculum")
@@ -123,11 +114,7 @@ class Curriculum(TeamVecEnvWrapper):
             raise ValueError(f"expected game_steps to be a multiple of {self.n_games}, got {state['game_steps']}")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Go on from there.
-
-        :param state: what :meth:`checkpoint_state` gave
-        """
+        """Go on from there."""
         self.game_steps = state["game_steps"]
         self._enter(self._present_stage())
 

@@ -1,4 +1,4 @@
-"""Attributes of a PettingZoo game and of the wrappers around it."""
+"""What can be asked of a PettingZoo game and of the wrappers around it: attributes, methods, action masks."""
 
 from __future__ import annotations
 
@@ -42,6 +42,11 @@ def get_attribute(env: Any, name: str) -> Any:
         if value is not _MISSING:
             return value
     raise AttributeError(f"neither {env} nor what it wraps has an attribute {name!r}")
+
+
+def call_method(env: Any, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    """Call a method of the game or of a wrapper around it."""
+    return get_attribute(env, name)(*args, **kwargs)
 
 
 def set_attribute(env: Any, name: str, value: Any) -> None:

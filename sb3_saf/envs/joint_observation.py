@@ -130,19 +130,11 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return method_name == _ACTION_MASKS and self.team_spaces.action_mask is not None
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """
-        Steps so far, and the action masks of the present.
-
-        :return: plain data for :meth:`load_checkpoint_state`
-        """
+        """Steps so far, and the action masks of the present."""
         return {"n_steps": self._n_steps, "masks_shown": self._masks_shown}
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that the wrapper could be in a state.
-
-        :raises ValueError: naming the part that does not fit
-        """
+        """Check that the wrapper could be in a state."""
         check_whole(state["n_steps"], "the steps of CentralizedValueWrapper")
         if (masks := state["masks_shown"]) is not None:
             shape = (self.num_envs, self._raw.n_masked_actions or 0)

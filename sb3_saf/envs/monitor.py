@@ -158,11 +158,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         return writer
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """
-        Counters, unfinished episodes, and how long the file is.
-
-        :return: plain data for :meth:`load_checkpoint_state`
-        """
+        """Counters, unfinished episodes, and how long the file is."""
         return {
             "returns": self._returns.copy(),
             "lengths": self._lengths.copy(),
@@ -173,12 +169,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that the monitor could be in a state.
-
-        :param state: what :meth:`checkpoint_state` gave
-        :raises ValueError: naming the part that does not fit
-        """
+        """Check that the monitor could be in a state."""
         for name, own in (("returns", self._returns), ("lengths", self._lengths)):
             check_array(state[name], own.shape, own.dtype, f"{name!r} of the monitor")
         for name in ("episode_count", "n_steps", "file_size"):
@@ -200,11 +191,7 @@ class TeamMonitor(TeamVecEnvWrapper):
             )
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Go on from there: lines that were written to the file later are cut off, for they will come again.
-
-        :param state: what :meth:`checkpoint_state` gave
-        """
+        """Go on from there: lines that were written to the file later are cut off, for they will come again."""
         self._returns[:] = state["returns"]
         self._lengths[:] = state["lengths"]
         self.episode_count = state["episode_count"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from copy import deepcopy
 from typing import Any, Final, TypeAlias
 
@@ -11,9 +11,10 @@ import numpy.typing as npt
 from gymnasium.vector.utils import iterate
 from supersuit.vector import MarkovVectorEnv
 
-from sb3_saf.envs import game_layers, parallel_calls
+from sb3_saf.envs import parallel_calls
 from sb3_saf.envs.game_copies import Way, pickled, unpickled
 from sb3_saf.envs.game_form import OBSERVATION, AnyParallelEnv, GameForm
+from sb3_saf.envs.game_layers import get_attribute
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.space_reader import SpaceReader
 from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
@@ -169,7 +170,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         if way == "pickle":
             content = {"pickled": pickled(self.par_env)}
         else:
-            content = {"state": game_layers.get_attribute(self.par_env, "get_state")()}
+            content = {"state": get_attribute(self.par_env, "get_state")()}
         return {"n_steps": self._n_steps, "ended": [agent in self._ended for agent in self.agents], **content}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -178,7 +179,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
             self.par_env = unpickled(snapshot["pickled"], self.par_env)
         else:
             parallel_calls.reset(self.par_env, None, None)
-            game_layers.get_attribute(self.par_env, "set_state")(snapshot["state"])
+            get_attribute(self.par_env, "set_state")(snapshot["state"])
         self._count_step(snapshot["n_steps"])
         self._ended = {agent for agent, ended in zip(self.agents, snapshot["ended"], strict=True) if ended}
         self._playing = self._find_playing()
@@ -268,29 +269,6 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
             f"and ones (one per action), got {found!r}; give it at every step to every agent that acts, or pass "
             "action_masks=False"
         )
-
-    # ---- what SB3 asks games for
-
-    def answer(self, question: str, *args: Any) -> Any:
-        """
-        Answer a question about the game; see :mod:`sb3_saf.envs.game_layers`.
-
-        :param question: "has_attr", "get_attr", "set_attr", "call" (name, arguments, keyword arguments), "is_wrapped",
-            "action_masks"
-        :param args: of the question
-        """
-        if question == "call":
-            name, positional, keywords = args
-            return game_layers.get_attribute(self.par_env, name)(*positional, **keywords)
-        if question == "action_masks":
-            return game_layers.action_masks(self.par_env, self.agents)
-        answers: dict[str, Callable[..., Any]] = {
-            "has_attr": game_layers.has_attribute,
-            "get_attr": game_layers.get_attribute,
-            "set_attr": game_layers.set_attribute,
-            "is_wrapped": game_layers.is_wrapped,
-        }
-        return answers[question](self.par_env, *args)
 
 
 def _add_missing_attributes(env: Any) -> None:

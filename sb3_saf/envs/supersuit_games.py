@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +14,19 @@ from sb3_saf.envs.game_form import GameForm
 from sb3_saf.envs.game_source import GameSource
 from sb3_saf.envs.supersuit_game import Info, Infos, TeamMarkovVectorEnv
 
-#: Game, question and arguments of :meth:`TeamMarkovVectorEnv.answer`.
-Question = tuple[int, str, tuple[Any, ...]]
+
+class Question(NamedTuple):
+    """
+    A question to a game.
+
+    :param game: its index among all
+    :param function: of :mod:`sb3_saf.envs.game_layers`, called with the game
+    :param args: further arguments
+    """
+
+    game: int
+    function: Callable[..., Any]
+    args: tuple[Any, ...]
 
 
 class Played(NamedTuple):
@@ -62,24 +73,6 @@ class TeamConcatVecEnv(ConcatVecEnv):
         self._way: Way | None = None
         _check_all_differ(self.vec_envs)
 
-    def reset(
-        self, seed: Sequence[int | None] | None = None, options: Sequence[Info | None] | None = None
-    ) -> tuple[Any, Infos]:
-        """
-        Begin an episode in every game.
-
-        :param seed: of each game
-        :param options: for each game
-        :return: observations and infos of the rows
-        """
-        none = [None] * len(self.vec_envs)
-        started = [
-            game.reset(seed=one, options=own)
-            for game, one, own in zip(self.vec_envs, seed or none, options or none, strict=True)
-        ]
-        observations, infos = zip(*started, strict=True)
-        return self.concat_obs(observations), [info for game in infos for info in game]
-
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """
         Begin an episode in every game of this process.
@@ -88,7 +81,10 @@ class TeamConcatVecEnv(ConcatVecEnv):
         :param options: for all E games
         :return: observations and infos of the rows
         """
-        return self.reset([seeds[game] for game in self._indices], [options[game] for game in self._indices])
+        games = zip(self._indices, self.vec_envs, strict=True)
+        started = [game.reset(seed=seeds[index], options=options[index]) for index, game in games]
+        observations, infos = zip(*started, strict=True)
+        return self.concat_obs(observations), [info for game in infos for info in game]
 
     def play(self, actions: npt.NDArray[Any]) -> Played:
         """
@@ -112,8 +108,8 @@ class TeamConcatVecEnv(ConcatVecEnv):
         """
         games = dict(zip(self._indices, self.vec_envs, strict=True))
         return {
-            place: games[game].answer(question, *args)
-            for place, (game, question, args) in enumerate(questions)
+            place: function(games[game].par_env, *args)
+            for place, (game, function, args) in enumerate(questions)
             if game in games
         }
 

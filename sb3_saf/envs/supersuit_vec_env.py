@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, cast
@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
+from sb3_saf.envs import game_layers
 from sb3_saf.envs.game_copies import check_signature, signature
 from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, Signals, check_is_parallel, first_infos_of, game_form
 from sb3_saf.envs.game_source import GameSource
@@ -166,12 +167,7 @@ class SuperSuitVecEnv(TeamVecEnv):
     # ---- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """
-        Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`).
-
-        :return: plain data and bytes for :meth:`load_checkpoint_state`
-        :raises CheckpointError: if games cannot be copied
-        """
+        """Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`)."""
         self._check_open()
         snapshots = self._games.snapshots()
         for snapshot in snapshots:
@@ -186,12 +182,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that the games could be in this state, and that this user has signed what is pickled.
-
-        :param state: what :meth:`checkpoint_state` gave
-        :raises CheckpointError: naming what does not fit
-        """
+        """Check that the games could be in this state, and that this user has signed what is pickled."""
         where = "the state of the games"
         check_keys(state, ("seeds", "next_seeds", "begun", "warned", "games"), where)
         for name in ("seeds", "next_seeds"):
@@ -211,12 +202,7 @@ class SuperSuitVecEnv(TeamVecEnv):
                 check_signature(game["pickled"], game["signature"])
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Go on from there.
-
-        :param state: what :meth:`checkpoint_state` gave
-        :raises CheckpointError: see :meth:`check_checkpoint_state`
-        """
+        """Go on from there."""
         self.check_checkpoint_state(state)
         if state["begun"]:
             self._games.restore(state["games"])
@@ -232,76 +218,48 @@ class SuperSuitVecEnv(TeamVecEnv):
         answers = self._games.ask(questions)
         return [answers[place] for place in range(len(questions))]
 
-    def _ask_rows(self, indices: VecEnvIndices, question: str, *args: Any) -> list[Any]:
+    def _ask_rows(self, indices: VecEnvIndices, function: Callable[..., Any], *args: Any) -> list[Any]:
         """Ask the games of some rows, once each; return for each row the answer of its game."""
         games = [row // self.n_agents for row in chosen_indices(indices, self.num_envs)]
         asked = list(dict.fromkeys(games))
-        answers = dict(zip(asked, self._ask([(game, question, args) for game in asked]), strict=True))
+        answers = dict(zip(asked, self._ask([Question(game, function, args) for game in asked]), strict=True))
         return [answers[game] for game in games]
 
     def has_attr(self, attr_name: str) -> bool:
-        """
-        Return whether all games have an attribute.
-
-        :param attr_name: of the game, or of a wrapper around it
-        """
-        return all(self._ask_rows(None, "has_attr", attr_name))
+        """Return whether all games, or wrappers around them, have an attribute."""
+        return all(self._ask_rows(None, game_layers.has_attribute, attr_name))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """
-        Get an attribute of the rows' games; from a worker process comes a copy.
-
-        :param attr_name: of the game, or of a wrapper around it
-        :param indices: rows
-        :return: one value per row
-        """
-        return self._ask_rows(indices, "get_attr", attr_name)
+        """Get an attribute of the rows' games, or of wrappers around them; from a worker process comes a copy."""
+        return self._ask_rows(indices, game_layers.get_attribute, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """
-        Set an attribute of the rows' games, once per game.
-
-        :param attr_name: of the game, or of the wrapper around it that has it
-        :param value: the new value
-        :param indices: rows
-        """
-        self._ask_rows(indices, "set_attr", attr_name, value)
+        """Set an attribute of the rows' games, or of the wrappers around them that have it; once per game."""
+        self._ask_rows(indices, game_layers.set_attribute, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """
-        Call a method of the rows' games, once for every row: a game with N rows among the indices is called N times.
-
-        :param method_name: of the game, or of a wrapper around it
-        :param method_args: positional arguments
-        :param indices: rows
-        :param method_kwargs: keyword arguments
-        :return: one result per row
-        """
+        """Call a method of the rows' games, once for every row; ``action_masks`` once per game (see the class)."""
         rows = chosen_indices(indices, self.num_envs)
         if method_name == "action_masks" and not method_args and not method_kwargs:
-            masks = self._ask_rows(rows, "action_masks")
+            masks = self._ask_rows(rows, game_layers.action_masks, self.possible_agents)
             return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
-        call = (method_name, method_args, method_kwargs)
-        return self._ask([(row // self.n_agents, "call", call) for row in rows])
+        return self._call([row // self.n_agents for row in rows], method_name, method_args, method_kwargs)
 
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
         """Call a method of games, once each (see the base class)."""
-        chosen = chosen_indices(games, self.n_games, "game")
-        return self._ask([(game, "call", (method_name, args, kwargs)) for game in chosen])
+        return self._call(chosen_indices(games, self.n_games, "game"), method_name, args, kwargs)
+
+    def _call(self, games: Sequence[int], *call: Any) -> list[Any]:
+        return self._ask([Question(game, game_layers.call_method, call) for game in games])
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """
-        Return whether the rows' games are wrapped.
-
-        :param wrapper_class: a wrapper
-        :param indices: rows
-        :return: one answer per row
-        """
-        return self._ask_rows(indices, "is_wrapped", wrapper_class.__module__, wrapper_class.__qualname__)
+        """Return whether the rows' games are wrapped in a wrapper."""
+        names = wrapper_class.__module__, wrapper_class.__qualname__
+        return self._ask_rows(indices, game_layers.is_wrapped, *names)
 
 
 def _source_and_form(make_env: MakeEnv, n_cpus: int, signals: Signals) -> tuple[GameSource, GameForm]:

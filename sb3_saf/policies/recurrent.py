@@ -166,15 +166,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     def evaluate_actions(  # type: ignore[override]
         self, obs: PyTorchObs, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """
-        Evaluate given actions.
-
-        :param obs: rows of sequences, one after another
-        :param actions: (B, ...) actions
-        :param lstm_states: see :meth:`forward`, before the sequences
-        :param episode_starts: (B,)
-        :return: values (B, 1), log-likelihoods (B,), entropies (B,) or None if there is no closed form
-        """
+        """Evaluate actions of sequences, one after another; see the base class, and :meth:`forward` for the states."""
         self._check_minibatch(obs)
         encoded = self._encoded(obs)
         distribution, _ = self._recall_distribution(obs, encoded.own, lstm_states.pi, episode_starts)
@@ -184,27 +176,13 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     def get_distribution(  # type: ignore[override]
         self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> tuple[Distribution, LstmStates]:
-        """
-        Return the action distribution; ``team`` is not read and may be missing.
-
-        :param obs: rows, or own observations alone (B, ...)
-        :param lstm_states: of the actor
-        :param episode_starts: (B,)
-        :return: distribution and the actor's next states
-        """
+        """Return the action distribution and the actor's next states (see the base class)."""
         return self._recall_distribution(obs, self.encode_own(obs), lstm_states, episode_starts)
 
     def predict_values(  # type: ignore[override]
         self, obs: PyTorchObs, lstm_states: LstmStates, episode_starts: th.Tensor
     ) -> th.Tensor:
-        """
-        Estimate values.
-
-        :param obs: rows
-        :param lstm_states: of the critic
-        :param episode_starts: (B,)
-        :return: (B, 1)
-        """
+        """Return values (B, 1); ``lstm_states`` are the critic's."""
         return self._recall_values(obs, self._encoded(obs), lstm_states, episode_starts)[0]
 
     def remember(
