@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hecogrid_envs import parallel_env, play
+from hecogrid_envs import TeamSupportEnv, play
+from hecogrid_envs.parallel_env import StepResult
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.play import Session, line_keys, make_session, play_text, play_window, terminal_keys
-from hecogrid_envs.task import TaskName
+from hecogrid_envs.play import Others, Session, line_keys, make_session, play_text, play_window, terminal_keys
 from hecogrid_envs.text import parse_level
 from hecogrid_envs.window import HumanWindow, _import_pygame
 
@@ -37,63 +37,44 @@ LEVEL = """
 ZONE_1 = list(permutations(range(7)))[500]
 
 
-class StillGame:
-    """Nothing moves; it remembers what it was asked to do."""
+class NotedGame(TeamSupportEnv):
+    """Remembers what it was asked to do."""
 
-    task: TaskName = "TeamSupport"
-
-    def __init__(self) -> None:
-        self.params = HECOGridParams(n_agents=3, grid_size=10, n_treasures=1, n_keys=0, heterogeneity=2, max_cycles=3)
-        self.possible_agents = ["agent_0", "agent_1", "agent_2"]
-        self.n_steps = 0
-        self.collected = 0
+    def __init__(self, **params: Any) -> None:
+        super().__init__(**params)
         self.actions: list[list[int]] = []
         self.seeds: list[int | None] = []
-        self.pay = 0.0
-        self.closed = False
 
-    def observations(self) -> dict[str, Any]:
-        return {agent: np.ones((7, 7), dtype=np.uint8) for agent in self.possible_agents}
-
-    def reset(self, seed: int | None = None) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> Any:
         self.seeds.append(seed)
-        self.n_steps = 0
-        return self.observations(), {}
+        return super().reset(seed, options)
 
-    def step(self, actions: dict[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    def step(self, actions: Mapping[str, int]) -> StepResult:
         self.actions.append([actions[agent] for agent in self.possible_agents])
-        self.n_steps += 1
-        everyone = self.possible_agents
-        over = dict.fromkeys(everyone, self.n_steps >= self.params.max_cycles)
-        return self.observations(), dict.fromkeys(everyone, self.pay), dict.fromkeys(everyone, False), over, {}
-
-    def get_state(self) -> Mapping[str, Any]:
-        return parse_level(LEVEL)
-
-    def close(self) -> None:
-        self.closed = True
+        return super().step(actions)
 
 
-@pytest.fixture
-def game() -> Any:
-    return StillGame()
+def noted_session(
+    seed: int | None = 0, raw: bool = False, others: Others = "wait", **params: Any
+) -> tuple[Session, NotedGame]:
+    """A session on the level above, and its game."""
+    world = {"n_agents": 3, "grid_size": 10, "n_treasures": 1, "n_keys": 0, "clutter_density": 0.0} | params
+    game = NotedGame(observation="tiles", agent_order="index", **world)
+    session = Session(game, seed, raw, others)
+    game.set_state(parse_level(LEVEL))
+    return session, game
 
 
 def real_session(**params: Any) -> Session:
-    """A session on the level above."""
-    world = {"n_agents": 3, "grid_size": 10, "n_treasures": 1, "n_keys": 0, "clutter_density": 0.0} | params
-    env = parallel_env("TeamSupport", observation="tiles", agent_order="index", **world)
-    session = Session(env, seed=0)
-    env.set_state(parse_level(LEVEL))
-    return session
+    return noted_session(**params)[0]
 
 
 # --- keys and actions
 
 
 @pytest.mark.parametrize(("key", "command"), [("left", 0), ("right", 1), ("up", 2), ("p", 3), ("d", 4), ("space", 6)])
-def test_keys_are_translated_for_the_zone(game: Any, key: str, command: int) -> None:
-    session = Session(game)
+def test_keys_are_translated_for_the_zone(key: str, command: int) -> None:
+    session, game = noted_session(heterogeneity=2)
     session.press(key)
     assert game.actions[-1][0] == command
     # The second agent (reading order) stands in zone 1.
@@ -102,8 +83,8 @@ def test_keys_are_translated_for_the_zone(game: Any, key: str, command: int) -> 
     assert game.actions[-1][1] == ZONE_1[command]
 
 
-def test_raw_keys_are_not_translated(game: Any) -> None:
-    session = Session(game, raw=True)
+def test_raw_keys_are_not_translated() -> None:
+    session, game = noted_session(raw=True, heterogeneity=2)
     session.press("tab")
     session.press("p")
     assert game.actions[-1][1] == 3
@@ -111,30 +92,30 @@ def test_raw_keys_are_not_translated(game: Any) -> None:
 
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("action", range(7))
-def test_numbers_are_never_translated(game: Any, action: int, raw: bool) -> None:
-    session = Session(game, raw=raw)
+def test_numbers_are_never_translated(action: int, raw: bool) -> None:
+    session, game = noted_session(raw=raw, heterogeneity=2)
     session.press("tab")
     session.press(str(action))
     assert game.actions[-1][1] == action
 
 
-def test_the_others_do_nothing(game: Any) -> None:
-    Session(game).press("up")
+def test_the_others_do_nothing() -> None:
+    session, game = noted_session(heterogeneity=2)
+    session.press("up")
     assert game.actions == [[2, ZONE_1[6], 6]]
 
 
-def test_the_others_can_wander(game: Any) -> None:
-    session = Session(game, seed=0, others="random")
+def test_the_others_can_wander() -> None:
+    session, game = noted_session(others="random", max_cycles=100)
     for _ in range(100):
-        session.over = False
         session.press("up")
     actions = np.array(game.actions)
     assert (actions[:, 0] == 2).all()
     assert set(actions[:, 1]) == set(actions[:, 2]) == set(range(7))
 
 
-def test_tab_selects_round_and_round(game: Any) -> None:
-    session = Session(game)
+def test_tab_selects_round_and_round() -> None:
+    session, game = noted_session()
     selected = []
     for _ in range(4):
         session.press("tab")
@@ -144,19 +125,19 @@ def test_tab_selects_round_and_round(game: Any) -> None:
 
 
 @pytest.mark.parametrize("key", ["q", "escape", "quit"])
-def test_leaving(game: Any, key: str) -> None:
-    assert Session(game).press(key) is False
-    assert Session(game).press("tab") is True
+def test_leaving(key: str) -> None:
+    assert real_session().press(key) is False
+    assert real_session().press("tab") is True
 
 
-def test_new_games_continue_the_seed(game: Any) -> None:
-    session = Session(game, seed=5)
+def test_new_games_continue_the_seed() -> None:
+    session, game = noted_session(seed=5)
     session.press("r")
-    assert game.seeds == [5, None]
+    assert game.seeds == [5, None, None]  # the second one is that of the level
 
 
-def test_an_ended_game_waits_for_a_new_one(game: Any) -> None:
-    session = Session(game)
+def test_an_ended_game_waits_for_a_new_one() -> None:
+    session, game = noted_session(max_cycles=3)
     for _ in range(5):
         session.press("up")
     assert len(game.actions) == 3
@@ -167,13 +148,12 @@ def test_an_ended_game_waits_for_a_new_one(game: Any) -> None:
     assert len(game.actions) == 4
 
 
-def test_status(game: Any) -> None:
-    session = Session(game)
+def test_status() -> None:
+    session = real_session(heterogeneity=2)
     session.press("tab")
     assert session.status == "agent 1 (zone 1, facing south): selected"
-    game.pay = 1 / 3
     session.press("up")
-    assert session.status == f"agent 1 (zone 1, facing south): up: action {ZONE_1[2]} = forward; 1 collected!"
+    assert session.status == f"agent 1 (zone 1, facing south): up: action {ZONE_1[2]} = forward"
     session.press("x")
     assert session.status.endswith("key 'x' does nothing; h lists the keys")
     session.press("h")

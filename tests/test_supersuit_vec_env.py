@@ -167,12 +167,6 @@ def test_stock_repeats_seeds_on_several_cpus() -> None:
     close_stock(venv)
 
 
-@one_and_two_cpus
-def test_no_two_games_share_a_seed(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(CounterEnv, n_games=4, seed=0, n_cpus=n_cpus)
-    assert len(set(draws(venv.reset()).tolist())) == 8
-
-
 def test_stock_copies_play_the_same_game() -> None:
     venv = stock(EagerEnv(), 3)
     assert len(set(draws(venv.reset()).tolist())) == 2  # of the two agents
@@ -694,14 +688,6 @@ def test_ppo_with_dict_observations_and_continuous_actions(bridge: Bridge, n_cpu
 
 
 @one_and_two_cpus
-def test_image_observations(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(ImageEnv, n_games=2, seed=0, n_cpus=n_cpus)
-    assert venv.observation_space == spaces.Box(0, 255, (8, 8, 3), np.uint8)
-    expected = [ImageEnv().reset(seed=seed)[0] for seed in game_seeds(0, 2)]
-    assert np.array_equal(np.asarray(venv.reset()), [game[agent] for game in expected for agent in game])
-
-
-@one_and_two_cpus
 def test_sb3_wrappers_on_top(bridge: Bridge, n_cpus: int) -> None:
     venv = bridge(lambda: CounterEnv(2, max_cycles=3, deaths={1: 2}), n_games=2, n_cpus=n_cpus)
     wrapped = VecNormalize(VecMonitor(VecCheckNan(venv, raise_exception=True)), gamma=0.9)
@@ -780,11 +766,6 @@ def test_module_instead_of_environment(bridge: Bridge) -> None:
 
     with pytest.raises(ValueError, match=r"type module; pass pettingzoo.classic.rps.rps.parallel_env\(...\)"):
         bridge(module, n_games=1)
-
-
-def test_padding_helps(bridge: Bridge) -> None:
-    venv = bridge(lambda: supersuit.pad_action_space_v0(UnequalEnv("action")), n_games=1)
-    assert venv.action_space == spaces.Discrete(7)
 
 
 @one_and_two_cpus
@@ -1054,14 +1035,6 @@ def test_worker_that_dies(bridge: Bridge, when: str) -> None:
 
 
 @pytest.mark.timeout(60)
-def test_worker_that_dies_before_a_question(bridge: Bridge) -> None:
-    venv = bridge(CounterEnv, n_games=2, n_cpus=2)
-    kill(workers(venv)[0])
-    with pytest.raises(RuntimeError, match=r"worker process . .* ended with exit code -9"):
-        venv.get_attr("level")
-
-
-@pytest.mark.timeout(60)
 def test_worker_that_an_odd_exception_ends(bridge: Bridge) -> None:
     venv = bridge(lambda: FaultyEnv("odd"), n_games=4, n_cpus=2)
     pids = workers(venv)
@@ -1225,9 +1198,3 @@ def test_script_that_forgets_to_close(tmp_path: Path, module: str, function: str
     finally:
         process.kill()
         process.communicate()
-
-
-def test_the_game_imports_neither_sb3_nor_torch() -> None:
-    code = "import sys, hecogrid_envs; assert not {'torch', 'stable_baselines3', 'supersuit'} & set(sys.modules)"
-    root = str(Path(__file__).parents[1])
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=root)
