@@ -233,11 +233,7 @@ def play_text(session: Session, stdin: TextIO, stdout: TextIO) -> None:
 
 
 def line_keys(stdin: TextIO) -> Iterator[str]:
-    """
-    Read keys from lines such as ``up up left p``.
-
-    :return: the words, in lower case
-    """
+    """Read keys from lines such as ``up up left p``: their words, in lower case."""
     for line in stdin:
         yield from line.lower().split()
 

@@ -102,11 +102,7 @@ def render_scene(scene: Scene, tile_size: int | None = None, show_views: bool = 
 
 
 def header_height(task: TaskName, params: HECOGridParams, tile_size: int) -> int:
-    """
-    Return the height of the bar above the map.
-
-    :return: pixels, an even number
-    """
+    """Return the height of the bar above the map in pixels, an even number."""
     return _header_layout(task, params, tile_size).height
 
 

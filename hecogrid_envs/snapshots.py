@@ -31,13 +31,7 @@ _NOBODY: Final = -1
 
 
 def take_snapshot(games: Games, seeded: npt.NDArray[np.bool_]) -> dict[str, npt.NDArray[Any]]:
-    """
-    Copy games.
-
-    :param games: E games
-    :param seeded: (E,) which of them have begun
-    :return: arrays by name, with games along the first axis; ``rank`` (E, N) counts who arrived in its cell before
-    """
+    """Copy E games: arrays by name; ``rank`` (E, N) counts who arrived in its cell before."""
     stored = {name: getattr(games, name).copy() for name in _STORED}
     return {"seeded": seeded.copy(), **stored, "rank": _ranks(games)}
 
@@ -55,15 +49,7 @@ def _ranks(games: Games) -> npt.NDArray[np.int32]:
 
 
 def check_snapshot(snapshot: Snapshot, games: Games, seeded: npt.NDArray[np.bool_], params: HECOGridParams) -> None:
-    """
-    Check that games with these parameters could be in a state.
-
-    :param snapshot: what :func:`take_snapshot` gave
-    :param games: E games of the same kind
-    :param seeded: (E,)
-    :param params: of the games
-    :raises ValueError: naming the first fault
-    """
+    """Check what :func:`take_snapshot` gave against games of the same kind; see ``GameBatch.check_snapshot``."""
     own = take_snapshot(games, seeded)
     if different := sorted(own.keys() ^ snapshot.keys()):
         raise ValueError(f"expected a snapshot with the arrays {sorted(own)}, they differ in {different[0]!r}")
@@ -114,13 +100,7 @@ def _check_game(snapshot: Snapshot, game: int, params: HECOGridParams) -> None:
 
 
 def load_snapshot(games: Games, world: World, snapshot: Snapshot) -> None:
-    """
-    Let games go on from a snapshot that passed :func:`check_snapshot`; their cells must be redrawn afterwards.
-
-    :param games: E games, overwritten
-    :param world: of the games
-    :param snapshot: copied
-    """
+    """Let games go on from a checked snapshot; their cells must be redrawn afterwards."""
     blank = empty_games(world, len(games.rng))
     for name, empty in blank._asdict().items():
         getattr(games, name)[...] = empty

@@ -73,19 +73,11 @@ class Curriculum(TeamVecEnvWrapper):
         return chosen[self.stage]
 
     def reset(self) -> VecEnvObs:
-        """
-        Start new episodes in the present stage.
-
-        :return: observations of the B rows
-        """
+        """Start new episodes in the present stage."""
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
-        """
-        Play one game step; if the stage ends with it, begin the next one.
-
-        :return: observations, rewards, dones and infos of the B rows
-        """
+        """Play one game step; if the stage ends with it, begin the next one."""
         obs, rewards, dones, infos = self.venv.step_wait()
         self.game_steps += self.n_games
         if self._present_stage() == self.stage:
@@ -119,11 +111,7 @@ class Curriculum(TeamVecEnvWrapper):
         self._enter(self._present_stage())
 
     def venv_in(self, state: Mapping[str, Any]) -> VecEnv:
-        """
-        Find the games that a state belongs to.
-
-        :param state: what :meth:`checkpoint_state` gave
-        """
+        """Return the games that a state of :meth:`checkpoint_state` belongs to."""
         return self.stages[int(np.searchsorted(self.ends, state["game_steps"], side="right"))]
 
     def close(self) -> None:

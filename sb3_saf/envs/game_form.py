@@ -213,11 +213,7 @@ def _state_space(example: Any) -> spaces.Space[Any]:
 
 
 def first_infos_of(build: Callable[[], Any]) -> Mapping[Any, Any]:
-    """
-    Return the infos of a reset, of a copy that is closed again.
-
-    :param build: makes the copy
-    """
+    """Return the infos of a reset, of a copy that ``build`` makes and that is closed again."""
     env = build()
     try:
         return parallel_calls.reset(env, seed=0, options=None)[1]

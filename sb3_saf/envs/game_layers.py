@@ -30,13 +30,7 @@ def has_attribute(env: Any, name: str) -> bool:
 
 
 def get_attribute(env: Any, name: str) -> Any:
-    """
-    Return an attribute of the game or of a wrapper around it, also one that PettingZoo's wrappers hide.
-
-    :param env: the outermost layer
-    :param name: of the attribute
-    :raises AttributeError: if no layer has it
-    """
+    """Return an attribute of the game or of a wrapper around it, also one that PettingZoo's wrappers hide."""
     for layer in layers_of(env):
         value = getattr(layer, name, _MISSING)
         if value is not _MISSING:
@@ -50,13 +44,7 @@ def call_method(env: Any, name: str, args: Sequence[Any], kwargs: Mapping[str, A
 
 
 def set_attribute(env: Any, name: str, value: Any) -> None:
-    """
-    Set an attribute on the outermost layer that has it of its own, else on the bare game.
-
-    :param env: the outermost layer
-    :param name: of the attribute
-    :param value: new value
-    """
+    """Set an attribute on the outermost layer that has it of its own, else on the bare game."""
     layers = layers_of(env)
     owners = (layer for layer in layers if name in getattr(layer, "__dict__", {}) or hasattr(type(layer), name))
     setattr(next(owners, layers[-1]), name, value)

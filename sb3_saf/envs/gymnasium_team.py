@@ -67,11 +67,7 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """
-        Play one step (see PettingZoo).
-
-        :param actions: of all agents
-        """
+        """Play one step with the actions of all agents (see PettingZoo)."""
         observations, rewards, terminated, truncated, info = self.env.step([actions[a] for a in self.possible_agents])
         is_over = bool(np.all(terminated)) or bool(np.all(truncated))
         is_ended = bool(np.all(terminated)) if self._is_ended is None else is_over and self._is_ended(self.env)
@@ -138,11 +134,5 @@ def check_is_team(env: gym.Env[Any, Any]) -> None:
 
 
 def make_gymnasium(env_id: str, render_mode: str | None, params: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    """
-    Make a registered environment without the checks and wrappers that are meant for one agent.
-
-    :param env_id: of Gymnasium's registry
-    :param render_mode: one of the environment's; None for none
-    :param params: of the environment
-    """
+    """Make an environment of Gymnasium's registry without checks and wrappers that are meant for one agent."""
     return gym.make(env_id, render_mode=render_mode, disable_env_checker=True, **params)

@@ -78,11 +78,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._writer: ResultsWriter | None = None
 
     def reset(self) -> VecEnvObs:
-        """
-        Start new episodes in all games; unfinished ones are not counted.
-
-        :return: observations as ``venv`` gives them
-        """
+        """Start new episodes in all games; unfinished ones are not counted."""
         self._returns[:] = 0
         self._lengths[:] = 0
         return self.venv.reset()
@@ -256,11 +252,7 @@ class OppositionDetector:
         self._n_steps = 0
 
     def see(self, rewards: Array) -> None:
-        """
-        Take the rewards of a step.
-
-        :param rewards: (E, N)
-        """
+        """Take the rewards of a step, (E, N)."""
         if self._n_steps >= _N_STEPS:
             return
         rewards = rewards.astype(np.float64)

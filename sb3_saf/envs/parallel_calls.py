@@ -1,4 +1,8 @@
-"""Calls of a game's ``reset`` and ``step``, with a clear error where the results are not PettingZoo's."""
+"""
+Calls of a game's ``reset`` and ``step``, with a clear error where the results are not PettingZoo's.
+
+What a game gives is by agent; ``place`` is game and step, for messages. Everything here raises ValueError.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +36,7 @@ class Step(NamedTuple):
 
 
 def reset(env: Any, seed: int | None, options: dict[str, Any] | None) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
-    """
-    Reset a game.
-
-    :param env: a ParallelEnv, so it says
-    :param seed: of the game
-    :param options: for the game
-    :return: observations and infos by agent
-    :raises ValueError: if its ``reset`` is not PettingZoo's
-    """
+    """Reset a game: observations and infos by agent."""
     try:
         result = env.reset(seed=seed, options=options)
     except TypeError as error:
@@ -62,13 +58,7 @@ def reset(env: Any, seed: int | None, options: dict[str, Any] | None) -> tuple[M
 
 
 def step(env: Any, actions: dict[Any, Any]) -> Step:
-    """
-    Step a game.
-
-    :param env: a ParallelEnv, so it says
-    :param actions: by agent
-    :raises ValueError: if its ``step`` does not return what PettingZoo's does
-    """
+    """Step a game with actions by agent."""
     result = env.step(actions)
     if not _are_dicts(result, 5):
         hint = ""
@@ -82,14 +72,7 @@ def step(env: Any, actions: dict[Any, Any]) -> Step:
 
 
 def playing_agents(env: Any, possible_agents: Sequence[Any], place: str) -> set[Any]:
-    """
-    Return the agents that a game lists in ``agents``.
-
-    :param env: the game
-    :param possible_agents: the names that it may list
-    :param place: game and step, for the message
-    :raises ValueError: if it lists something else
-    """
+    """Return the agents that a game lists in ``agents``, all of which must be in ``possible_agents``."""
     agents = env.agents
     if isinstance(agents, (str, bytes)) or not isinstance(agents, Iterable):
         raise ValueError(f"expected agents of {env} to be a list of names in {place}, got {agents!r}")
@@ -104,14 +87,7 @@ def playing_agents(env: Any, possible_agents: Sequence[Any], place: str) -> set[
 
 
 def number(rewards: Mapping[Any, Any], agent: Any, place: str) -> float:
-    """
-    Return the reward of an agent that acted.
-
-    :param rewards: by agent
-    :param agent: its name
-    :param place: game and step, for the message
-    :raises ValueError: if there is none, or it is no number
-    """
+    """Return the reward of an agent that acted."""
     if agent not in rewards:
         raise ValueError(
             f"expected a reward for {agent}, which acted, in {place}, got rewards for {list(rewards)}; give every "
@@ -127,15 +103,7 @@ def number(rewards: Mapping[Any, Any], agent: Any, place: str) -> float:
 
 
 def flag(name: str, flags: Mapping[Any, Any], agent: Any, place: str) -> bool:
-    """
-    Return whether an agent was terminated or truncated; one that is not mentioned was not.
-
-    :param name: of the flags, for the message
-    :param flags: by agent
-    :param agent: its name
-    :param place: game and step, for the message
-    :raises ValueError: if it is neither true nor false
-    """
+    """Return whether an agent was terminated or truncated (``name``); one that is not mentioned was not."""
     value = flags.get(agent, False)
     if value is True or value is False:
         return value
@@ -146,14 +114,7 @@ def flag(name: str, flags: Mapping[Any, Any], agent: Any, place: str) -> bool:
 
 
 def info(infos: Mapping[Any, Any], agent: Any, place: str) -> Mapping[str, Any]:
-    """
-    Return the info of an agent, an empty one if there is none.
-
-    :param infos: by agent
-    :param agent: its name
-    :param place: game and step, for the message
-    :raises ValueError: if it is no dict
-    """
+    """Return the info of an agent, an empty one if there is none."""
     found = infos.get(agent)
     if found is None:
         return {}

@@ -95,13 +95,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         return self._rows(observations, infos, self._playing), self.reset_infos
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Any, Any, Any, Any, Infos]:
-        """
-        Step the game; the next episode begins by itself.
-
-        :param actions: of the N rows, those of agents that take no part are ignored
-        :return: observations, rewards, terminations, truncations and infos of the N rows
-        :raises ValueError: if the game breaks PettingZoo's rules
-        """
+        """Step the game with the actions of the N rows (see PettingZoo); the next episode begins by itself."""
         acted = self._playing
         chosen = dict(zip(self.agents, iterate(self.action_space, actions), strict=True))
         self._count_step(self._n_steps + 1)

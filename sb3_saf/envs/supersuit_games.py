@@ -74,25 +74,14 @@ class TeamConcatVecEnv(ConcatVecEnv):
         _check_all_differ(self.vec_envs)
 
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
-        """
-        Begin an episode in every game of this process.
-
-        :param seeds: of all E games
-        :param options: for all E games
-        :return: observations and infos of the rows
-        """
+        """Begin an episode in every game of this process, of which there are seeds and options of all E games."""
         games = zip(self._indices, self.vec_envs, strict=True)
         started = [game.reset(seed=seeds[index], options=options[index]) for index, game in games]
         observations, infos = zip(*started, strict=True)
         return self.concat_obs(observations), [info for game in infos for info in game]
 
     def play(self, actions: npt.NDArray[Any]) -> Played:
-        """
-        Step every game of this process.
-
-        :param actions: of the B rows of all games
-        :return: the step of the rows of this process
-        """
+        """Step every game of this process, whose actions are among those of the B rows of all games."""
         first, last = self._indices[0], self._indices[-1] + 1
         rows = actions[first * self._n_agents : last * self._n_agents]
         observations, rewards, terminations, truncations, infos = self.step(rows)
@@ -100,12 +89,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
         return Played(observations, rewards, terminations | truncations, infos, reset_infos, self._notes)
 
     def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
-        """
-        Ask games.
-
-        :param questions: to any games
-        :return: answers of the games of this process, by the question's place in the list
-        """
+        """Answer questions to games of this process, by the question's place among those to any game."""
         games = dict(zip(self._indices, self.vec_envs, strict=True))
         return {
             place: function(games[game].par_env, *args)
@@ -114,21 +98,13 @@ class TeamConcatVecEnv(ConcatVecEnv):
         }
 
     def snapshots(self) -> list[dict[str, Any]]:
-        """
-        Copy the games of this process (see :meth:`TeamMarkovVectorEnv.snapshot`).
-
-        :raises CheckpointError: if they cannot be copied
-        """
+        """Copy the games of this process; a CheckpointError says that they cannot be copied."""
         if self._way is None:
             self._way = find_way(self._new_game)
         return [game.snapshot(self._way) for game in self.vec_envs]
 
     def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
-        """
-        Go on from snapshots.
-
-        :param snapshots: of all E games
-        """
+        """Go on from snapshots of all E games."""
         for index, game in zip(self._indices, self.vec_envs, strict=True):
             game.restore(snapshots[index])
 

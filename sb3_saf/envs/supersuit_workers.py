@@ -60,12 +60,7 @@ class GameProcess(gymnasium.Env[Any, Any]):
         threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def run(self, payload: bytes) -> bytes:
-        """
-        Call a method of this class.
-
-        :param payload: pickled name and arguments
-        :return: pickled result or :class:`Failure`
-        """
+        """Call a method of this class: pickled name and arguments to pickled result or :class:`Failure`."""
         try:
             name, args = pickle.loads(payload)
             result = getattr(self, name)(*args)

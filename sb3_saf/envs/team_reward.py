@@ -35,11 +35,7 @@ class SharedReward(TeamVecEnvWrapper):
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
-        """
-        Wait for the step of all games.
-
-        :return: what ``venv`` gives, with rewards (B,) that are equal in a team
-        """
+        """Wait for the step of all games; rewards (B,) are equal in a team."""
         obs, rewards, dones, infos = self.venv.step_wait()
         by_game = np.asarray(rewards).reshape(self.n_games, self.n_agents)
         shared = by_game.sum(axis=1) if self.team_reward == "sum" else by_game.mean(axis=1)

@@ -55,23 +55,12 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
             self._n_actions[agent] = int(space.n)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """
-        Begin a game.
-
-        :param seed: of the game
-        :param options: for the game
-        :return: observations and infos by agent
-        """
+        """Begin a game (see PettingZoo)."""
         observations, infos = super().reset(None if seed is None else seed % _SEEDS, options)
         return self._with_masks(observations, infos)
 
     def step(self, actions: dict[Any, Any]) -> Any:
-        """
-        Let the agent move whose turn it is.
-
-        :param actions: by agent; those of agents that wait are not read
-        :return: observations, rewards, terminations, truncations and infos by agent
-        """
+        """Let the agent move whose turn it is; actions of agents that wait are not read."""
         observations, rewards, terminations, truncations, infos = super().step(actions)
         observations, infos = self._with_masks(observations, infos)
         return observations, rewards, terminations, truncations, infos

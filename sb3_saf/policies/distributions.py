@@ -191,12 +191,7 @@ class PoolDistribution(_FromPool):
         self.space = spec_of(action_space)
 
     def proba_distribution(self, log_weights: th.Tensor, parameters: th.Tensor) -> PoolDistribution:
-        """
-        Set the parameters.
-
-        :param log_weights: (B, U), normalised
-        :param parameters: (B, U, P)
-        """
+        """Set normalised log weights (B, U) and parameters (B, U, P)."""
         self.log_weights, self.parameters = log_weights, parameters
         return self
 

@@ -226,11 +226,7 @@ class TeamRowsPolicy(BasePolicy):
     # --- encoding ---------------------------------------------------------------------------------------------------
 
     def encode_own(self, obs: PyTorchObs) -> EncodedRows:
-        """
-        Encode the rows' own observations.
-
-        :param obs: rows, or own observations alone
-        """
+        """Encode the own observations of rows, or own observations alone."""
         return self.row_encoder.rows(self._own(obs))
 
     def encode_teams(self, obs: PyTorchObs) -> tuple[EncodedRows, EncodedTeams]:
