@@ -175,7 +175,7 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"overrides": {"n_envs": 0}}, "n_envs must be from 1 to 100000"),
         ({"overrides": {"n_envs": True}}, "n_envs must be a whole number"),
         ({"overrides": {"normalize_advantage": "yes"}}, "normalize_advantage must be true or false"),
-        ({"overrides": {"time_limit": "end"}}, "time_limit must be one of 'terminal', 'bootstrap'"),
+        ({"overrides": {"time_limit": "end"}}, "time_limit must be 'terminal' or 'bootstrap'"),
         ({"overrides": {"policy_kwargs": "dict(n_slots=8)"}}, "must be a mapping, written {key: value}, got"),
         ({"overrides": {"policy_kwargs": {"n_policys": 2}}}, r"did you mean 'n_policies'\?"),
         ({"overrides": {"policy_kwargs": {"selection": "mix"}}}, "selection must be 'mixture' or 'gumbel'"),

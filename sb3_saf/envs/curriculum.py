@@ -72,10 +72,6 @@ class Curriculum(TeamVecEnvWrapper):
         chosen = [stage.seed(_seed_of_stage(seed, number)) for number, stage in enumerate(self.stages)]
         return chosen[self.stage]
 
-    def reset(self) -> VecEnvObs:
-        """Start new episodes in the present stage."""
-        return self.venv.reset()
-
     def step_wait(self) -> VecEnvStepReturn:
         """Play one game step; if the stage ends with it, begin the next one."""
         obs, rewards, dones, infos = self.venv.step_wait()

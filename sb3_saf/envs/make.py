@@ -11,9 +11,6 @@ import gymnasium as gym
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from hecogrid_envs.core.rng import check_seed
-from hecogrid_envs.task import check_task
-from hecogrid_envs.vec_env import make_vec_env
 from sb3_saf.envs.curriculum import Curriculum, Stage
 from sb3_saf.envs.game_form import AnyParallelEnv, AskMasks, Signals
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
@@ -108,7 +105,6 @@ def make_team_env(
     """
     check_count("n_envs", n_envs)
     check_count("n_cpus", n_cpus)
-    check_seed(seed)
     if backend is not None:
         check_choice("backend", backend, BACKENDS)
     if team_reward is not None:
@@ -179,6 +175,9 @@ def _in_stages(
 
 def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
+    from hecogrid_envs.task import check_task
+    from hecogrid_envs.vec_env import make_vec_env
+
     try:
         name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))
     except ValueError as error:

@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_saf.envs.teams import TeamVecEnvWrapper
 
@@ -29,10 +29,6 @@ class SharedReward(TeamVecEnvWrapper):
     def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"], n_agents: int | None = None) -> None:
         super().__init__(venv, n_agents)
         self.team_reward = team_reward
-
-    def reset(self) -> VecEnvObs:
-        """Start new episodes in all games."""
-        return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
         """Wait for the step of all games; rewards (B,) are equal in a team."""

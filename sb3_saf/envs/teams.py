@@ -18,9 +18,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs
 
-from hecogrid_envs.vec_env import chosen_indices
 from sb3_saf.errors import NonFiniteError
 
 TeamKey = Literal["obs", "team", "agent"]
@@ -255,6 +254,13 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     return size
 
 
+def chosen_rows(indices: VecEnvIndices, n_rows: int) -> list[int]:
+    """Return the rows that indices mean as SB3's methods take them, None for all."""
+    rows = np.arange(n_rows)
+    chosen = rows if indices is None else np.atleast_1d(rows[np.asarray(indices, dtype=np.int64)])
+    return [*map(int, chosen)]
+
+
 def check_count(name: str, value: object) -> int:
     """
     Check that a value is a whole number of at least 1.
@@ -397,6 +403,10 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         if is_vecenv_wrapped(venv, VecMonitor):
             self._warn_of_rows()
 
+    def reset(self) -> VecEnvObs:
+        """Start new episodes in all games."""
+        return self.venv.reset()
+
     def getattr_depth_check(self, name: str, already_found: bool) -> str | None:
         """See the base class; the team's shape is never ambiguous."""
         return None if name in _TEAM_ATTRIBUTES else super().getattr_depth_check(name, already_found)
@@ -408,7 +418,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """See the base class; the team's shape is answered here, whether the environments know it or not."""
         if attr_name in _TEAM_ATTRIBUTES and attr_name in vars(self):
-            return [vars(self)[attr_name] for _ in chosen_indices(indices, self.num_envs)]
+            return [vars(self)[attr_name] for _ in chosen_rows(indices, self.num_envs)]
         return super().get_attr(attr_name, indices)
 
     def env_is_wrapped(
@@ -418,7 +428,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         if wrapper_class is not Monitor:
             return super().env_is_wrapped(wrapper_class, indices)
         self._warn_of_rows()
-        return [False for _ in chosen_indices(indices, self.num_envs)]
+        return [False for _ in chosen_rows(indices, self.num_envs)]
 
     def _warn_of_rows(self) -> None:
         if self._warned_of_rows or self.n_agents == 1:
