@@ -90,7 +90,7 @@ def test_games_begun_from_a_state_have_randomness_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("n_threads", [1, 2])
-def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) -> None:
+def test_rows_are_the_games_of_parallel_env_also_where_they_end_at_different_steps(n_threads: int) -> None:
     params = {**SMALL, "observation": "tiles"}
     venv: Any = make_vec_env("TeamSupport", 3, seed=4, n_threads=n_threads, **params)
     twins = [hecogrid_envs.parallel_env("TeamSupport", **params) for _ in range(3)]
@@ -105,6 +105,7 @@ def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) 
             twins[1].reset(seed=9)
         actions = rng.integers(0, 7, size=(3, 5))
         observations, rewards, dones, infos = venv.step(actions.reshape(-1))
+        assert dones.dtype == bool and len({id(info) for info in infos}) == 15
         for game, env in enumerate(twins):
             rows = slice(game * 5, game * 5 + 5)
             result = env.step(dict(zip(env.agents, actions[game].tolist(), strict=True)))
@@ -112,6 +113,7 @@ def test_last_observations_of_games_that_end_at_different_steps(n_threads: int) 
             if not env.agents:
                 ends.append((step, game))
                 np.testing.assert_array_equal([info["terminal_observation"] for info in infos[rows]], now)
+                assert all(info["TimeLimit.truncated"] is True for info in infos[rows])
                 now = list(env.reset()[0].values())
             assert dones[rows].tolist() == list(result.truncations.values())
             np.testing.assert_array_equal(observations[rows], now)

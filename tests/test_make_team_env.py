@@ -98,16 +98,6 @@ def test_a_factory_with_parameters() -> None:
     assert [info["TimeLimit.truncated"] for info in infos] == [False] * 6
 
 
-def test_an_environment_is_copied() -> None:
-    own = CounterEnv(n_agents=2)
-    env = make_team_env(own, n_envs=3, seed=0)
-    draws = env.reset()["obs"][:, 2]
-    assert len(set(draws.tolist())) == 6, "copies play different games"
-    assert own.episode == 0
-    env.close()
-    assert not own.closed
-
-
 def test_agents_that_die_stay_as_idle_rows_until_the_team_is_done() -> None:
     env = make_team_env(CounterEnv(n_agents=2, max_cycles=3, deaths={0: 1}), seed=0, time_limit="bootstrap")
     env.reset()

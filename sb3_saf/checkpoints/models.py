@@ -1,8 +1,8 @@
 """
 State of an algorithm of SB3 between two rollouts.
 
-SB3 keeps most of it in attributes without a public name, and ``save`` leaves out parts of it, so those attributes are
-read and set here, and only here.
+SB3 has no public way to set most of it: its own ``load`` writes the attributes, from a file that it unpickles, and
+``save`` leaves out parts of them. So they are read and set here, and only here.
 """
 
 from __future__ import annotations

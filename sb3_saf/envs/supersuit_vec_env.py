@@ -19,9 +19,8 @@ from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, chec
 from sb3_saf.envs import game_layers
 from sb3_saf.envs.game_copies import check_signature, signature
 from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, Signals, check_is_parallel, first_infos_of, game_form
-from sb3_saf.envs.game_source import GameSource
 from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
-from sb3_saf.envs.supersuit_games import Question, TeamConcatVecEnv
+from sb3_saf.envs.supersuit_games import GameSource, Question, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.envs.teams import Array, check_count
 

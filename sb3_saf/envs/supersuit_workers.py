@@ -24,9 +24,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_saf.envs.game_form import GameForm
-from sb3_saf.envs.game_source import GameSource
 from sb3_saf.envs.supersuit_game import Info, Infos
-from sb3_saf.envs.supersuit_games import Played, Question, TeamConcatVecEnv, joined
+from sb3_saf.envs.supersuit_games import GameSource, Played, Question, TeamConcatVecEnv, joined
 
 #: Seconds that a worker process gets to close its games.
 CLOSE_TIMEOUT = 10.0
