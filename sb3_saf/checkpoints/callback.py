@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.game_steps import game_steps, show_game_steps
-from sb3_saf.checkpoints.callbacks import all_callbacks, callback_states
+from sb3_saf.checkpoints.callback_states import all_callbacks, callback_states
 from sb3_saf.checkpoints.checks import check_keys, check_text, check_whole
 from sb3_saf.checkpoints.data import Tree, encode, write_tree
 from sb3_saf.checkpoints.environments import environment_state

@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_saf.callbacks.finite import FiniteCallback
 from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run, newest_checkpoint
-from sb3_saf.checkpoints.callbacks import all_callbacks, check_callback_states, load_callback_states
+from sb3_saf.checkpoints.callback_states import all_callbacks, check_callback_states, load_callback_states
 from sb3_saf.checkpoints.checks import refused
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import check_environment_state, load_environment_state

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -156,19 +157,11 @@ class TeamConcatVecEnv(ConcatVecEnv):
             game.restore(snapshots[index])
 
     def close(self) -> None:
-        """Close all games, once; then raise the first error."""
+        """Close all games, once, even if closing one fails; then raise its error."""
         self.closed = True
-        errors = [error for game in self.vec_envs if (error := _closing_error(game)) is not None]
-        if errors:
-            raise errors[0]
-
-
-def _closing_error(game: TeamMarkovVectorEnv) -> Exception | None:
-    try:
-        game.close()
-    except Exception as error:
-        return error
-    return None
+        with ExitStack() as closing:
+            for game in reversed(self.vec_envs):  # the last one is called first
+                closing.callback(game.close)
 
 
 def _check_all_differ(games: Sequence[TeamMarkovVectorEnv]) -> None:
