@@ -708,22 +708,6 @@ def test_ppo_learns_and_no_weight_is_dead(name: str, kwargs: dict[str, Any], act
 # --- saving -----------------------------------------------------------------------------------------------------------
 
 
-def test_model_saves_loads_and_continues(tmp_path: Path) -> None:
-    kwargs = {"n_policies": 3, "selection": "mixture", "critic_input": "team", "chunk_size": 7}
-    model = make_model(policy_kwargs=kwargs).learn(120)
-    model.save(tmp_path / "model")
-    loaded = PPO.load(tmp_path / "model", env=ToyTeams(), device="cpu")
-    assert isinstance(loaded.policy, SAFPolicy)
-    assert loaded.policy.parts == model.policy.parts
-    assert loaded.policy.chunk_size == 7
-    assert equal_weights(model.policy, loaded.policy)
-    obs = to_numpy(team_rows(VECTOR))
-    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
-    loaded.learn(120, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 240
-    assert not equal_weights(model.policy, loaded.policy)
-
-
 @pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
 def test_policy_saves_and_loads(
     policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], tmp_path: Path
