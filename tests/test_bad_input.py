@@ -193,6 +193,11 @@ WRONG_CALLS: list[tuple[Callable[[], Any], str]] = [
     (lambda: GameBatch("TeamSupport", HECOGridParams(), 1, 0), "n_threads must be an integer of at least 1, got 0"),
     (lambda: vec(n_envs=0), "n_games must be an integer of at least 1, got 0"),
     (lambda: vec(backend="gpu"), "backend must be 'native' or 'supersuit', got 'gpu'"),
+    (
+        lambda: vec().set_options([{}]),
+        "expected a dict for all games or a list of 4 dicts, one per row (2 games of 2 agents), got 1",
+    ),
+    (lambda: vec().env_method("state", indices=4), "there is no row 4: expected 0 to 3"),
     (lambda: vec().step(np.zeros(4, dtype=int)), "the games have not begun: call reset() before step()"),
     (
         lambda: started().step(np.zeros(3, dtype=int)),
