@@ -16,6 +16,7 @@ from sb3_saf.experiments.page import config_words, experiment_words
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from tests.experiments_jobs import InlineEngine
+from tests.test_training_commands import failed
 
 
 def output(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -134,9 +135,4 @@ def test_one_line_errors(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(words)
-    error = capsys.readouterr().err
-    assert re.match(rf"python -m sb3_saf\.experiments( {words[0]})?: error: ", error)
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in failed(words, capsys, cli.main)

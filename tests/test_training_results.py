@@ -26,6 +26,7 @@ from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.runs import Run, describe, find_runs, setting_names, training_curve
 from sb3_saf.training.settings import load_settings
 from sb3_saf.training.watching import play
+from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
 
@@ -121,7 +122,7 @@ def test_a_window_needs_a_display(
     capsys.readouterr()
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
-    line = failed(zoo_enjoy.main, ["-f", str(logs), "--env", ENV], capsys)
+    line = failed(["-f", str(logs), "--env", ENV], capsys, zoo_enjoy.main)
     assert "there is no display" in line
     assert "--gif FILE" in line
 
@@ -148,7 +149,7 @@ def test_mistakes_in_enjoy_are_one_line(
     options: list[str], words: str, logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     quiet = [] if "--gif" in options else ["--no-render"]
-    assert words in failed(zoo_enjoy.main, ["-f", str(logs), *quiet, *options], capsys)
+    assert words in failed(["-f", str(logs), *quiet, *options], capsys, zoo_enjoy.main)
 
 
 def test_a_reader_may_leave(logs: Path) -> None:
@@ -164,20 +165,9 @@ def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.
     run = tmp_path / "saf" / f"{ENV}_1"
     (run / ENV).mkdir(parents=True)
     (run / f"{ENV}.zip").write_bytes(b"no zip")
-    assert "is no run of sb3_saf.train" in failed(zoo_enjoy.main, ["-f", str(tmp_path), "--no-render"], capsys)
+    assert "is no run of sb3_saf.train" in failed(["-f", str(tmp_path), "--no-render"], capsys, zoo_enjoy.main)
     (run / ENV / "config.yml").write_text((logs / "saf" / f"{ENV}_1" / ENV / "config.yml").read_text())
-    assert "is not a model saved by" in failed(zoo_enjoy.main, ["-f", str(tmp_path), "--no-render"], capsys)
-
-
-def failed(main: object, options: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line on stderr with which a command ended."""
-    assert callable(main)
-    with pytest.raises(SystemExit) as exit_:
-        main(options)
-    assert exit_.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "error: " in line
-    return line
+    assert "is not a model saved by" in failed(["-f", str(tmp_path), "--no-render"], capsys, zoo_enjoy.main)
 
 
 # --- runs and plot ----------------------------------------------------------------------------------------------------
@@ -270,7 +260,7 @@ def test_damaged_results_are_one_line(
     (run / name).write_text("a,b\nsome,text\n")
     source = "training" if name == "monitor.csv" else "evaluation"
     options = ["curves", "-f", str(tmp_path), "--source", source, "-o", str(tmp_path / "a.png")]
-    assert f"{name} is not what sb3_saf.train writes" in failed(zoo_plot.main, options, capsys)
+    assert f"{name} is not what sb3_saf.train writes" in failed(options, capsys, zoo_plot.main)
 
 
 @pytest.mark.parametrize("module", ["plot_train", "all_plots"])
@@ -311,4 +301,4 @@ def test_mistakes_in_plot_are_one_line(
     options: list[str], words: str, logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = [] if "-f" in options else ["-f", str(logs)]
-    assert words in failed(zoo_plot.main, [*options[:1], *folder, *options[1:]], capsys)
+    assert words in failed([*options[:1], *folder, *options[1:]], capsys, zoo_plot.main)

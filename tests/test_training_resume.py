@@ -15,22 +15,12 @@ from sb3_saf.export.weights import read_weights
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.commands import check_device
-from sb3_saf.training.settings import load_settings
+from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
 OPTIONS = (
-    "--env",
-    ENV,
-    "--size",
-    "smoke",
-    "--eval-episodes",
-    "2",
-    "--checkpoint-freq",
-    "1",
-    "-n",
-    "200",
-    "--inspect-freq",
-    "100000",
+    *("--env", ENV, "--size", "smoke", "-n", "200"),
+    *("--eval-episodes", "2", "--checkpoint-freq", "1", "--inspect-freq", "100000"),
 )
 
 
@@ -113,30 +103,23 @@ def test_other_settings_begin_another_run(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        train(tmp_path, "saf", "--hyperparams", "learning_rate:1.0e30")
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    line = failed([*OPTIONS, "-f", str(tmp_path), "--hyperparams", "learning_rate:1.0e30"], capsys)
     # Where it shows first depends on the seed.
     assert "must be finite, got nan at game step" in line or "invalid values" in line
     assert "the last good checkpoint is" in line and "checkpoint-0" in line
 
 
-def test_resume_is_for_training(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    with pytest.raises(SystemExit):
-        train(tmp_path, "saf", "--resume", "-optimize")
-    assert "--resume is for training with settings" in capsys.readouterr().err
+def test_resume_is_for_training(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--resume is for training with settings" in failed(["--resume", "-optimize"], capsys)
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
-def test_a_device_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_device_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     for device, words in (
         ("cuda", "torch .* sees no CUDA devices"),
         ("meat", "must be auto, cpu, cuda, .* got 'meat'"),
     ):
         with pytest.raises(ValueError, match=words):
             check_device(device)
-    with pytest.raises(SystemExit):
-        train(tmp_path, "saf", "--device", "cuda:1")
-    assert "--device cuda:1 is not there" in capsys.readouterr().err
-    assert load_settings("saf", ENV, "smoke") is not None and check_device("cpu") == "cpu"
+    assert "--device cuda:1 is not there" in failed(["--device", "cuda:1"], capsys)
+    assert check_device("cpu") == "cpu"
