@@ -94,12 +94,7 @@ def run_job(folder: Path) -> None:
 
 
 def _train(job: Job, folder: Path, result: Path) -> BaseAlgorithm:
-    """
-    Return a trained model, which leaves its file, its learning curve and what it cost.
-
-    :param folder: of the training; if it was finished before, its model is loaded
-    :param result: of the cell
-    """
+    """Return a trained model, which leaves its files in the result; one that was finished before is loaded."""
     settings = job.config.settings(job.cell)
     status = folder / "status.json"
     if status.exists():

@@ -179,11 +179,7 @@ class RayEngine(Engine):
             ) from None
 
     def _check_resources(self) -> None:
-        """
-        Refuse jobs that fit on no node: they would wait for ever.
-
-        :raises ValueError: if no node can come that has room; a cluster may still grow, so there it is only said
-        """
+        """Refuse jobs that fit on no node: they would wait for ever. A cluster may grow, so there it is only said."""
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         if any(node.get("CPU", 0) >= self.cpus and node.get("GPU", 0) >= self.gpus for node in nodes):
             return
@@ -233,13 +229,7 @@ class RayEngine(Engine):
 
 
 def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
-    """
-    Do a job on a node.
-
-    :param name: its folder, if this node sees it
-    :param inputs: the files of the job
-    :return: None if the result is in that folder, else the result's files as an archive
-    """
+    """Do a job on a node; return its result as an archive, or None if the node sees the folder and has put it there."""
     from sb3_saf.experiments.cell import run_job
 
     folder = Path(name)

@@ -138,16 +138,7 @@ def record_episodes(
 
 
 class _Recorder:
-    """
-    Plays episodes and collects what every step gives.
-
-    :param env: rows of teams
-    :param reader: of the policy
-    :param shares: (E,) episodes of each game
-    :param zones: gives the zone of each row's agent; None for no zones
-    :param normalizer: of the rewards that the critic learns from
-    :param observations: whether to keep observations
-    """
+    """Plays episodes, ``shares`` (E,) of each game, and collects what every step gives."""
 
     def __init__(
         self,

@@ -40,20 +40,15 @@ Packed = dict[str, Any]
 
 
 class _Episode(NamedTuple):
-    """
-    One episode of one game.
-
-    :param actions: (T, N) as the game took them
-    :param rewards: (T,) of the team
-    :param arrays: packed arrays by name
-    :param frames: data URLs of pictures, where there is no grid
-    :param of_team: whether values are the team's
-    """
+    """One episode of one game: (T, N) actions, (T,) rewards of the team, and what the page shows beside them."""
 
     actions: npt.NDArray[Any]
     rewards: npt.NDArray[np.float64]
+    #: Packed, by name.
     arrays: dict[str, Packed | None]
+    #: Data URLs of pictures, where there is no grid.
     frames: list[str]
+    #: Whether values are the team's.
     of_team: bool = False
 
 

@@ -53,14 +53,7 @@ class Features(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """
-    The distinct views of a batch; those that are seen before a step come first.
-
-    :param views: (K, *shape)
-    :param now: (G, N) which of them each agent sees before the step
-    :param after: (G, N) and after it
-    :param n_now: views that are seen before a step
-    """
+    """The distinct views (K, *shape), the ``n_now`` before steps first, and which each agent has, (G, N)."""
 
     views: th.Tensor
     now: th.Tensor
