@@ -25,7 +25,7 @@ from sb3_saf.experiments.definitions import Level, find_experiment
 from sb3_saf.experiments.files import differences
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.run import RunOptions, Summary, run
+from sb3_saf.experiments.run import CellOptions, Summary, run
 from sb3_saf.training.seeds import evaluation_seed
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 
@@ -46,7 +46,7 @@ def run_inline(
     retries: int = 0,
 ) -> tuple[Summary, InlineEngine]:
     engine = engine or InlineEngine()
-    options = RunOptions(retries=retries)
+    options = CellOptions(retries=retries)
     return run(find_experiment(name), selection, config, Results(folder), engine, options, shard), engine
 
 

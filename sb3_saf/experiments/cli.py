@@ -256,10 +256,10 @@ def _run(options: argparse.Namespace) -> int:
     if not experiment.is_grid:
         return _print_parameters()
     require("pandas")
-    from sb3_saf.experiments.run import RunOptions, run
+    from sb3_saf.experiments.run import CellOptions, run
 
     config, shard = _config(options, experiment), Shard.parse(options.shard)
-    how = RunOptions(
+    how = CellOptions(
         check_device(options.device), options.threads, options.retries, options.tensorboard, options.resume
     )
     try:

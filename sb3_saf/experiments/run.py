@@ -27,7 +27,7 @@ from sb3_saf.experiments.tables import write_table
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class CellOptions:
     """
     How cells are run, which changes nothing in their results but the last digits.
 
@@ -79,7 +79,7 @@ def run(
     config: RunConfig,
     results: Results,
     engine: Engine,
-    options: RunOptions | None = None,
+    options: CellOptions | None = None,
     shard: Shard = Shard(),  # noqa: B008 (immutable)
 ) -> Summary:
     """
@@ -104,7 +104,7 @@ def run(
         f"{experiment.name}: {len(grid.cells)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
         f"{results.folder}"
     )
-    progress = _Progress(todo, config, results, engine, options or RunOptions())
+    progress = _Progress(todo, config, results, engine, options or CellOptions())
     # On a terminal a bar with the time that is left; in a log file a line per cell.
     with tqdm(total=len(todo), unit="cell", disable=None, dynamic_ncols=True) as bar, progress, engine:
         for line in progress.lines():
@@ -121,7 +121,7 @@ class _Progress:
     """The cells of one run: waiting, at work, ended."""
 
     def __init__(
-        self, todo: Sequence[Cell], config: RunConfig, results: Results, engine: Engine, options: RunOptions
+        self, todo: Sequence[Cell], config: RunConfig, results: Results, engine: Engine, options: CellOptions
     ) -> None:
         self._config, self._results, self._engine, self._options = config, results, engine, options
         self._waiting = deque((cell, 1) for cell in todo)
