@@ -289,7 +289,7 @@ def test_plots_of_rl_zoo3_read_the_folders(module: str, logs: Path, tmp_path: Pa
         (["curves", "-f", "nowhere", "-o", "a.png"], "there is no folder nowhere"),
         (["curves", "--env", "TeamSupport-v0", "-o", "a.png"], "there are no runs of TeamSupport-v0"),
         (["curves", "--algos", "mapo", "-o", "a.png"], "did you mean 'mappo'"),
-        (["curves", "-o", "a.txt"], "--output must end with .png"),
+        (["curves", "-o", "a.txt"], "Format 'txt' is not supported (supported formats: "),
         (["levels", "--level", "cordination", "-o", "a.png"], "did you mean 'coordination'"),
         (["aggregate", "-o", "a.png"], "aggregates"),
         (["bars", "-o", "a.png"], "invalid choice"),

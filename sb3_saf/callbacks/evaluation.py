@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, game_steps, show_game_steps
+from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, show_game_steps, team_steps
 from sb3_saf.envs.teams import check_other_games, require_n_agents
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 
@@ -78,9 +78,7 @@ class TeamEvalCallback(EvalCallback):
         self._plan_next()
 
     def _game_steps(self) -> int:
-        steps = game_steps(self.model)
-        assert steps is not None, "_init_callback has checked that the environment is made of teams"
-        return steps
+        return team_steps(self.model)
 
     def _plan_next(self) -> None:
         """The next multiple of ``eval_freq``: E games at a time, steps may jump over it."""

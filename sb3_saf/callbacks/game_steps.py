@@ -31,6 +31,13 @@ def game_steps(model: BaseAlgorithm) -> int | None:
     return None if n_agents is None else model.num_timesteps // n_agents
 
 
+def team_steps(model: BaseAlgorithm) -> int:
+    """Return the same of a model whose environment was checked to be made of teams."""
+    steps = game_steps(model)
+    assert steps is not None
+    return steps
+
+
 def check_training(model: BaseAlgorithm) -> None:
     """
     Check a model before it learns; the callbacks of this package call it.

@@ -12,7 +12,7 @@ from typing import BinaryIO, Final, NamedTuple, NoReturn
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf.callbacks.game_steps import game_steps, show_game_steps
+from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
 from sb3_saf.checkpoints.callback_states import all_callbacks, callback_states
 from sb3_saf.checkpoints.checks import check_keys, check_text, check_whole
 from sb3_saf.checkpoints.data import Tree, encode, write_tree
@@ -178,9 +178,7 @@ class TeamCheckpointCallback(BaseCallback):
         self._stop = stop
 
     def _game_steps(self) -> int:
-        steps = game_steps(self.model)
-        assert steps is not None, "_init_callback has checked that the environment is made of teams"
-        return steps
+        return team_steps(self.model)
 
     def _take(self) -> None:
         """Keep the present state; with a replay buffer, on the disk."""

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, Image
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, sync_envs_normalization
 
-from sb3_saf.callbacks.game_steps import game_steps, show_game_steps
+from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.teams import check_count, require_n_agents
 from sb3_saf.inspection.games import Zones, check_zones
@@ -106,26 +106,21 @@ class InspectionCallback(BaseCallback):
         self._page.write(self.num_timesteps)
 
     def _on_step(self) -> bool:
-        if self._game_steps() >= self._next:
+        if team_steps(self.model) >= self._next:
             self._inspect()
         return True
 
     def _on_training_end(self) -> None:
         # RL-Zoo3 ends callbacks even if training never began, which would hide why.
-        if self._last is not None and self._last != self._game_steps():
+        if self._last is not None and self._last != team_steps(self.model):
             self._inspect()
-
-    def _game_steps(self) -> int:
-        steps = game_steps(self.model)
-        assert steps is not None, "_init_callback has checked that the environment is made of teams"
-        return steps
 
     # --- what -------------------------------------------------------------------------------------------------------
 
     def _inspect(self) -> dict[str, float]:
         """Play, write, and return the scalars."""
         began = time.perf_counter()
-        now = self._game_steps()
+        now = team_steps(self.model)
         self._last, self._next = now, (now // self.every_game_steps + 1) * self.every_game_steps
         if isinstance(self.eval_env, VecNormalize) and self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
@@ -157,7 +152,7 @@ class InspectionCallback(BaseCallback):
         # At the start there is no training yet that it could be a share of.
         elapsed = time.perf_counter() - self._started
         costs = {"time/inspection_seconds": self.seconds}
-        return costs | {"time/inspection_share": self.seconds / elapsed} if self._game_steps() else costs
+        return costs | {"time/inspection_share": self.seconds / elapsed} if team_steps(self.model) else costs
 
     def _draw(self, inspection: Inspection) -> None:
         self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))
@@ -169,7 +164,7 @@ class InspectionCallback(BaseCallback):
         strip, film = inspection.strip, inspection.film
         if strip is not None and film is not None:
             self._page.show("episode/strip", Image(strip, "HWC"))
-            self._page.gif("episode/film", film, self._game_steps())
+            self._page.gif("episode/film", film, team_steps(self.model))
 
 
 def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:

@@ -14,7 +14,7 @@ from tqdm import TqdmExperimentalWarning
 from tqdm.rich import tqdm
 
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
-from sb3_saf.callbacks.game_steps import game_steps
+from sb3_saf.callbacks.game_steps import team_steps
 from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.randomness import own_randomness
 from sb3_saf.training.seeds import evaluation_seed
@@ -22,12 +22,6 @@ from sb3_saf.training.seeds import evaluation_seed
 #: The rate of training is measured from the end of the first rollout on, for at least so many seconds.
 _MEASURED_SECONDS: Final = 20.0
 _MEASURED_ROLLOUTS: Final = 2
-
-
-def _game_steps(model: Any) -> int:
-    steps = game_steps(model)
-    assert steps is not None, "settings make environments of teams only"
-    return steps
 
 
 class SeededEvalCallback(TeamEvalCallback):
@@ -92,7 +86,7 @@ class RemainingTime(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._n_rollouts += 1
-        now, steps = time.perf_counter(), _game_steps(self.model)
+        now, steps = time.perf_counter(), team_steps(self.model)
         if self._n_rollouts == 2:  # the first one compiles and fills caches
             self._started = now, steps
         seconds = now - self._started[0]
@@ -118,10 +112,10 @@ class CheckpointInGameSteps(BaseCallback):
         self._next = 0
 
     def _on_training_start(self) -> None:
-        self._next = (_game_steps(self.model) // self.save_freq + 1) * self.save_freq
+        self._next = (team_steps(self.model) // self.save_freq + 1) * self.save_freq
 
     def _on_step(self) -> bool:
-        steps = _game_steps(self.model)
+        steps = team_steps(self.model)
         if steps >= self._next:
             self._next = (steps // self.save_freq + 1) * self.save_freq
             path = self.folder / f"rl_model_{steps}_steps.zip"
