@@ -14,13 +14,7 @@ from sb3_saf.export.weights import read_weights
 
 
 class Check(NamedTuple):
-    """
-    What a second run has found.
-
-    :param equal: what is equal, bit for bit
-    :param different: what is not, and how much
-    :param software: what differs between the versions then and now; empty if nothing does
-    """
+    """What a second run has found equal, bit for bit, and different, and what differs in the versions."""
 
     equal: list[str]
     different: list[str]

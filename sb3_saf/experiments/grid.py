@@ -126,14 +126,7 @@ class RunConfig:
 
 
 class LeftOut(NamedTuple):
-    """
-    A level that does not fit the size.
-
-    :param task: the environment
-    :param level: trained at
-    :param test: the level that does not fit, the trained one or a tested one
-    :param reason: why
-    """
+    """A level that does not fit the size, for training or for a test after training at a level, and the reason."""
 
     task: str
     level: Level
@@ -146,12 +139,7 @@ class LeftOut(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """
-    All cells of an experiment.
-
-    :param cells: in an order in which every stretch has all methods
-    :param left_out: what does not fit
-    """
+    """All cells of an experiment, in an order in which every stretch has all methods, and what does not fit."""
 
     cells: list[Cell]
     left_out: list[LeftOut]
@@ -235,12 +223,7 @@ def _misfits(env: str, levels: Iterable[Level], config: RunConfig) -> Iterator[t
 
 
 class Shard(NamedTuple):
-    """
-    One of several parts of a grid, for machines that do not share a folder.
-
-    :param number: from 1
-    :param parts: how many there are
-    """
+    """One of several parts of a grid, the first is 1, for machines that do not share a folder."""
 
     number: int = 1
     parts: int = 1

@@ -35,14 +35,7 @@ _AGAINST_TIME: Final = "against processor time"
 
 
 class Report(NamedTuple):
-    """
-    What was written.
-
-    :param page: the Markdown page
-    :param figures: the pictures
-    :param missing: cells that are not finished
-    :param n_cells: all that were asked for
-    """
+    """What was written: the Markdown page and its pictures; which of all cells asked for are not finished."""
 
     page: Path
     figures: list[Path]

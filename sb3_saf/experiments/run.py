@@ -46,13 +46,7 @@ class CellOptions:
 
 
 class Summary(NamedTuple):
-    """
-    How a run ended.
-
-    :param finished: cells that it finished
-    :param failed: cells that failed for good
-    :param elsewhere: cells that another run is at
-    """
+    """How a run ended: cells that it finished, that failed for good, and that another run is at."""
 
     finished: int
     failed: list[Cell]
@@ -60,13 +54,7 @@ class Summary(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """
-    A cell that is at work.
-
-    :param cell: the cell
-    :param number: from 1
-    :param lock: that keeps other runs away from it
-    """
+    """A cell that is at work, the attempt's number from 1, and the lock that keeps other runs away from it."""
 
     cell: Cell
     number: int

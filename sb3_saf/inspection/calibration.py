@@ -38,13 +38,7 @@ class Calibration(NamedTuple):
 
 
 class Bin(NamedTuple):
-    """
-    Values of about the same size.
-
-    :param value: their mean
-    :param mean: mean of the returns that followed
-    :param std: standard deviation of these returns
-    """
+    """Values of about the same size: their mean; mean and standard deviation of the returns that followed."""
 
     value: float
     mean: float

@@ -40,12 +40,7 @@ _NO_ZONE = -1
 
 
 class ReturnScale(NamedTuple):
-    """
-    The unit of team returns.
-
-    :param unit: such as ``"treasures"``; None if the environment does not say
-    :param best: the largest possible return; None if unknown
-    """
+    """The unit of team returns, such as ``"treasures"``, and the largest possible one; None where it is not known."""
 
     unit: str | None
     best: float | None

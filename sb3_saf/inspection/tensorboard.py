@@ -108,12 +108,7 @@ _OF_LINES: Final = re.compile(
 
 
 class Line(NamedTuple):
-    """
-    Where TensorBoard shows a scalar that is one of several lines.
-
-    :param chart: its tag there
-    :param run: name of the run below the training's
-    """
+    """Where TensorBoard shows a scalar that is one of several lines: its tag, and a run below the training's."""
 
     chart: str
     run: str

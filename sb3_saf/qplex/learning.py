@@ -41,12 +41,7 @@ class TeamError(NamedTuple):
 
 
 class Features(NamedTuple):
-    """
-    Features of two observations of each team.
-
-    :param now: (G, N, d) before the step
-    :param after: (G, N, d) after it
-    """
+    """Features (G, N, d) of the observations before and after each team's step."""
 
     now: th.Tensor
     after: th.Tensor
