@@ -156,7 +156,7 @@ def _more_inputs(
 def _written(
     network: DecidingNetwork, inputs: dict[str, th.Tensor], names: list[str], metadata: dict[str, str]
 ) -> bytes:
-    rows = th.export.Dim("rows")
+    rows = th.export.Dim("rows", max=2**31 - 1)  # without a limit, torch 2.7 refuses its own
     axes = {name: {1 if name in ("hidden", "cell") else 0: rows} for name in inputs}
     try:
         with _quiet():
