@@ -23,6 +23,7 @@ from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
 from tests.experiments_jobs import InlineEngine, read_table, wait_until
 from tests.test_experiments_run import assert_same_weights
+from tests.test_training_commands import failed
 
 CHOICE = Selection((0,), ("ippo", "mappo"))
 SMOKE = RunConfig("smoke")
@@ -39,10 +40,7 @@ IMPATIENT = {
 def test_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("ray")
     words = ["run", "joint", "--size", "smoke", "--address", "auto", "-f", str(tmp_path)]
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(words)
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
+    error = failed(words, capsys, cli.main)
     assert "no Ray cluster at --address auto" in error
     assert "start one with `ray start --head`" in error
 
@@ -188,9 +186,7 @@ def test_cells_that_fit_on_no_node_of_a_fresh_ray() -> None:
 
 def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)])
-    assert capsys.readouterr().err == (
+    assert failed(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)], capsys, cli.main) == (
         "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install "
-        "-e '.[ray]', or leave --ray out to run in processes of this machine\n"
+        "-e '.[ray]', or leave --ray out to run in processes of this machine"
     )

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple, NoReturn
+from typing import Final, NamedTuple
 
 from hecogrid_envs.task import check_task
 from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, PROGRAM, Experiment, own_experiment
@@ -282,11 +282,7 @@ def _run(options: argparse.Namespace) -> int:
 @contextmanager
 def _sigterm_like_control_c() -> Iterator[None]:
     """Batch systems send SIGTERM before they kill: end as after Ctrl-C."""
-
-    def interrupt(*_: object) -> NoReturn:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
