@@ -119,11 +119,7 @@ def _with_blank_map(world: World) -> World:
 
 
 def empty_games(world: World, n_games: int) -> Games:
-    """
-    Return games that have not begun.
-
-    :param n_games: E
-    """
+    """Return E games that have not begun."""
     agents, cells = (n_games, world.n_agents), (n_games, world.width * world.width)
     games = Games(
         rng=aligned(n_games, np.uint64),

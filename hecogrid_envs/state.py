@@ -107,11 +107,7 @@ def state_of(
 
 
 def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> StateMapping | None:
-    """
-    Return the state that the options of a reset ask for, if any.
-
-    :raises ValueError: naming the first fault of an inconsistent mapping
-    """
+    """Return the state that the options of a reset ask for, if any, checked by :func:`check_state`."""
     if options is None or options.get("state") is None:
         return None
     return check_state(options["state"], params)

@@ -46,11 +46,7 @@ DECLARED: Final[dict[TaskName, Task]] = {}
 
 
 def check_task(task: object) -> TaskName:
-    """
-    Check a task's name.
-
-    :raises ValueError: with the nearest name that exists
-    """
+    """Check a task's name; the ValueError has the nearest name that exists."""
     if isinstance(task, str) and task in DECLARED:
         return task
     raise ValueError(f"unknown task {task!r}{did_you_mean(task, list(DECLARED))}; the tasks are {', '.join(DECLARED)}")

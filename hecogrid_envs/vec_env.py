@@ -157,11 +157,7 @@ class NativeVecEnv(TeamVecEnv):
         super().__init__(batch.n_games, batch.params.n_agents, own_space, spaces.Discrete(N_ACTIONS), seed)
 
     def reset(self) -> U8:
-        """
-        Start new episodes everywhere.
-
-        :return: (B, *observation shape)
-        """
+        """Start new episodes everywhere: views (B, *observation shape)."""
         options = enumerate(self._options[:: self.n_agents])
         states = {game: state_option(given, self.params) for game, given in options if given}
         self.batch.reset(seeds=self._next_seeds)

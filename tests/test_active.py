@@ -148,7 +148,7 @@ def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
             lambda: RowSpaces.of(
                 spaces.Dict(obs=spaces.Discrete(3), action_mask=spaces.MultiBinary(3)), spaces.Discrete(2)
             ),
-            r"expected 'action_mask' of a row to be MultiBinary\(A\) where actions are Discrete\(A\)",
+            r"expected 'action_mask' to be MultiBinary\(A\) where actions are Discrete\(A\)",
         ),
         (
             lambda: MAPPOPolicy(telling_spaces(state=None), spaces.Discrete(4), lambda _: 0.0, critic_input="state"),

@@ -15,11 +15,7 @@ from hecogrid_envs.core.view import draw_pictures, observe_tiles
 
 
 def _compiled_play(sources: int) -> Any:
-    """
-    Compile :func:`play`.
-
-    :param sources: see :func:`~hecogrid_envs.core.jit.source_key`
-    """
+    """Compile :func:`play` of :func:`~hecogrid_envs.core.jit.source_key`."""
 
     @njit(cache=True, nogil=True)
     def play(

@@ -47,11 +47,7 @@ def _game_seed(seed: int, index: int) -> int:
 
 
 def check_seed(seed: object) -> None:
-    """
-    Check that a value is a seed.
-
-    :raises ValueError: unless it is None or an integer of at least 0
-    """
+    """Raise ValueError unless a value is a seed: None or an integer of at least 0."""
     if seed is not None and (isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0):
         raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
 

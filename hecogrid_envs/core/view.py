@@ -94,11 +94,7 @@ def look(games: Games, world: World, e: int, agent: int) -> None:
 
 @hot
 def observe_tiles(games: Games, world: World, out: U8, first: int, last: int) -> None:
-    """
-    Write the views of games ``first`` to ``last - 1`` as tile codes.
-
-    :param out: (n * N * V * V,), n = last - first
-    """
+    """Write the views of games ``first`` to ``last - 1`` as tile codes, (n * N * V * V,), n = last - first."""
     size = world.view_size
     n_words = (size + _WORD_BYTES - 1) // _WORD_BYTES
     own = (size - 1 - world.view_offset) * size + size // 2

@@ -203,11 +203,7 @@ class TeamCheckpointCallback(BaseCallback):
         }
 
     def write_last(self) -> None:
-        """
-        Write the last state between rollouts, unless it is written already.
-
-        :raises CheckpointError: if it cannot be written
-        """
+        """Write the last state between rollouts, unless it is written already; CheckpointError if that fails."""
         if self._last is not None and self._last[0] != self._written:
             steps, data = self._last
             self._write(lambda file: file.write(data), steps)

@@ -76,11 +76,7 @@ def all_callbacks(callback: Callbacks) -> Iterator[BaseCallback]:
 
 
 def callback_states(callbacks: Iterable[BaseCallback]) -> list[Tree]:
-    """
-    States of callbacks.
-
-    :raises CheckpointError: if an environment for evaluation cannot give its state
-    """
+    """States of callbacks; CheckpointError if an environment for evaluation cannot give its state."""
     return [
         {
             "counters": {name: getattr(one, name) for name in _kinds(one)},
@@ -92,11 +88,7 @@ def callback_states(callbacks: Iterable[BaseCallback]) -> list[Tree]:
 
 
 def check_callback_states(callbacks: Iterable[BaseCallback], states: Tree) -> None:
-    """
-    Check that callbacks could be in these states.
-
-    :raises CheckpointError: naming the first part that does not fit
-    """
+    """Check that callbacks could be in these states; a CheckpointError names the first part that does not fit."""
     callbacks = list(callbacks)
     check_list(states, "the states of callbacks", len(callbacks))
     for one, state in zip(callbacks, states, strict=True):

@@ -36,20 +36,12 @@ class Stateful(Protocol):
 
 
 def environment_state(venv: VecEnv) -> list[Tree]:
-    """
-    State of every layer, outermost first.
-
-    :raises CheckpointError: if a layer cannot give its state, saying what to do
-    """
+    """State of every layer, outermost first; a CheckpointError names one that gives none, and what to do."""
     return [{"class": type(layer).__name__, "state": _layer_state(layer)} for layer in layers(venv)]
 
 
 def check_environment_state(venv: VecEnv, states: Tree) -> None:
-    """
-    Check that every layer could be in its state.
-
-    :raises CheckpointError: if the layers or their arguments differ, naming the first difference
-    """
+    """Check layers, arguments and states; a CheckpointError names the first difference."""
     check_list(states, "the state of the environment")
     for state in states:
         check_keys(state, ("class", "state"), "the state of a layer of the environment")
@@ -86,11 +78,7 @@ def is_stateful(part: object) -> bool:
 
 
 def check_stateful(part: object, state: Tree, where: str) -> None:
-    """
-    Let a layer or a callback check its own state, if it does.
-
-    :raises CheckpointError: if it refuses
-    """
+    """Let a layer or a callback check its own state, if it does; CheckpointError if it refuses."""
     check = getattr(type(part), "check_checkpoint_state", None)
     if not isinstance(state, dict):
         raise CheckpointError(f"the checkpoint does not fit {where}: expected a dict, got {type(state).__name__}")

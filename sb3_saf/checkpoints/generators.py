@@ -29,11 +29,7 @@ def generator_states(action_space: spaces.Space[Any]) -> dict[str, Tree]:
 
 
 def check_generator_states(states: Tree, action_space: spaces.Space[Any]) -> None:
-    """
-    Check that generators could be in these states.
-
-    :raises CheckpointError: naming the first that could not
-    """
+    """Check states of generators; a CheckpointError names the first that none could be in."""
     own = generator_states(action_space)
     check_keys(states, own, "generators")
     check_list(states["python"], "the state of Python's generator", 3)

@@ -89,11 +89,7 @@ def resume(
 
 
 def _check(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
-    """
-    Check everything before anything is touched.
-
-    :raises CheckpointError: naming the first difference
-    """
+    """Check everything before anything is touched; a CheckpointError names the first difference."""
     assert model.env is not None
     check_descriptions(model, others, tree["description"], tree["callback_descriptions"])
     check_software(tree["software"])

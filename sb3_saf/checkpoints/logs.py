@@ -31,11 +31,7 @@ def logger_state(logger: Logger) -> Tree:
 
 
 def check_logger_state(state: Tree) -> None:
-    """
-    Check names and numbers.
-
-    :raises CheckpointError: naming the first that is none
-    """
+    """Check names and numbers; a CheckpointError names the first that is none."""
     check_keys(state, ("tensorboard", "numbers"), "logger")
     if state["tensorboard"] is not None:
         check_name(state["tensorboard"], "the folder of the logs")

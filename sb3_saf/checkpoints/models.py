@@ -43,11 +43,7 @@ _INFO_BUFFERS: Final = ("ep_info_buffer", "ep_success_buffer")
 
 
 def require_resumable(model: BaseAlgorithm) -> None:
-    """
-    Check that an algorithm's state can be given completely.
-
-    :raises CheckpointError: if it cannot, naming those that can
-    """
+    """Refuse algorithms whose state cannot be given completely, with a CheckpointError that names those that can."""
     if not isinstance(model, (OnPolicyAlgorithm, QPLEX)):
         raise CheckpointError(
             "exact resume is for PPO, A2C, TRPO, RecurrentPPO, MaskablePPO and QPLEX, got "
@@ -108,11 +104,7 @@ def load_model_state(model: BaseAlgorithm, state: Tree) -> None:
 
 
 def check_model_state(model: BaseAlgorithm, state: Tree) -> None:
-    """
-    Check that the model could be in this state.
-
-    :raises CheckpointError: naming the first part that does not fit
-    """
+    """Check that the model could be in this state; a CheckpointError names the first part that does not fit."""
     names = ("weights", "optimizer", "counters", "last", "lstm", "agent_state", "replay", *_INFO_BUFFERS)
     check_keys(state, (*names, "info_buffer_size"), "model")
     check_like(state["weights"], dict(model.policy.state_dict()), "weights")

@@ -205,11 +205,7 @@ def signature(data: npt.NDArray[np.uint8]) -> str:
 
 
 def check_signature(data: npt.NDArray[np.uint8], signed: object) -> None:
-    """
-    Check that this user has signed a pickled game.
-
-    :raises ForeignGamesError: if not, with what to do
-    """
+    """Raise ForeignGamesError, with what to do, unless this user has signed a pickled game."""
     if not isinstance(signed, str) or not hmac.compare_digest(signature(data), signed):
         raise ForeignGamesError(
             "its games are pickled and were not signed with this user's key, and unpickling a stranger's file runs "

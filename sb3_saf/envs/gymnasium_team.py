@@ -115,11 +115,7 @@ def is_gymnasium_team(env: object) -> bool:
 
 
 def check_is_team(env: gym.Env[Any, Any]) -> None:
-    """
-    Check that observations and actions are Tuples of one entry per agent.
-
-    :raises ValueError: if they are not
-    """
+    """Raise ValueError unless observations and actions are Tuples of one entry per agent."""
     observations, actions = env.observation_space, env.action_space
     if (
         not isinstance(observations, spaces.Tuple)

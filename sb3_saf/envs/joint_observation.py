@@ -146,11 +146,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._n_steps, self._masks_shown = state["n_steps"], state["masks_shown"]
 
     def reset(self) -> dict[str, Array]:
-        """
-        Start new episodes in all games.
-
-        :return: the Dict observation of all rows
-        """
+        """Start new episodes in all games: the Dict observation of all rows."""
         return self._joint_observation(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:

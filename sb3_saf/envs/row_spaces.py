@@ -9,7 +9,16 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 
-from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, ALL_KEYS, OBS_KEY, OPTIONAL_KEYS, STATE_KEY, TEAM_KEYS
+from sb3_saf.envs.teams import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    ALL_KEYS,
+    OBS_KEY,
+    OPTIONAL_KEYS,
+    STATE_KEY,
+    TEAM_KEYS,
+    check_masks,
+)
 
 _ROW_KEYS = {OBS_KEY, *OPTIONAL_KEYS}
 
@@ -59,11 +68,7 @@ class RowSpaces(NamedTuple):
         active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
         if active is not None and active != spaces.Discrete(2):
             raise ValueError(f"expected {ACTIVE_KEY!r} of a row to be Discrete(2), got {active}")
-        if action_mask is not None and not _fits(action_mask, action_space):
-            raise ValueError(
-                f"expected {ACTION_MASK_KEY!r} of a row to be MultiBinary(A) where actions are Discrete(A), got "
-                f"{action_mask} for {action_space}"
-            )
+        check_masks(action_mask, action_space)
         n_masked = None if action_mask is None else int((action_mask.shape or ())[0])
         return cls(space.spaces[OBS_KEY], active is not None, n_masked, state, is_dict=True)
 
@@ -100,10 +105,6 @@ class RowSpaces(NamedTuple):
             got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__
             raise ValueError(f"expected {what} to be a dict with the keys {keys}, got {got}")
         return {key: obs[key] for key in keys}
-
-
-def _fits(action_mask: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
-    return isinstance(action_space, spaces.Discrete) and action_mask == spaces.MultiBinary(int(action_space.n))
 
 
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:

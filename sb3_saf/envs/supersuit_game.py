@@ -156,11 +156,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     # ---- copies
 
     def snapshot(self, way: Way) -> dict[str, Any]:
-        """
-        Return all that the future of the game depends on, as plain data and bytes.
-
-        :param way: that :func:`~sb3_saf.envs.game_copies.find_way` has found
-        """
+        """Return all that the future of the game depends on, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
         if way == "pickle":
             content = {"pickled": pickled(self.par_env)}
         else:

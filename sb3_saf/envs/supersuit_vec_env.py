@@ -105,11 +105,7 @@ class SuperSuitVecEnv(TeamVecEnv):
     # ---- episodes
 
     def reset(self) -> VecEnvObs:
-        """
-        Begin an episode in every game; a step that was begun is cancelled.
-
-        :return: observations of the B rows
-        """
+        """Begin an episode in every game; a step that was begun is cancelled."""
         self._check_open()
         self._begun, self._actions = False, None
         options = [own or None for own in self._options[:: self.n_agents]]
@@ -132,11 +128,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._actions = checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """
-        Step all games.
-
-        :return: observations, rewards (float32), dones (bool) and infos of the B rows
-        """
+        """Step all games: observations, rewards (float32), dones (bool) and infos of the B rows."""
         if self._actions is None:
             raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
         actions = _in_games_form(self._game_action_space, self._actions)

@@ -173,6 +173,17 @@ def _checked_state(state: spaces.Space[Any]) -> spaces.Space[Any]:
     )
 
 
+def check_masks(action_mask: spaces.Space[Any] | None, action_space: spaces.Space[Any]) -> None:
+    """Raise ValueError unless the space of action masks, if there is one, fits the actions."""
+    if action_mask is None:
+        return
+    if not isinstance(action_space, spaces.Discrete) or action_mask != spaces.MultiBinary(int(action_space.n)):
+        raise ValueError(
+            f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A) where actions are Discrete(A), got {action_mask} for "
+            f"{action_space}"
+        )
+
+
 def bounds_of(space: spaces.Space[Any]) -> tuple[Array, Array]:
     """
     Return the lowest and the highest value of each entry, both included, in the space's shape and dtype.
@@ -262,22 +273,14 @@ def chosen_rows(indices: VecEnvIndices, n_rows: int) -> list[int]:
 
 
 def check_count(name: str, value: object) -> int:
-    """
-    Check that a value is a whole number of at least 1.
-
-    :raises ValueError: with the name and the value
-    """
+    """Check that a value is a whole number of at least 1; the ValueError has its name."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """
-    Check an argument that is one of a few words.
-
-    :raises ValueError: with the choices
-    """
+    """Check an argument that is one of a few words; the ValueError has them."""
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
 

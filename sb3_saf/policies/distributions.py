@@ -97,20 +97,12 @@ class LeanCategorical(CategoricalDistribution):
     log_probs: th.Tensor
 
     def proba_distribution(self, action_logits: th.Tensor) -> LeanCategorical:
-        """
-        Set the parameters.
-
-        :param action_logits: (B, A)
-        """
+        """Set the parameters, logits (B, A)."""
         # With rows last in memory, loops run over many rows instead of few actions.
         return self.of_log_probs(action_logits.t().contiguous().log_softmax(dim=0).t())
 
     def of_log_probs(self, log_probs: th.Tensor) -> LeanCategorical:
-        """
-        Set the parameters.
-
-        :param log_probs: (B, A), normalised
-        """
+        """Set the parameters, normalised log probabilities (B, A)."""
         self.log_probs = log_probs
         return self
 

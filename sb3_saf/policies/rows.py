@@ -24,6 +24,7 @@ from sb3_saf.envs.teams import (
     TEAM_KEY,
     TeamSpaces,
     check_count,
+    check_masks,
 )
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.networks.spaces import pixels_to_codes
@@ -69,7 +70,7 @@ class TeamRowsPolicy(BasePolicy):
         if chunk_size is not None and chunk_size != "auto":
             check_count("chunk_size", chunk_size)
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
-        _check_masks(self.team_spaces, action_space)
+        check_masks(self.team_spaces.action_mask, action_space)
         self.chunk_size = chunk_size
         self.encode_once = encode_once
         whole_numbers = np.issubdtype(self.team_spaces.team.dtype, np.integer)
@@ -287,15 +288,6 @@ class TeamRowsPolicy(BasePolicy):
             return self.chunk_size
         has_convolutions = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
         return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
-
-
-def _check_masks(team: TeamSpaces, action_space: spaces.Space[Any]) -> None:
-    mask = team.action_mask
-    if mask is not None and not (isinstance(action_space, spaces.Discrete) and mask.n == action_space.n):
-        raise ValueError(
-            f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A) where actions are Discrete(A), got {mask} for "
-            f"{action_space}"
-        )
 
 
 def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
