@@ -60,7 +60,7 @@ class Campaign(NamedTuple):
         return f"{self.variables.format(n=n)} python {self.arguments.format(n=n)}".strip()
 
 
-def _kills(name: str, options: str, number: int = 4, needs: tuple[str, ...] = ()) -> Campaign:
+def _kills(name: str, options: str, number: int = 8, needs: tuple[str, ...] = ()) -> Campaign:
     return Campaign(
         f"kills, {name}", f"-m tests.kill_harness {options} --rollouts 7 --kills {{n}}", number, needs=needs
     )
@@ -72,13 +72,13 @@ def _mutated(name: str, of: str, number: int) -> Campaign:
 
 CAMPAIGNS: Final = (
     _kills("SAF, HECOGrid", "--algo saf", 12),
-    _kills("QPLEX, HECOGrid", "--algo qplex", 8),
+    _kills("QPLEX, HECOGrid", "--algo qplex", 12),
     _kills("SAF, simple_spread_v3", "--game spread", needs=("mpe2",)),
     _kills("QPLEX, simple_spread_v3", "--algo qplex --game spread", needs=("mpe2",)),
     _kills("SAF, simple_spread_v3 in two processes", "--game spread --cpus 2", needs=("mpe2",)),
     _kills("SAF, pursuit_v5", "--game pursuit", needs=("pymunk",)),
     _kills("SAF, a game that makes its generator late", "--game lazy"),
-    _kills("SAF, JaxMARL's MPE in a batch", "--game jax", needs=("jaxmarl",)),
+    _kills("SAF, JaxMARL's MPE in a batch", "--game jax", 4, needs=("jaxmarl",)),
     Campaign(
         "crafted checkpoints, checksums right, contents wrong",
         f"{PYTEST} tests/test_crafted_checkpoints.py",
@@ -97,7 +97,7 @@ CAMPAIGNS: Final = (
     Campaign(
         "odd configurations under NUMBA_BOUNDSCHECK",
         f"{PYTEST} tests/test_invariants.py",
-        300,
+        1_500,
         # Kernels without the check, which are kept on the disk, are not to be taken.
         f"NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR={tempfile.gettempdir()}/sb3_saf_bounds EXAMPLES={{n}}",
     ),

@@ -113,6 +113,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
     def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:
         self._notes: list[str] = []
         self._indices = indices
+        self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, what could not be made is closed, too
         super().__init__(
             [lambda index=index: TeamMarkovVectorEnv(source.build(), form, index, self._notes) for index in indices]
         )
