@@ -8,22 +8,10 @@ observations a step: for hundreds of agents make the map smaller (``map_size=20`
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
-from sb3_saf.suites.suite import Suite
-
-
-def _tasks() -> list[str]:
-    import magent2.environments
-
-    return [module.name for module in pkgutil.iter_modules(magent2.environments.__path__) if module.name[-1].isdigit()]
-
-
-def _game(task: str, *, render_mode: str | None = None, **params: Any) -> Any:
-    return importlib.import_module(f"magent2.environments.{task}").parallel_env(render_mode=render_mode, **params)
-
+from sb3_saf.suites.suite import Suite, modules_with_versions, parallel_env
 
 SUITE: Final = Suite(
     name="magent",
@@ -31,9 +19,9 @@ SUITE: Final = Suite(
     requires=("magent2>=0.3.4,<0.4",),
     extra="magent",
     page="https://magent2.farama.org",
-    list_tasks=_tasks,
+    list_tasks=partial(modules_with_versions, "magent2.environments"),
     examples=("gather_v5", "adversarial_pursuit_v4", "tiger_deer_v4"),
-    game=_game,
+    game=partial(parallel_env, "magent2.environments"),
     competitive=("adversarial_*", "battle*", "combined_*", "tiger_*"),
     has_state=True,
 )

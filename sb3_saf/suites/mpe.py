@@ -8,22 +8,10 @@ all agents, one after the other.
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
-from sb3_saf.suites.suite import Suite
-
-
-def _tasks() -> list[str]:
-    import mpe2
-
-    return [module.name for module in pkgutil.iter_modules(mpe2.__path__) if module.name[-1].isdigit()]
-
-
-def _game(task: str, *, render_mode: str | None = None, **params: Any) -> Any:
-    return importlib.import_module(f"mpe2.{task}").parallel_env(render_mode=render_mode, **params)
-
+from sb3_saf.suites.suite import Suite, modules_with_versions, parallel_env
 
 SUITE: Final = Suite(
     name="mpe",
@@ -31,9 +19,9 @@ SUITE: Final = Suite(
     requires=("mpe2>=1.1,<2",),
     extra="mpe",
     page="https://mpe2.farama.org",
-    list_tasks=_tasks,
+    list_tasks=partial(modules_with_versions, "mpe2"),
     examples=("simple_spread_v3", "simple_reference_v3", "simple_speaker_listener_v4"),
-    game=_game,
+    game=partial(parallel_env, "mpe2"),
     competitive=("simple_adversary_*", "simple_crypto_*", "simple_push_*", "simple_tag_*", "simple_world_comm_*"),
     has_state=True,
 )

@@ -14,15 +14,16 @@ from sb3_saf.suites.suite import Suite
 
 
 def _tasks() -> list[str]:
-    from sb3_saf.suites.engines.jaxmarl_envs import overcooked_layouts
+    from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts
 
-    return overcooked_layouts()
+    return list(overcooked_layouts)
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl_envs import overcooked_layout, vec_env
+    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+    from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts
 
-    return vec_env("overcooked", n_envs, seed, fixed={"layout": overcooked_layout(task)}, **params)
+    return vec_env("overcooked", n_envs, seed, fixed={"layout": overcooked_layouts[task]}, **params)
 
 
 SUITE: Final = Suite(

@@ -7,7 +7,7 @@ import pkgutil
 import warnings
 from collections.abc import Iterator
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sb3_saf.suites
 from sb3_saf.suites.suite import Suite
@@ -50,10 +50,9 @@ def _declared() -> Iterator[Suite]:
     for module in pkgutil.iter_modules(sb3_saf.suites.__path__, f"{sb3_saf.suites.__name__}."):
         if module.name.endswith("__main__"):
             continue
-        found: Any = getattr(importlib.import_module(module.name), "SUITE", None)
-        for one in found if isinstance(found, tuple) else (found,):
-            if isinstance(one, Suite):
-                yield one
+        found = getattr(importlib.import_module(module.name), "SUITE", None)
+        if isinstance(found, Suite):
+            yield found
 
 
 def find_task(env_id: str) -> SuiteTask | None:

@@ -6,25 +6,10 @@ Time limits are truncations.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
-from sb3_saf.suites.suite import Suite
-
-_PREFIX: Final = "sisl/"
-
-
-def _tasks() -> list[str]:
-    import pettingzoo
-
-    # Named as modules are, like everything else of PettingZoo's; its registry writes pursuit-v5.
-    return [name.removeprefix(_PREFIX).replace("-v", "_v") for name in pettingzoo.parallel_registry if _PREFIX in name]
-
-
-def _game(task: str, *, render_mode: str | None = None, **params: Any) -> Any:
-    import pettingzoo
-
-    return pettingzoo.make("parallel", _PREFIX + task.replace("_v", "-v"), render_mode=render_mode, **params)
-
+from sb3_saf.suites.suite import Suite, modules_with_versions, parallel_env
 
 SUITE: Final = Suite(
     name="sisl",
@@ -32,7 +17,7 @@ SUITE: Final = Suite(
     requires=("pettingzoo>=1.27,<2", "pymunk>=6.2", "box2d>=2.3.10"),
     extra="sisl",
     page="https://pettingzoo.farama.org/environments/sisl",
-    list_tasks=_tasks,
+    list_tasks=partial(modules_with_versions, "pettingzoo.sisl"),
     examples=("pursuit_v5", "multiwalker_v9"),
-    game=_game,
+    game=partial(parallel_env, "pettingzoo.sisl"),
 )

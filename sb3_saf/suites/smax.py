@@ -15,15 +15,16 @@ from sb3_saf.suites.suite import Suite
 
 
 def _tasks() -> list[str]:
-    from sb3_saf.suites.engines.jaxmarl_envs import smax_maps
+    from sb3_saf.suites.engines.jaxmarl_package import MAP_NAME_TO_SCENARIO
 
-    return smax_maps()
+    return list(MAP_NAME_TO_SCENARIO)
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl_envs import smax_map, vec_env
+    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+    from sb3_saf.suites.engines.jaxmarl_package import MAP_NAME_TO_SCENARIO
 
-    return vec_env("HeuristicEnemySMAX", n_envs, seed, fixed={"scenario": smax_map(task)}, **params)
+    return vec_env("HeuristicEnemySMAX", n_envs, seed, fixed={"scenario": MAP_NAME_TO_SCENARIO[task]}, **params)
 
 
 SUITE: Final = Suite(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -141,6 +143,17 @@ class Suite:
             f"{'did you mean' if near else 'there are'} {', '.join(shown)}{'?' if near else ', ...'} "
             f"(python -m sb3_saf.suites {self.name} lists all {len(self.tasks)})"
         )
+
+
+def modules_with_versions(package: str) -> list[str]:
+    """Return the names of a package's modules that end with a version, such as ``simple_spread_v3``."""
+    found = pkgutil.iter_modules(importlib.import_module(package).__path__)
+    return [module.name for module in found if module.name[-1].isdigit()]
+
+
+def parallel_env(package: str, task: str, *, render_mode: str | None = None, **params: Any) -> Any:
+    """Make a game of one of these modules, as PettingZoo's packages name them."""
+    return importlib.import_module(f"{package}.{task}").parallel_env(render_mode=render_mode, **params)
 
 
 def _version(distribution: str) -> str | None:

@@ -9,13 +9,7 @@ from typing import Any, Final
 
 from sb3_saf.suites.engines.batch import ResumableBatchVecEnv
 from sb3_saf.suites.engines.jaxmarl import JaxGames, JaxPrograms
-from sb3_saf.suites.engines.jaxmarl_package import (
-    MABRAX_AVAILABLE,
-    MAP_NAME_TO_SCENARIO,
-    SUBMODULE_ENVIRONMENTS,
-    jaxmarl,
-)
-from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts as _LAYOUTS
+from sb3_saf.suites.engines.jaxmarl_package import MABRAX_AVAILABLE, SUBMODULE_ENVIRONMENTS, jaxmarl
 from sb3_saf.suites.engines.jaxmarl_rules import rules_of
 
 #: Environments that need another package (brax, jaxrobotarium), or a trained enemy.
@@ -25,26 +19,6 @@ _NEEDS_A_POLICY: Final = "LearnedPolicyEnemySMAX"
 _NOT_BY_AGENT: Final = ("storm", "storm_2p", "storm_np")
 #: Compiled environments that are kept; one takes tens of MB.
 _N_KEPT: Final = 8
-
-
-def smax_maps() -> list[str]:
-    """Return the names of SMAX's scenarios."""
-    return list(MAP_NAME_TO_SCENARIO)
-
-
-def smax_map(name: str) -> Any:
-    """Return a scenario of SMAX."""
-    return MAP_NAME_TO_SCENARIO[name]
-
-
-def overcooked_layouts() -> list[str]:
-    """Return the names of Overcooked's kitchens."""
-    return list(_LAYOUTS)
-
-
-def overcooked_layout(name: str) -> Any:
-    """Return a kitchen of Overcooked."""
-    return _LAYOUTS[name]
 
 
 def registered() -> list[str]:

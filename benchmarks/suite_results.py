@@ -1,0 +1,137 @@
+"""
+What teams learn on the suites' tasks, beside the suites' own baselines: ``results/suites.md``.
+
+``python -m benchmarks.suite_results`` trains what is missing (``sb3_saf.experiments run``, one folder for each task)
+and writes the table of that page from whatever is there; ended at any time, the same command goes on. All tasks have
+their first seed before one has its second. What programs of others reach is in ``results/suites_baselines.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pandas as pd
+
+from sb3_saf.experiments.cli import main as experiments
+from sb3_saf.experiments.files import read_json
+from sb3_saf.experiments.tables import read_results
+from sb3_saf.training.statistics import mean_over_seeds
+
+METHODS: Final = ("saf", "mappo", "ippo")
+SEEDS: Final = (0, 1, 2)
+BASELINES: Final = Path("results", "suites_baselines.csv")
+PAGE: Final = Path("results", "suites.md")
+#: What stands before and after the table on the page.
+_MARKS: Final = ("<!-- table -->", "<!-- end of table -->")
+_NOT_RUN: Final = "not run"
+
+
+class Task(NamedTuple):
+    """
+    A row of the table.
+
+    :param env_id: of the suite
+    :param game_steps: of one training, equal for all methods
+    """
+
+    env_id: str
+    game_steps: int
+
+    @property
+    def name(self) -> str:
+        """Return the name of its experiment and folder."""
+        return self.env_id.replace("/", "-")
+
+
+#: The most telling first.
+TASKS: Final = (
+    Task("smax/3m", 100_000),
+    Task("lbf/Foraging-8x8-2p-3f-v3", 60_000),
+    Task("vmas/balance", 100_000),
+    Task("jaxmarl/MPE_simple_spread_v3", 200_000),
+    Task("jaxmarl/MPE_simple_speaker_listener_v4", 200_000),
+    Task("overcooked/cramped_room", 200_000),
+    Task("smax/2s3z", 60_000),
+    Task("rware/rware-tiny-2ag-v2", 40_000),
+)
+
+
+def run(task: Task, seed: int, options: argparse.Namespace) -> None:
+    """Train and test what is missing of a task and seed, one cell after the other."""
+    words = ["run", task.name, "--env", task.env_id, "--size", "small", "--workers", "1", "--seeds", str(seed)]
+    words += ["-n", str(task.game_steps), "--methods", *options.methods, "-f", str(options.folder / task.name)]
+    experiments(words)
+
+
+def row(task: Task, folder: Path, methods: Sequence[str], baselines: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return the cells of a task's line; what is not there says so."""
+    beside = "; ".join(f"{one['value']} ({one['program']}, {one['game_steps']} game steps)" for one in baselines)
+    try:
+        tests = read_results(folder, task.name).tests
+    except ValueError:
+        return [task.env_id, f"{task.game_steps:,}", *[_NOT_RUN] * (len(methods) + 2), beside]
+    by_method = [tests[tests["method"] == method] for method in ("random", *methods)]
+    spent = [_seconds(rows["processor_seconds"]) for rows in by_method[1:]]
+    return [task.env_id, f"{tests['game_steps'].max():,}", *map(_figures, by_method), " / ".join(spent), beside]
+
+
+def _seconds(values: pd.Series) -> str:
+    return _NOT_RUN if values.empty else f"{values.mean():.0f}"
+
+
+def _figures(tests: pd.DataFrame) -> str:
+    """Return the mean return over seeds with its interval, the share of games won, and the number of seeds."""
+    if tests.empty:
+        return _NOT_RUN
+    value, low, high = mean_over_seeds(tests["return_mean"].to_numpy())
+    found = f"{value:.2f}" if pd.isna(low) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
+    won = tests["success_rate"].mean()
+    return f"{found}{'' if pd.isna(won) else f', {won:.0%} won'} ({len(tests)})"
+
+
+def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterator[str]:
+    """Yield the lines of the table, and of what it is made from."""
+    with BASELINES.open(encoding="utf-8", newline="") as file:
+        known = list(csv.DictReader(file))
+    head = ["task", "game steps", "random", *methods, f"processor s ({' / '.join(methods)})", "others"]
+    yield f"| {' | '.join(head)} |"
+    yield f"|{' --- |' * len(head)}"
+    for task in tasks:
+        others = [one for one in known if one["task"] == task.env_id]
+        yield f"| {' | '.join(row(task, folder / task.name, methods, others))} |"
+    versions = [read_json(path) for path in folder.glob("*/cells/*/*/*/versions.json")]
+    yield ""
+    yield f"Commits: {', '.join(sorted({one['commit'] for one in versions if one})) or 'none'}. Others:"
+    yield ""
+    for one in known:
+        yield f"- {one['task']}: {one['program']}, {one['source']}"
+
+
+def main() -> None:
+    """Run what is missing, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-f", "--folder", type=Path, default=Path("runs", "suites"), help="of the trainings")
+    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    parser.add_argument("--tasks", nargs="+", default=[task.env_id for task in TASKS], help="to train on")
+    parser.add_argument("-n", "--game-steps", type=int, help="of each training, in the place of the tasks' own")
+    parser.add_argument("--table", action="store_true", help="train nothing")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    options = parser.parse_args()
+    tasks = [task._replace(game_steps=options.game_steps or task.game_steps) for task in TASKS]
+    for seed in [] if options.table else options.seeds:
+        for task in tasks:
+            if task.env_id in options.tasks:
+                run(task, seed, options)
+    before, _, rest = options.page.read_text(encoding="utf-8").partition(_MARKS[0])
+    lines = "\n".join(table(tasks, options.folder, options.methods))
+    after = rest.partition(_MARKS[1])[2]
+    options.page.write_text(f"{before}{_MARKS[0]}\n\n{lines}\n\n{_MARKS[1]}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
