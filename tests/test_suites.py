@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import csv
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
+from benchmarks.suite_results import BASELINES, METHODS, TASKS, table
 from sb3_saf import (
     Actor,
     RandomPolicy,
@@ -130,6 +132,17 @@ def test_the_listing(capsys: pytest.CaptureFixture[str]) -> None:
         assert problem in listed if problem else f"{suite.name}/{suite.examples[0]}: " in listed
     assert main(["lbff"]) == 2
     assert "did you mean 'lbf'" in capsys.readouterr().err
+
+
+def test_the_table_of_results_has_a_line_for_each_task_and_says_what_was_not_run(tmp_path: Path) -> None:
+    head, _, *lines = table(TASKS, tmp_path, METHODS)
+    rows = [line.strip("| ").split(" | ") for line in lines[: len(TASKS)]]
+    assert [cells[0] for cells in rows] == [task.env_id for task in TASKS]
+    assert all(cells[2 : 4 + len(METHODS)] == ["not run"] * (2 + len(METHODS)) for cells in rows)
+    assert head.count("|") == lines[0].count("|") and {task.env_id.partition("/")[0] for task in TASKS} <= set(suites())
+    with BASELINES.open(encoding="utf-8", newline="") as file:
+        beside = {one["task"] for one in csv.DictReader(file)}
+    assert beside and {cells[0] for cells in rows if "JaxMARL" in cells[-1]} == beside
 
 
 # --- every task -------------------------------------------------------------------------------------------------------
