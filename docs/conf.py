@@ -76,13 +76,15 @@ def _drop_markdown_docstrings(
 
 def _copy_pages() -> None:
     """Copy the pages that live outside this folder into it: Sphinx reads no others."""
-    tutorials = ROOT / "docs" / "tutorials"
-    tutorials.mkdir(exist_ok=True)
-    for source in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        notebook = source.read_text(encoding="utf-8").replace("../docs/", "../")
-        (tutorials / source.name).write_text(notebook, encoding="utf-8")
-    shutil.copyfile(ROOT / "notebooks" / "README.md", tutorials / "README.md")
-    shutil.copyfile(ROOT / "CHANGELOG.md", ROOT / "docs" / "changelog.md")
+    docs = ROOT / "docs"
+    for folder, pages in (("notebooks", "tutorials"), ("results", "results")):
+        shutil.copytree(ROOT / folder, docs / pages, ignore=shutil.ignore_patterns("*.py*", "__*"), dirs_exist_ok=True)
+        for copied in [*(docs / pages).rglob("*.md"), *(docs / pages).rglob("*.ipynb")]:
+            text = copied.read_text(encoding="utf-8").replace("../docs/", "../")
+            # A report is reached from the page that it belongs to, not from the sidebar.
+            is_report = copied.name == "report.md"
+            copied.write_text("---\norphan: true\n---\n\n" + text if is_report else text, encoding="utf-8")
+    shutil.copyfile(ROOT / "CHANGELOG.md", docs / "changelog.md")
 
 
 def setup(app: Sphinx) -> None:
