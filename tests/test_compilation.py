@@ -23,7 +23,8 @@ def start(package: Path) -> tuple[str, bool]:
     """How often compiled code was found on disk, and whether compiling was announced, in a new process."""
     environment = {**os.environ, "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
-    process = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", CODE]  # before Python 3.11 the folder where it runs comes first
+    process = subprocess.run(command, cwd=package.parent, env=environment, capture_output=True, text=True, check=True)
     return process.stdout.strip(), "once on this machine they are compiled" in process.stderr
 
 
