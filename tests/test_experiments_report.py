@@ -44,6 +44,11 @@ def report(folder: Path, *words: str, name: str = "coordination") -> str:
     return (folder / name / "report.md").read_text(encoding="utf-8")
 
 
+def part_of(page: str, heading: str) -> str:
+    """Return what stands under a heading that begins so."""
+    return page.split(f"## {heading}")[1].split("\n## ")[0]
+
+
 @pytest.fixture(scope="module")
 def page(folder: Path) -> str:
     return report(folder)
@@ -75,8 +80,21 @@ def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> 
     assert f"| saf | {runs.return_mean.mean():.2f} [{low:.2f}, {high:.2f}] |" in page
     every = np.sort(table[table.method == "ippo"].score)
     assert f"{stats.trim_mean(every, 0.25):.3f} [" in page.split("## Aggregates")[1].split("## ")[0]
-    rows = [line for line in page.splitlines() if line.count("|") == 9 and "against" not in line and "---" not in line]
+    rows = [
+        line
+        for line in part_of(page, "Paired").splitlines()
+        if line.count("|") == 9 and "against" not in line and "---" not in line
+    ]
     assert [line.split(" | ")[-1] for line in rows] == ["no winner: fewer than 3 seeds |"] * (2 * len(LEVELS))
+
+
+def test_returns_while_learning_are_means_of_whole_curves(folder: Path, page: str) -> None:
+    curves = [pd.read_csv(folder / f"cells/{LEVELS[-1]}/saf/seed-{seed}/curve.csv")["mean_return"] for seed in (0, 1)]
+    low, high = stats.t.interval(
+        0.95, 1, loc=np.mean([c.mean() for c in curves]), scale=stats.sem([c.mean() for c in curves])
+    )
+    row = part_of(page, "Return while learning").strip().splitlines()[-1]
+    assert row.startswith(f"| TeamSupport | c=3, h=1 | ippo | 0, 1 | {(low + high) / 2:.2f} [{low:.2f}, {high:.2f}] |")
 
 
 def test_losses_are_shares_of_the_first_level(page: str) -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experiment, Level, View
 from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.tables import FEWEST_SEEDS, comparisons, complete, of_view, strata
+from sb3_saf.experiments.tables import FEWEST_SEEDS, Compared, comparisons, complete, of_view, strata
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
@@ -33,6 +33,7 @@ class Content(NamedTuple):
     :param missing: those that are not finished
     :param left_out: levels that do not fit the size
     :param table: of tests, see ``tables``
+    :param curves: of trainings, see ``tables``
     :param figures: names of the pictures beside the page
     """
 
@@ -43,6 +44,7 @@ class Content(NamedTuple):
     missing: Sequence[Cell]
     left_out: Sequence[LeftOut]
     table: pd.DataFrame
+    curves: pd.DataFrame
     figures: Sequence[str]
 
 
@@ -58,6 +60,7 @@ def page(content: Content) -> str:
         aggregates(content.experiment, table),
         *(_comparisons(table, view) for view in views),
         _pictures(content, "curve-"),
+        *(_learning(content.curves, view) for view in views if view.train is None),
         _reproduction(content),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
@@ -215,22 +218,38 @@ def _estimates(head: Sequence[str], methods: Iterable[str], columns: Iterable[Ma
 
 def _comparisons(table: pd.DataFrame, view: View) -> str:
     """Return the first method against each other one, seed by seed."""
-    compared = comparisons(table, view)
-    if not compared:
-        return ""
-    ours = compared[0].ours
-    head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", f"{ours} is"]
     text = (
         "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
         f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than "
         f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner "
         "by chance now and then."
     )
+    return _compared(f"## Paired comparisons by {view.axis}{view.suffix}", text, comparisons(table, view))
+
+
+def _learning(curves: pd.DataFrame, view: View) -> str:
+    """Return the same of the returns while training."""
+    if curves.empty:
+        return ""
+    of_runs = curves.groupby(["method", "task", "level", "seed"], sort=False, as_index=False)["score"].mean()
+    table = of_runs.rename(columns={"score": "return_mean"}).assign(train_level=of_runs["level"])
+    text = (
+        "Mean return of the training episodes of a whole run, from its first game step to its last: of two that "
+        "end alike, who learns sooner has more."
+    )
+    return _compared(f"## Return while learning by {view.axis}", text, comparisons(table, view))
+
+
+def _compared(heading: str, text: str, compared: Sequence[Compared]) -> str:
+    if not compared:
+        return ""
+    ours = compared[0].ours
+    head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", f"{ours} is"]
     body = []
     for task, level, _, other, found in compared:
         numbers = [_show(found.first), _show(found.second), _show(found.difference)]
         body.append([task, str(level), other, ", ".join(map(str, found.seeds)), *numbers, found.verdict])
-    return "\n".join([f"## Paired comparisons by {view.axis}{view.suffix}", "", text, "", *_table(head, body)])
+    return "\n".join([heading, "", text, "", *_table(head, body)])
 
 
 def _reproduction(content: Content) -> str:

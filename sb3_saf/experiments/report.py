@@ -63,7 +63,7 @@ def write_report(
     drawer = _Drawer(shown, table, curves, _references(scale, cells, config))
     figures = {**drawer.views(), **drawer.aggregates(), **drawer.curves()}
     missing = [cell for cell in cells if results.missing_tests(cell)]
-    content = Content(shown, config, results, cells, missing, asked.left_out, table, list(figures))
+    content = Content(shown, config, results, cells, missing, asked.left_out, table, curves, list(figures))
     folder = results.folder / experiment.name
     with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as name:
         fresh = Path(name)
