@@ -72,6 +72,7 @@ def train_team(options: Options) -> BaseAlgorithm:
         tensorboard_log=options.output / "tb",
         inspect_freq=max(1, options.settings.game_steps // N_INSPECTIONS),
         progress=options.progress_bar,
+        num_threads=1,  # small networks gain nothing from more, and lose where other programs run
     )
     return train(options.settings, options.seed, options.output, run)
 
