@@ -1,1 +1,1 @@
-"""Programs that measure speed, each against its baselines in one run."""
+"""Benchmarks: each program measures its subject and its baselines in one run."""

@@ -1,10 +1,9 @@
 """
-Gridworlds of others, to compare speeds with: what each is made with, and how it is stepped.
+Third-party gridworlds for speed comparisons: settings, and how they are stepped.
 
-As near to HECOGrid's defaults (10 agents, a 30 x 30 grid, views of 7 x 7 cells, episodes of 50 steps, random actions,
-resets included) as each allows; where it does not, the choice that makes it faster. Nothing here needs more than NumPy
-and the library in question, because some ask for versions that this project does not work with and get an interpreter
-of their own (:mod:`benchmarks.install_baselines`).
+Settings are as close to HECOGrid's defaults (10 agents, a 30 x 30 grid, views of 7 x 7 cells, episodes of 50 steps,
+random actions, resets included) as each allows; otherwise the faster choice is used. This module needs only NumPy and
+the library in question, because some run in separate environments (:mod:`benchmarks.install_baselines`).
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ SIGHT = 3
 
 class Stepper(NamedTuple):
     """
-    An environment that runs.
+    A running environment.
 
-    :param work: step it and say how many agent-steps that was
+    :param work: steps it and returns the number of agent-steps
     :param observe: observations of the last step, agents first
     """
 
@@ -40,11 +39,11 @@ class Baseline(NamedTuple):
     """
     One row of the table.
 
-    :param title: what the row says
+    :param title: title of the row
     :param distribution: the package to install
-    :param make: makes and resets it
-    :param isolated: whether it needs an interpreter of its own
-    :param module: what has to be there to be imported, if not a module of the package's name
+    :param make: creates and resets it
+    :param isolated: whether it needs a separate environment
+    :param module: module to import, if it is not named like the package
     """
 
     title: str
@@ -55,13 +54,13 @@ class Baseline(NamedTuple):
 
 
 class LastSeen:
-    """What the last step gave, for those who want to look at it outside the measured time."""
+    """Results of the last step, for use outside the measured time."""
 
     def __init__(self, observation: Any) -> None:
         self.observation = observation
 
     def stacked(self) -> Any:
-        """Agents first."""
+        """Stack observations, agents first."""
         found = self.observation
         return np.stack(list(found.values()) if isinstance(found, dict) else list(found))
 
@@ -85,7 +84,7 @@ def pursuit() -> Stepper:
 
 
 def minigrid() -> Stepper:
-    """MiniGrid: one agent, rgb partial view with tiles of 4 pixels, as large as HECOGrid's."""
+    """MiniGrid: one agent, rgb partial view with tiles of 4 pixels, the size of HECOGrid's."""
     import gymnasium
     from minigrid.wrappers import RGBImgPartialObsWrapper
 
@@ -108,8 +107,8 @@ def foraging() -> Stepper:
     """
     Level-based foraging on 30 x 30.
 
-    With 10 foods instead of 100 and its vectors (a position and a level for each food and player) instead of its
-    grids, which Gymnasium 1 refuses: both are faster.
+    Uses 10 foods instead of 100, and vectors (a position and a level for each food and player) instead of grids, which
+    fail with Gymnasium 1; both are faster.
     """
     from lbforaging.foraging import ForagingEnv
 
@@ -138,7 +137,7 @@ def foraging() -> Stepper:
 
 
 def pogema() -> Stepper:
-    """POGEMA on 30 x 30 with its obstacles (density 0.3); who arrives gets a new target."""
+    """POGEMA on 30 x 30 with its obstacles (density 0.3); an agent that arrives gets a new target."""
     from pogema import GridConfig, pogema_v0
 
     config = GridConfig(
@@ -164,7 +163,7 @@ def pogema() -> Stepper:
 
 
 def overcooked() -> Stepper:
-    """JaxMARL's Overcooked: its first layout, 2 cooks on 4 x 5, who see all of it."""
+    """JaxMARL's Overcooked: its first layout, 2 cooks on 4 x 5, fully observed."""
     return _jaxmarl("overcooked")
 
 
@@ -174,7 +173,7 @@ def overcooked_v2() -> Stepper:
 
 
 def _jaxmarl(task: str, **params: Any) -> Stepper:
-    """128 games side by side (vmap), compiled (jit), on the processor; it resets what is over by itself."""
+    """Create 128 parallel games (vmap), compiled (jit), on the CPU, with automatic resets."""
     import jax
     import jaxmarl
 

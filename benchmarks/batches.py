@@ -1,4 +1,4 @@
-"""Batches of games to be measured."""
+"""Batches of games for benchmarks."""
 
 from __future__ import annotations
 

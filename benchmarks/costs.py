@@ -1,9 +1,9 @@
 """
-What encoders and methods cost, side by side. ``python -m benchmarks.costs``
+Compare the costs of encoders and methods: ``python -m benchmarks.costs``.
 
-Encoders: forward and backward passes over views of HECOGrid (7 x 7 tiles, 28 x 28 pixels) and over larger pictures.
-Methods: rollout and update of PPO on TeamSupport with 10 agents, all of it, with each encoder (``MLPEncoder`` reads the
-tile codes as numbers: what it costs is what observations that are vectors cost).
+Encoders: forward and backward passes over views of HECOGrid (7 x 7 tiles, 28 x 28 pixels) and over larger images.
+Methods: rollout and update of PPO on TeamSupport with 10 agents, with each encoder (``MLPEncoder`` reads the tile codes
+as numbers, so its cost is that of vector observations).
 
 Processor time of one core; programs take turns, and the table shows medians.
 """
@@ -26,7 +26,7 @@ from sb3_saf import LightEncoder, MLPEncoder, NatureEncoder, PaperCNN, TeamRollo
 N_VIEWS: Final = 128
 METHODS: Final = ("IPPO", "MAPPO", "SAF")
 OF_METHODS: Final = (PaperCNN, LightEncoder, MLPEncoder)
-#: Height and width of pictures, and who encodes them.
+#: Height and width of images, and their encoder.
 PICTURES: Final[dict[tuple[int, int], tuple[type[BaseFeaturesExtractor], ...]]] = {
     (28, 28): (PaperCNN, LightEncoder),
     (64, 64): (PaperCNN, NatureEncoder, LightEncoder),
@@ -36,7 +36,7 @@ PICTURES: Final[dict[tuple[int, int], tuple[type[BaseFeaturesExtractor], ...]]] 
 
 
 def encoder_work(encoder_class: type[BaseFeaturesExtractor], height: int, width: int) -> tuple[Callable[[], int], int]:
-    """Forward and backward over some views, and the number of weights."""
+    """Run forward and backward over some views; also return the number of weights."""
     encoder = encoder_class(spaces.Box(0, 255, (3, height, width), np.uint8))
     pictures = th.rand(N_VIEWS if height < 100 else 16, 3, height, width)
 
@@ -48,7 +48,7 @@ def encoder_work(encoder_class: type[BaseFeaturesExtractor], height: int, width:
 
 
 def method_work(method: str, encoder: type[BaseFeaturesExtractor], n_games: int) -> Callable[[], int]:
-    """One rollout of 25 steps and 4 epochs over it."""
+    """Run one rollout of 25 steps and 4 epochs over it."""
     env = make_team_env("TeamSupport", n_envs=n_games, seed=0)
     n_rows = 25 * env.num_envs
     settings: dict[str, Any] = {"n_steps": 25, "batch_size": n_rows, "n_epochs": 4, "seed": 0, "device": "cpu"}
@@ -63,7 +63,7 @@ def method_work(method: str, encoder: type[BaseFeaturesExtractor], n_games: int)
 
 
 def medians(programs: dict[Any, Callable[[], int]], rounds: int) -> dict[Any, float]:
-    """What each does per second of processor time; the first round warms up."""
+    """Return each program's units per second of processor time; the first round is a warm-up."""
     rates: dict[Any, list[float]] = {name: [] for name in programs}
     for _ in range(rounds + 1):
         for name, work in programs.items():
@@ -74,7 +74,7 @@ def medians(programs: dict[Any, Callable[[], int]], rounds: int) -> dict[Any, fl
 
 
 def encoder_table(rounds: int) -> None:
-    """Print what encoders cost."""
+    """Print the costs of encoders."""
     made = {
         (size, encoder): encoder_work(encoder, *size) for size, encoders in PICTURES.items() for encoder in encoders
     }
@@ -88,7 +88,7 @@ def encoder_table(rounds: int) -> None:
 
 
 def method_table(rounds: int, n_games: int) -> None:
-    """Print what methods cost."""
+    """Print the costs of methods."""
     programs = {
         (method, encoder): method_work(method, encoder, n_games) for method in METHODS for encoder in OF_METHODS
     }

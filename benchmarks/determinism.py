@@ -1,8 +1,8 @@
 """
-What changes the bits of a training, and what does not: ``python -m benchmarks.determinism`` prints the table.
+Measure which changes affect the bits of a training: ``python -m benchmarks.determinism`` prints the table.
 
-SAF trains on TeamSupport for a few rollouts, once as it is and once with each change. Weights are compared bit for bit;
-where they differ, the largest difference of a weight says by how much.
+SAF trains on TeamSupport for a few rollouts, once unchanged and once with each change. Weights are compared bit for
+bit; if they differ, the table shows the largest difference.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ Weights = dict[str, npt.NDArray[Any]]
 
 class Change(NamedTuple):
     """
-    What is done in another way.
+    One change of the training.
 
     :param name: for the table
     :param env: arguments of make_team_env
     :param policy: arguments of the policy
-    :param threads: of torch
-    :param variables: of the environment, which libraries read when they are loaded
+    :param threads: number of torch threads
+    :param variables: environment variables that libraries read when they are loaded
     """
 
     name: str
@@ -61,7 +61,7 @@ CHANGES: Final = (
 
 
 def train(change: Change) -> Weights:
-    """Weights after some rollouts."""
+    """Return the weights after some rollouts."""
     th.set_num_threads(change.threads)
     env = sb3_saf.make_team_env("TeamSupport", N_GAMES, seed=0, **{**TASK, **change.env})
     model = PPO(
@@ -80,7 +80,7 @@ def train(change: Change) -> Weights:
 
 
 def train_elsewhere(change: Change) -> Weights:
-    """In a process of its own, with its variables."""
+    """Train in a separate process with its environment variables."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "weights.npz")
         command = [sys.executable, "-m", "benchmarks.determinism", "--train", change.name, "--file", str(file)]
@@ -90,7 +90,7 @@ def train_elsewhere(change: Change) -> Weights:
 
 
 def verdict(one: Weights, other: Weights) -> str:
-    """Equal, or the largest difference."""
+    """Describe the result: equal, or the largest difference."""
     if all(one[name].tobytes() == other[name].tobytes() for name in one):
         return "bit-equal"
     return f"differs by {max(float(np.abs(one[name] - other[name]).max()) for name in one):.1g}"

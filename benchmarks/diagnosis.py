@@ -1,10 +1,10 @@
 """
-Why do methods differ? Looks into the trained teams of an experiment's folder. ``python -m benchmarks.diagnosis FOLDER``
+Diagnose why methods differ, from the trained teams of an experiment: ``python -m benchmarks.diagnosis FOLDER``.
 
-For every finished cell it plays episodes with the trained team and asks the critic, the knowledge source and the pool
-(``sb3_saf.inspect_team``): how well values tell returns, whether messages matter, whether the pool chooses at all; how
-many actions are wasted in which zone; and what the most likely actions would earn. Means over seeds; one row per method
-and level.
+Plays episodes with the team of every finished cell and inspects critic, knowledge source and pool
+(``sb3_saf.inspect_team``): how well values predict returns, whether messages matter, how the pool is used; also which
+share of actions has no effect in each zone, and the return of the most likely actions. Means over seeds; one row per
+method and level.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SETTING: Final = re.compile(r"(?P<task>\w+)-c(?P<c>\d+)-h(?P<h>\d+)(-n(?P<n>\d+
 
 
 def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
-    """Trained teams of an experiment's folder; ``setting`` such as TeamSupport-c2-h1."""
+    """Return the trained teams of an experiment's folder; ``setting`` is e.g. TeamSupport-c2-h1."""
     for model in sorted(results.folder.glob(f"cells/{setting}/*/*/model.zip")):
         folder, method, seed = model.parts[-4:-1]
         found = _SETTING.fullmatch(folder)
@@ -47,7 +47,7 @@ def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
 
 
 def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
-    """Numbers by name."""
+    """Return numbers by name."""
     config = results.config()
     if config is None:
         raise ValueError(f"{results.folder} does not say how its cells were trained: settings.json is missing")
@@ -62,7 +62,7 @@ def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
 
 
 def commands_and_zones(model: BaseAlgorithm, env: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Commands that agents drew in one episode of every game, and the zones they were in; (steps, rows) each."""
+    """Return the commands of one episode of every game, and the agents' zones; (steps, rows) each."""
     params = env.unwrapped.batch.params
     obs, commands, zones = env.reset(), [], []
     for _ in range(params.max_cycles):
@@ -77,12 +77,12 @@ def useless_commands(
     task: TaskName, commands: npt.NDArray[np.uint8], zones: npt.NDArray[np.integer[Any]]
 ) -> dict[str, float]:
     """
-    How many actions are wasted: two commands do nothing at all, and without keys, in TeamSupport and TeamTogether, a
-    third does nothing either.
+    Compute the share of commands without effect: two commands never have one, and a third has none in TeamSupport and
+    TeamTogether, which have no keys.
 
     :param task: whose rules hold
     :param commands: of agents in game steps
-    :param zones: where they were
+    :param zones: of the agents
     :return: share of all commands, by zone
     """
     nothing = [Command.TOGGLE, Command.DONE] + ([] if task == "KeyForTreasure" else [Command.DROP])

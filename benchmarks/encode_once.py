@@ -1,10 +1,10 @@
 """
-What encoding equal observations once saves: the share of unique observations and teams in minibatches, and the time of
-an update with and without it, for an untrained and a trained policy.
+Measure what encoding equal observations once saves: the share of unique observations and teams in minibatches, and the
+time of an update with and without it, for an untrained and a trained policy.
 
 ``python -m benchmarks.encode_once [TRAINED.zip]`` prints Markdown. The trained policy is one of ``python -m
-sb3_saf.train --algo saf --env TeamSupport-v0 --size small -n 20000``; without a file, it is trained here first. Vectors
-are those of an environment of random numbers, as good as never equal.
+sb3_saf.train --algo saf --env TeamSupport-v0 --size small -n 20000``; without a file, it is trained first. Vectors are
+random observations, which are practically never equal.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ ROUNDS: Final = 10
 
 
 def codes(observation: str) -> VecEnv:
-    """Games of TeamSupport at size small, as codes or pixels."""
+    """Create games of TeamSupport at size small, with codes or pixels."""
     level = dict(load_settings("saf", "TeamSupport-v0", "small").env_kwargs)
     return sb3_saf.make_team_env("TeamSupport", GAMES, seed=1, **{**level, "observation": observation})
 
 
 def vectors() -> VecEnv:
-    """Games whose observations are 18 random numbers, as many as simple_spread's."""
+    """Create games whose observations are 18 random numbers, as many as simple_spread's."""
     from tests.toy_teams import ToyTeams
 
     return ToyTeams(spaces.Box(-1.0, 1.0, (18,), np.float32), n_agents=5, n_games=GAMES, n_views=100_000)
 
 
 def minibatches(env: VecEnv, encode_once: bool, trained: Path | None) -> tuple[PPO, list[Any]]:
-    """A policy and the minibatches of one rollout that it has played."""
+    """Create a policy and the minibatches of one of its rollouts."""
     th.manual_seed(0)
     settings = sb3_saf.ppo_settings(env, n_steps=STEPS, policy_kwargs={"encode_once": encode_once}, seed=0)
     model = PPO("SAFPolicy", env, device="cpu", **settings)
@@ -57,7 +57,7 @@ def minibatches(env: VecEnv, encode_once: bool, trained: Path | None) -> tuple[P
 
 
 def share_of_unique(samples: list[Any]) -> tuple[float, float]:
-    """Shares of unique observations and of unique teams, mean over minibatches."""
+    """Return the shares of unique observations and of unique teams, mean over minibatches."""
     shares = []
     for sample in samples:
         teams = sample.observations.teams.observations
@@ -68,7 +68,7 @@ def share_of_unique(samples: list[Any]) -> tuple[float, float]:
 
 
 def seconds_of_update(model: PPO, samples: list[Any]) -> float:
-    """Processor time of one forward and backward pass over a rollout."""
+    """Return the processor time of one forward and backward pass over a rollout."""
     model.policy.set_training_mode(True)
     start = time.process_time()
     for sample in samples:
@@ -80,7 +80,7 @@ def seconds_of_update(model: PPO, samples: list[Any]) -> float:
 
 
 def row(name: str, env: VecEnv, trained: Path | None) -> str:
-    """One line of the table: both ways take turns, and the best of each counts."""
+    """Return one line of the table: both variants take turns, the best time of each counts."""
     ways = [minibatches(env, encode_once, trained) for encode_once in (True, False)]
     observations, teams = share_of_unique(ways[0][1])
     once, every = np.min([[seconds_of_update(*way) for way in ways] for _ in range(ROUNDS)], axis=0) * 1e3

@@ -1,11 +1,11 @@
 """
-Speed of the HECOGrid environments on one core, beside a memory copy and the gridworlds of others that are installed;
-seconds to the first step; memory of a rollout.
+Measure the speed of the HECOGrid environments on one core, compared with a memory copy and installed third-party
+gridworlds; seconds to the first step; memory of a rollout.
 
 ``python -m benchmarks.environments`` prints tables and writes them to ``benchmarks/results.md``. Medians and spread
-over rounds in which all rows take turns, so that a machine whose speed drifts does so for all of them. 128 games of 10
+over rounds in which all rows take turns, so that changes of the machine's speed affect all of them. 128 games of 10
 agents on a 30 x 30 grid, 100 treasures, random actions, resets included, unless a row says otherwise;
-:mod:`benchmarks.baselines` says with what the others are made.
+:mod:`benchmarks.baselines` has the settings of the others.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def vec_env_work(venv: Any) -> Work:
 
 
 def parallel_env_work() -> Work:
-    """One PettingZoo game with its dicts."""
+    """Step one PettingZoo game with its dicts."""
     env = parallel_env("TeamSupport")
     env.reset(seed=0)
     actions = iter(random_actions((64, 10)))
@@ -68,7 +68,7 @@ def parallel_env_work() -> Work:
 
 
 def copy_work() -> Work:
-    """The floor: copy as many bytes as 1,280 rgb views take."""
+    """Copy as many bytes as 1,280 rgb views take, a lower bound."""
     source = np.ones((N_GAMES * 10, 2352), dtype=np.uint8)
     target = np.empty_like(source)
 
@@ -80,7 +80,7 @@ def copy_work() -> Work:
 
 
 def programs() -> dict[str, Callable[[], Work]]:
-    """What is ours, and the copy."""
+    """Return the programs of this package, and the copy."""
 
     def team_env() -> Any:
         return sb3_saf.make_team_env("TeamSupport", n_envs=N_GAMES, seed=0)
@@ -106,10 +106,10 @@ def programs() -> dict[str, Callable[[], Work]]:
 
 def start_workers(stack: contextlib.ExitStack) -> dict[str, Worker]:
     """
-    Start the baselines that are installed, and say which are not.
+    Start the installed baselines, and print which are missing.
 
     :param stack: ends them
-    :return: by their row's title
+    :return: workers by the title of their row
     """
     workers: dict[str, Worker] = {}
     for name, baseline in BASELINES.items():
@@ -124,7 +124,7 @@ def start_workers(stack: contextlib.ExitStack) -> dict[str, Worker]:
 
 def speed_table(seconds: float, rounds: int) -> str:
     """
-    Let all rows take turns.
+    Measure all rows in turns.
 
     :param seconds: per row and round
     :return: Markdown
@@ -139,14 +139,14 @@ def speed_table(seconds: float, rounds: int) -> str:
 
 
 def machine() -> str:
-    """Processor and versions."""
+    """Describe processor and versions."""
     versions = ", ".join(f"{name} {version(name)}" for name in ("numba", "numpy", "torch", "stable-baselines3"))
     hardware = f"{processor()}, {os.cpu_count()} cores, {platform.machine()}, {platform.system()}"
     return f"Python {platform.python_version()}, {versions}; {hardware}"
 
 
 def processor() -> str:
-    """Its name, where Linux tells it."""
+    """Return the processor's name, if Linux provides it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

@@ -1,5 +1,5 @@
 """
-What ``FiniteCallback`` costs: processor time of training with and without it, taking turns.
+Measure the cost of ``FiniteCallback``: processor time of training with and without it, in turns.
 
 ``python -m benchmarks.finite``. TeamSupport as in the zoo's size ``small``: SAF, 5 agents.
 """
@@ -19,13 +19,13 @@ ROUNDS = 5
 
 
 def make(algo: str, **overrides: Any) -> BaseAlgorithm:
-    """A model of the zoo, on games of its size ``small``."""
+    """Create a model with the zoo's settings, on games of its size ``small``."""
     settings = load_settings(algo, "TeamSupport-v0", "small", overrides=overrides)
     return settings.make_model(settings.make_env(0, n_envs=overrides.get("n_envs")), 0)
 
 
 def seconds(model: BaseAlgorithm, steps: int, look: bool) -> float:
-    """Processor time of some training."""
+    """Return the processor time of some training."""
     began = time.process_time()
     model.learn(steps, FiniteCallback() if look else None, reset_num_timesteps=False)
     return time.process_time() - began

@@ -1,9 +1,9 @@
 """
-Seconds from the start of Python to the first step of a game: cold, with the kernels still to compile, and warm.
+Measure the seconds from the start of Python to the first step of a game: cold (kernels are compiled), and warm.
 ``python -m benchmarks.first_call``
 
-A cold start gets an empty ``NUMBA_CACHE_DIR``, a warm one that of the cold start before it. Python's own files
-(``__pycache__``) are there in both.
+A cold start gets an empty ``NUMBA_CACHE_DIR``, a warm one that of the previous cold start. Both find Python's own
+cached files (``__pycache__``).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ print(imported)
 
 
 class Start(NamedTuple):
-    """Seconds to the first step, and how many of them the imports took."""
+    """Seconds to the first step, and the part spent on imports."""
 
     total: float
     imports: float
@@ -73,7 +73,7 @@ def start(code: str, cache: str) -> Start:
 
 def measure(code: str, rounds: int) -> dict[str, list[Start]]:
     """
-    Cold and warm starts in turn.
+    Measure cold and warm starts in turns.
 
     :param code: one of ``PROGRAMS``
     """

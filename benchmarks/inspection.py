@@ -1,9 +1,9 @@
 """
-What does ``InspectionCallback`` cost at its default frequency? ``python -m benchmarks.inspection``
+Measure the cost of ``InspectionCallback`` at its default frequency: ``python -m benchmarks.inspection``.
 
 Trains SAF as ``make train`` does (TeamSupport, 5 agents, 16 games, light encoder) with an inspection at the start and
-one at the end, and compares the seconds of one inspection with those of training for as long as the default lies
-between two. Seconds are of one processor: what other programs do at the same time is not counted.
+one at the end, and relates the seconds of one inspection to those of training during the default interval. Seconds are
+processor time of one core, which excludes other programs.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ class Cost(NamedTuple):
     Seconds of one processor.
 
     :param inspection: of one inspection; the first, which imports and compiles, is left out
-    :param per_game_step: of training
+    :param per_game_step: of training per game step
     """
 
     inspection: float
     per_game_step: float
 
     def share(self, every_game_steps: int) -> float:
-        """Of inspections in the time of a run."""
+        """Share of inspections in the time of a run."""
         return self.inspection / (self.inspection + self.per_game_step * every_game_steps)
 
 
 class Timed(sb3_saf.InspectionCallback):
-    """Keeps the seconds of each inspection."""
+    """Records the seconds of each inspection."""
 
     def _inspect(self) -> dict[str, float]:
         began = time.process_time()

@@ -1,8 +1,8 @@
 """
-Interpreters of their own for baselines that ask for versions which this project does not work with.
+Create separate environments for baselines whose requirements conflict with this project's.
 
-``python -m benchmarks.install_baselines`` makes them in the folder ``baselines`` of this virtual environment; what is
-there already stays. What cannot be installed is told in one line and left out of the benchmarks.
+``python -m benchmarks.install_baselines`` creates them in the folder ``baselines`` of this virtual environment;
+existing ones are kept. Failed installations are reported in one line and left out of the benchmarks.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 from benchmarks.workers import INTERPRETERS
 
-#: POGEMA pins Gymnasium, NumPy and pydantic itself; the rest is what it was measured with.
+#: POGEMA pins Gymnasium, NumPy and pydantic itself; the other versions are those it was measured with.
 POGEMA = ("pogema==1.4.0", "gymnasium==0.28.1", "numpy==1.26.4", "pydantic==1.9.1")
-#: What PufferLib's environments import. Its package asks for a dozen more, which train.
+#: Imports of PufferLib's environments. Its package requires a dozen more, for training.
 PUFFERLIB_NEEDS = ("numpy==1.26.4", "gymnasium==0.29.1", "gym==0.23.0")
 PUFFERLIB = "pufferlib==3.0.0"
 #: The same optimisation as its own build.
@@ -40,8 +40,8 @@ def run(*command: str | Path, **variables: str) -> str:
     Run a command.
 
     :param variables: added to the environment
-    :return: what it printed
-    :raises RuntimeError: if it fails, with the last line that says "error"
+    :return: its output
+    :raises RuntimeError: if it fails, with the last line that contains "error"
     """
     result = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **variables})
     if result.returncode:
@@ -50,36 +50,36 @@ def run(*command: str | Path, **variables: str) -> str:
 
 
 def last_word(output: str) -> str:
-    """The last line that says "error", else the last."""
+    """Return the last line that contains "error", else the last line."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     return ([line for line in lines if "error" in line.lower()] or lines or ["no message"])[-1]
 
 
 def new_interpreter(folder: Path, *requirements: str) -> Path:
     """
-    Make a virtual environment.
+    Create a virtual environment.
 
-    :param folder: where
+    :param folder: its folder
     :return: its interpreter
     """
     run(sys.executable, "-m", "venv", folder)
     python = folder / "bin" / "python"
-    # gym 0.23 is built from source: its builder needs these two, and setuptools of its time.
+    # gym 0.23 is built from source, with these two and an old setuptools.
     run(python, "-m", "pip", "install", "--quiet", "setuptools==80.9.0", "wheel==0.45.1")
     run(python, "-m", "pip", "install", "--quiet", "--no-build-isolation", *requirements)
     return python
 
 
 def install_pogema(folder: Path) -> None:
-    """From its wheel."""
+    """Install POGEMA from its wheel."""
     new_interpreter(folder, *POGEMA)
 
 
 def install_pufferlib(folder: Path) -> None:
     """
-    One of its environments from the source package, by hand.
+    Build one of PufferLib's environments from the source package.
 
-    Its own build fetches raylib for the web and Box2D from outside the package registry and compiles thirty
+    Its own build downloads raylib for the web and Box2D from outside the package registry and compiles thirty
     environments that are not needed here.
     """
     python = new_interpreter(folder, *PUFFERLIB_NEEDS)
@@ -96,7 +96,7 @@ def install_pufferlib(folder: Path) -> None:
 
 
 def _pufferlib_source(folder: Path) -> Path:
-    """Unpacked by pip, whose next step, asking the package for its metadata, fails: see above."""
+    """Unpack the source with pip, whose next step, reading the package's metadata, fails (see above)."""
     with tempfile.TemporaryDirectory() as downloads:
         command = [
             sys.executable,
@@ -109,7 +109,7 @@ def _pufferlib_source(folder: Path) -> Path:
             "--no-clean",
         ]
         command += ["--no-binary", "pufferlib", "--dest", downloads, PUFFERLIB]
-        # NO_OCEAN: do not even try to fetch the rest.
+        # NO_OCEAN: do not try to download the rest.
         variables = {"TMPDIR": downloads, "NO_OCEAN": "1", "NO_TRAIN": "1"}
         result = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **variables})
         found = list(Path(downloads).glob("*/pufferlib_*/pufferlib/ocean"))
@@ -119,7 +119,7 @@ def _pufferlib_source(folder: Path) -> Path:
 
 
 def main() -> None:
-    """Make what is not there; an interrupted or failed installation is taken away."""
+    """Create missing environments; remove those whose installation was interrupted or failed."""
     programs: dict[str, Callable[[Path], None]] = {"pogema": install_pogema, "pufferlib": install_pufferlib}
     for name, install in programs.items():
         folder = INTERPRETERS / name

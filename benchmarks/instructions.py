@@ -1,10 +1,10 @@
 """
-Machine instructions per agent-step of the compiled kernels: a guard against slower code that needs no quiet machine.
+Count machine instructions per agent-step of the compiled kernels, to detect slower code independently of machine load.
 
-``python -m benchmarks.instructions`` counts under Valgrind's Callgrind and prints the counts beside the recorded ones;
-``--record`` writes them to ``benchmarks/instructions.json``. Kernels are compiled for plain x86-64, so that the counts
-are those of a compiler, not of a machine. Same workload as ``benchmarks.environments``; new levels are counted by
-themselves, per agent.
+``python -m benchmarks.instructions`` counts with Valgrind's Callgrind and prints the counts beside the recorded ones;
+``--record`` writes them to ``benchmarks/instructions.json``. Kernels are compiled for plain x86-64, so that counts do
+not depend on the machine. The workload is that of ``benchmarks.environments``; new levels are counted separately, per
+agent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds
 from hecogrid_envs.core.types import RESET
 
 RECORD: Final = Path(__file__).parent / "instructions.json"
-#: How much more than recorded is a failure: releases of Python differ by some instructions per call.
+#: Allowed excess over the record: releases of Python differ by some instructions per call.
 TOLERANCE: Final = 0.05
 N_GAMES: Final = 128
 STEPS: Final = 8
@@ -42,13 +42,13 @@ _ZERO_STATS: Final = 0x43540001
 _DUMP_STATS_AT: Final = 0x43540003
 _START_INSTRUMENTATION: Final = 0x43540004
 _STOP_INSTRUMENTATION: Final = 0x43540005
-#: The sequence that Valgrind takes for a request (four rotations by 128 bits in all, and an exchange with itself) and a
-#: processor for nothing: rax = rdi; edx = 0; rotate rdi by 3, 13, 61, 51; exchange rbx, rbx; return rdx.
+#: The instruction sequence that Valgrind reads as a request and a processor executes as a no-op (rotations by 128 bits
+#: in total): rax = rdi; edx = 0; rotate rdi by 3, 13, 61, 51; exchange rbx, rbx; return rdx.
 _REQUEST: Final = bytes.fromhex("4889f8 31d2 48c1c703 48c1c70d 48c1c73d 48c1c733 4887db 4889d0 c3")
 
 
 def why_not() -> str | None:
-    """Why this machine cannot count; None if it can."""
+    """Return why this machine cannot count; None if it can."""
     if shutil.which("valgrind") is None:
         return "valgrind is not installed"
     return None if platform.machine() in ("x86_64", "AMD64") else "requests to valgrind are written for x86-64"
@@ -56,17 +56,17 @@ def why_not() -> str | None:
 
 def count() -> dict[str, float]:
     """
-    Count in a process of its own.
+    Count in a separate process.
 
     :return: instructions per agent-step by row
-    :raises RuntimeError: with valgrind's words if it fails
+    :raises RuntimeError: with Valgrind's message if it fails
     """
     play = [sys.executable, "-m", "benchmarks.instructions", "--play"]
     plain = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "PYTHONHASHSEED": "0"}
     env = {**os.environ, **plain, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         valgrind = ["valgrind", "--tool=callgrind", "--instr-atstart=no", f"--callgrind-out-file={folder}/counts"]
-        # Once without valgrind, under which compiling takes minutes: the second finds the kernels in numba's cache.
+        # First without Valgrind, where compiling takes minutes: the second run finds the kernels in numba's cache.
         for command in (play, valgrind + play):
             ran = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
             if ran.returncode != 0:
@@ -108,13 +108,13 @@ def _play_step(
 
 
 def _draw_levels(batch: GameBatch) -> None:
-    """New levels without what :meth:`GameBatch.reset` does in Python."""
+    """Create new levels without the Python part of :meth:`GameBatch.reset`."""
     batch._buffers.fresh[...] = True
     batch._play_all(RESET)
 
 
 def _play() -> None:
-    """What runs under valgrind: every work under its name, compiled and loaded before."""
+    """Run each work under its name within Valgrind; kernels are compiled and loaded beforehand."""
     request = _requests()
     for name, work in _works():
         request(_START_INSTRUMENTATION)
@@ -140,9 +140,9 @@ def _requests() -> Callable[..., None]:
 
 def compare(counts: dict[str, float], record: dict[str, float]) -> list[str]:
     """
-    What is slower than recorded.
+    Compare with the recorded counts.
 
-    :return: one sentence a row
+    :return: one sentence for each row that is slower
     """
     most = {name: recorded * (1 + TOLERANCE) for name, recorded in record.items()}
     return [

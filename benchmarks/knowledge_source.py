@@ -1,9 +1,10 @@
 """
-Does the knowledge source cost linearly in the number of agents? ``python -m benchmarks.knowledge_source``
+Measure whether the cost of the knowledge source is linear in the number of agents: ``python -m
+benchmarks.knowledge_source``.
 
-Writing and reading, forward and backward, for N = 5 to 320 agents, beside plain attention among the agents, where every
-agent attends to every agent. Two measures: multiply-adds (counted by PyTorch, exact) and seconds of one processor
-(what other programs do at the same time is not counted). Letters: G teams, N agents, d = 64 features.
+Writing and reading, forward and backward, for N = 5 to 320 agents, compared with plain attention, where every agent
+attends to every agent. Two measures: multiply-adds (counted by PyTorch, exact) and processor seconds of one core (which
+exclude other programs). Letters: G teams, N agents, d = 64 features.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ FEATURES: Final = 64
 
 
 class AllToAll(nn.Module):
-    """Every agent attends to the messages of all agents, without slots between them."""
+    """Attention of every agent to the messages of all agents, without slots."""
 
     def __init__(self) -> None:
         super().__init__()
         self.attention = Attention(FEATURES)
 
     def forward(self, messages: th.Tensor, states: th.Tensor) -> th.Tensor:
-        """(G, N, d) and (G, N, d) to (G, N, d)."""
+        """Map (G, N, d) and (G, N, d) to (G, N, d)."""
         values: th.Tensor = self.attention(states, messages).values
         return values
 
 
 def one_pass(module: nn.Module, n_teams: int, n_agents: int) -> Callable[[], None]:
-    """Forward and backward on made-up messages and states, which need gradients as in training."""
+    """Run forward and backward on random messages and states, which need gradients as in training."""
     messages, states = (th.randn(n_teams, n_agents, FEATURES, requires_grad=True) for _ in range(2))
 
     def work() -> None:
@@ -49,14 +50,14 @@ def one_pass(module: nn.Module, n_teams: int, n_agents: int) -> Callable[[], Non
 
 
 def mega_multiply_adds(n_agents: int, make: Callable[[int], nn.Module]) -> float:
-    """Of one team."""
+    """Count the multiply-adds of one team, in millions."""
     with FlopCounterMode(display=False) as counter:
         one_pass(make(n_agents), 1, n_agents)()
     return counter.get_total_flops() / 2e6
 
 
 def seconds(works: Sequence[Callable[[], None]], repetitions: int) -> list[float]:
-    """Shortest processor time of each, in turns, after a first turn that is not counted."""
+    """Return the shortest processor time of each program, in turns, after a warm-up."""
     times = np.zeros((repetitions + 1, len(works)))
     for turn in times:
         for index, work in enumerate(works):
@@ -67,7 +68,7 @@ def seconds(works: Sequence[Callable[[], None]], repetitions: int) -> list[float
 
 
 def line(sizes: Sequence[int], costs: Sequence[float]) -> str:
-    """The straight line through the costs that is best in relative terms, and how far it is off."""
+    """Fit a straight line to the costs by relative error; also return the largest error."""
     n, cost = np.array(sizes, dtype=float), np.array(costs)
     design = np.stack([np.ones_like(n), n], axis=1) / cost[:, np.newaxis]
     fixed, slope = np.linalg.lstsq(design, np.ones_like(n), rcond=None)[0]
@@ -76,7 +77,7 @@ def line(sizes: Sequence[int], costs: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Print the table and the lines through its columns."""
+    """Print the table and the fits of its columns."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--teams", type=int, default=16, help="G, teams per pass")
     parser.add_argument("--repetitions", type=int, default=20)

@@ -1,15 +1,15 @@
 """
-Speed of the loop around the games, where few games and small networks are trained: SB3's own PPO beside IPPO, MAPPO and
-SAF. ``python -m benchmarks.loop``
+Measure the training loop with few games and small networks: SB3's own PPO compared with IPPO, MAPPO and SAF.
+``python -m benchmarks.loop``
 
-``free``: games that cost nothing (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of
-2 x 64 on the numbers as they are, for all; 4 epochs, 4 minibatches. SB3 plays the same rows with its ``MlpPolicy``.
-``small``: HECOGrid in the size ``small`` of the zoo, with the zoo's settings. ``growth``: cost by the number of agents,
-``small`` with N agents and as many rows. ``import``: seconds until ``import sb3_saf`` returns, beside torch and SB3.
+``free``: games that take no time (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of 2 x
+64 without an encoder, for all; 4 epochs, 4 minibatches. SB3 plays the same rows with its ``MlpPolicy``. ``small``:
+HECOGrid in the zoo's size ``small``, with the zoo's settings. ``growth``: cost by the number of agents, ``small`` with
+N agents and the same number of rows. ``import``: seconds of ``import sb3_saf``, compared with torch and SB3.
 
-Each number is processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of
-the rollout in milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole
-loop, and the whole loop's time as a multiple of the first program's.
+Processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of the rollout in
+milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole loop, and the
+time of the whole loop as a multiple of the first program's.
 """
 
 from __future__ import annotations
@@ -72,15 +72,15 @@ class FreeGames(VecEnv):
         self._step = 0
 
     def reset(self) -> VecEnvObs:
-        """First observations."""
+        """Return the first observations."""
         self._step = 0
         return self._observations[0]
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Actions change nothing."""
+        """Ignore the actions."""
 
     def step_wait(self) -> VecEnvStepReturn:
-        """The next observations."""
+        """Return the next observations."""
         self._step = (self._step + 1) % EPISODE
         ended = self._step == 0
         infos: Any = self._last if ended else self._infos
@@ -92,28 +92,28 @@ class FreeGames(VecEnv):
         )
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """One for all."""
+        """Return the same attribute for all games."""
         return [getattr(self, attr_name)] * self.num_envs
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Nobody asks."""
+        """Not used."""
         raise NotImplementedError
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Nobody asks."""
+        """Not used."""
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Rows have no wrappers."""
+        """Return False for all rows."""
         return [False] * self.num_envs
 
 
 class Cost(NamedTuple):
     """
-    Best seconds of processor time.
+    Best processor seconds.
 
     :param rollout: of a rollout
     :param update: of an update
@@ -128,12 +128,12 @@ class Cost(NamedTuple):
 
     @property
     def whole(self) -> float:
-        """Seconds per agent-step."""
+        """Total seconds per agent-step."""
         return (self.rollout + self.update) / self.n_rows
 
 
 def free_models(n_games: int) -> dict[str, PPO]:
-    """SB3's PPO and ours on games that cost nothing."""
+    """Create SB3's PPO and ours on games that take no time."""
     n_steps = N_STEPS[n_games]
     settings: dict[str, Any] = {
         "n_steps": n_steps,
@@ -151,7 +151,7 @@ def free_models(n_games: int) -> dict[str, PPO]:
 
 
 def small_model(algo: str, n_agents: int | None = None) -> PPO:
-    """PPO of the zoo's size ``small``; other numbers of agents get as many rows, and a board of the same density."""
+    """Create PPO of the zoo's size ``small``; for any number of agents, with equal rows and density."""
     settings = load_settings(algo, "TeamSupport-v0", "small")
     if n_agents is None:
         model = settings.make_model(settings.make_env(0), 0, device="cpu")
@@ -172,7 +172,7 @@ def small_model(algo: str, n_agents: int | None = None) -> PPO:
 
 
 def costs(models: Mapping[str, PPO], rounds: int) -> dict[str, Cost]:
-    """Let programs take turns; the first round warms up."""
+    """Measure programs in turns; the first round is a warm-up."""
     watches = {name: _Watch(model) for name, model in models.items()}
     for number in range(rounds + 1):
         for watch in watches.values():
@@ -181,7 +181,7 @@ def costs(models: Mapping[str, PPO], rounds: int) -> dict[str, Cost]:
 
 
 class _Watch:
-    """Counts a model's processor time in rollouts and updates."""
+    """Measures a model's processor time in rollouts and updates."""
 
     def __init__(self, model: PPO) -> None:
         self.model = model
@@ -204,13 +204,13 @@ class _Watch:
         return self.model.n_steps * self.model.n_envs
 
     def run(self, counts: bool) -> None:
-        """One rollout and one update."""
+        """Run one rollout and one update."""
         self.model.learn(self._n_rows, reset_num_timesteps=False)
         if counts:
             self._best = {name: min(best, self._spent[name]) for name, best in self._best.items()}
 
     def cost(self) -> Cost:
-        """Best of the rounds."""
+        """Return the best of the rounds."""
         return Cost(self._best["collect_rollouts"], self._best["train"], self.model.n_steps, self._n_rows)
 
 
@@ -226,7 +226,7 @@ def print_table(title: str, found: Mapping[str, Cost]) -> None:
 
 
 def print_growth(rounds: int) -> None:
-    """Cost by the number of agents."""
+    """Print the cost by the number of agents."""
     print("\n| agents | " + " | ".join(f"{algo}, us per agent-step" for algo in ("SAF", "MAPPO")) + " |")
     print("| --- | --- | --- |")
     for n_agents in GROWTH:
@@ -236,7 +236,7 @@ def print_growth(rounds: int) -> None:
 
 
 def print_imports(rounds: int) -> None:
-    """Seconds of the clock to import, best of some, in processes of their own."""
+    """Print wall-clock seconds of imports, the best of several, in separate processes."""
     print("\n| import | seconds, best |\n| --- | --- |")
     for modules in ("torch, stable_baselines3", "sb3_saf"):
         command = [sys.executable, "-c", _SET_UP.format(modules)]
@@ -247,7 +247,7 @@ def print_imports(rounds: int) -> None:
 
 
 def main() -> None:
-    """Print what is asked for, by default everything."""
+    """Print the selected tables, by default all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=("free", "small", "growth", "import"))
     parser.add_argument("--games", nargs="+", type=int, default=list(N_STEPS), choices=list(N_STEPS), help="of free")

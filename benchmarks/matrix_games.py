@@ -1,7 +1,7 @@
 """
-Which joint action do QPLEX, QMIX and VDN learn in matrix games? ``python -m benchmarks.matrix_games``
+Measure which joint action QPLEX, QMIX and VDN learn in matrix games: ``python -m benchmarks.matrix_games``.
 
-Data are uniform over joint actions (epsilon stays 1), so that only the factorisation decides.
+Data are uniform over joint actions (epsilon stays 1), so that only the factorisation matters.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ GAMES: dict[str, Floats] = {"one-step": ONE_STEP, "climbing": CLIMBING}
 
 def learned_payoff(payoffs: Floats, mixer: MixerName, seed: int, game_steps: int) -> float:
     """
-    Payoff of the greedy joint action after training.
+    Return the payoff of the greedy joint action after training.
 
     :param payoffs: (A, A)
     :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``

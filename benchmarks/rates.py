@@ -1,4 +1,4 @@
-"""Steps per second: what the rows of a table have in common. Needs NumPy alone: other interpreters use it, too."""
+"""Steps per second: measuring and tables. Needs only NumPy, because the separate environments use it too."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-#: Does some work and says how many agent-steps it was.
+#: Does some work and returns the number of agent-steps.
 Work = Callable[[], int]
 
-#: Does work for so many seconds and says how many agent-steps per second it did.
+#: Works for a number of seconds and returns agent-steps per second.
 Rate = Callable[[float], float]
 
 
@@ -29,10 +29,10 @@ class Row(NamedTuple):
 
 def random_actions(shape: tuple[int, ...], n_actions: int = 7) -> Iterator[Any]:
     """
-    Actions drawn beforehand, without end.
+    Yield actions drawn beforehand, endlessly.
 
-    :param shape: how many, then the shape of one
-    :param n_actions: actions are below
+    :param shape: number of actions, then the shape of one
+    :param n_actions: exclusive upper bound of the actions
     """
     table = np.random.default_rng(0).integers(0, n_actions, size=shape)
 
@@ -47,7 +47,7 @@ def rate(work: Work, seconds: float) -> float:
     """
     Work for a while.
 
-    :param seconds: at least
+    :param seconds: minimum
     :return: agent-steps per second
     """
     start, done = time.perf_counter(), 0
@@ -58,9 +58,9 @@ def rate(work: Work, seconds: float) -> float:
 
 def take_turns(programs: dict[str, Rate], seconds: float, rounds: int) -> list[Row]:
     """
-    Measure every program once per round, after a round that does not count.
+    Measure every program once per round, after a warm-up round.
 
-    A program that fails is left out with a line that says so; the others go on.
+    A program that fails is left out, with a message; the others continue.
 
     :param programs: by name
     :param seconds: per program and round
@@ -70,22 +70,22 @@ def take_turns(programs: dict[str, Rate], seconds: float, rounds: int) -> list[R
         for name in list(rates):
             try:
                 rates[name].append(programs[name](seconds))
-            except Exception as error:  # of libraries that are not ours
+            except Exception as error:  # raised by third-party libraries
                 del rates[name]
                 print(f"left out: {name} ({one_line(error)})", flush=True)
     return [Row(name, found[1:]) for name, found in rates.items()]
 
 
 def one_line(error: Exception) -> str:
-    """What went wrong, short enough for a list."""
+    """Describe an error in one short line."""
     return f"{type(error).__name__}: {error}".replace("\n", " ")[:200]
 
 
 def table(rows: list[Row], unit: str) -> str:
     """
-    Markdown, every row also as a ratio.
+    Format rows as Markdown, with ratios.
 
-    :param unit: the row that the others are divided by begins so
+    :param unit: start of the title of the row that the others are divided by
     """
     one = next((row.median for row in rows if row.name.startswith(unit)), float("nan"))
     lines = [f"| what | agent-steps/s | lowest - highest | ratio to the {unit} |", "| --- | --- | --- | --- |"]

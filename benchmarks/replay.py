@@ -1,4 +1,4 @@
-"""Print time and size of a replay page, of an untrained SAF on TeamSupport: ``python -m benchmarks.replay``."""
+"""Print time and size of a replay page for an untrained SAF on TeamSupport: ``python -m benchmarks.replay``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import sb3_saf
 
 
 def measure(n_agents: int, folder: Path) -> tuple[float, int]:
-    """Return processor seconds and bytes of a page, at constant density of agents and treasures."""
+    """Return processor seconds and bytes of a page, with constant density of agents and treasures."""
     size = round((90 * n_agents) ** 0.5)
     with closing(
         sb3_saf.make_team_env(
@@ -31,7 +31,7 @@ def main() -> None:
     print("| agents | processor seconds | kB |")
     print("| --- | --- | --- |")
     with tempfile.TemporaryDirectory() as name:
-        measure(2, Path(name))  # loads what is loaded once
+        measure(2, Path(name))  # warm-up: loads modules and kernels
         for n_agents in (5, 10, 50):
             seconds, size = measure(n_agents, Path(name))
             print(f"| {n_agents} | {seconds:.1f} | {size / 1000:.0f} |")

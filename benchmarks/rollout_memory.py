@@ -1,7 +1,8 @@
 """
-Memory of a rollout at the paper's size: 128 games of 10 agents, 50 steps. ``python -m benchmarks.rollout_memory``
+Compute the memory of a rollout at the paper's size (128 games of 10 agents, 50 steps): ``python -m
+benchmarks.rollout_memory``.
 
-Bytes per agent-step, beside Stable-Baselines3's buffer for the same observations: counted from the arrays, not timed.
+Bytes per agent-step, compared with Stable-Baselines3's buffer for the same observations, computed from the arrays.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ N_STEPS: Final = 50
 
 def bytes_per_row(observation: str) -> tuple[float, float, float]:
     """
-    Bytes per agent-step.
+    Compute bytes per agent-step.
 
     :param observation: ``"tiles"`` or ``"rgb"``
-    :return: views, everything else, and the whole of SB3's buffer
+    :return: views, everything else, and the total of SB3's buffer
     """
     env = make_team_env("TeamSupport", n_envs=N_GAMES, seed=0, observation=observation)
     rows = env.num_envs
@@ -32,7 +33,7 @@ def bytes_per_row(observation: str) -> tuple[float, float, float]:
     stock = DictRolloutBuffer(N_STEPS, space, env.action_space, "cpu", n_envs=rows)
     env.close()
     views = sum(array.nbytes for array in ours.observations.values())
-    # Untouched zeros: they are counted without taking memory.
+    # Untouched zeros are counted but take no memory.
     theirs = sum(array.nbytes for array in stock.observations.values())
     theirs += sum(
         getattr(stock, name).nbytes
@@ -43,7 +44,7 @@ def bytes_per_row(observation: str) -> tuple[float, float, float]:
 
 
 def memory_table() -> str:
-    """Markdown; views are stored once per agent, and the joint view is put together from them."""
+    """Format the table as Markdown; views are stored once per agent, joint observations are composed of them."""
     heads = ["rollout of", "views", "actions, rewards, values, ...", "together", "SB3's buffer", "whole rollout"]
     lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for observation in ("tiles", "rgb"):

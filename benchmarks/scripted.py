@@ -1,16 +1,18 @@
 """
-How well scripted teams play: a scale for trained ones. ``python -m benchmarks.scripted``
+Measure how well scripted teams play, as a reference for trained ones: ``python -m benchmarks.scripted``.
 
-Beside a team that acts at random there are two that learn nothing and know the rules, zones included:
+Besides a random team there are two scripted ones, which know the rules, including the zones:
 
-- **7 x 7 views**: each agent knows what it sees at the moment, and for how long it has waited. It goes to the treasure
-  that it reaches soonest, rather to one with company, and waits there for some steps; else it walks towards agents that
-  it sees, or straight on with turns at random. In KeyForTreasure everyone fetches a key first.
+- **7 x 7 views**: each agent knows what it currently sees, and how long it has waited. It goes to the treasure that it
+  reaches soonest, with a preference for those with other agents nearby, and waits there for some steps; otherwise it
+  moves towards agents that it sees, or straight on with random turns. In KeyForTreasure every agent fetches a key
+  first.
 - **full sight**: groups of c agents that see the whole map. A group goes to the free treasure that its c-th member
-  reaches soonest, by shortest path, and waits there for the rest. In KeyForTreasure one of each group fetches a key.
+  reaches soonest, by shortest path, and waits there for the rest. In KeyForTreasure one agent of each group fetches a
+  key.
 
-Games are those of the zoo's size ``small``, and of twice as many agents at the same density. Means and 95 % intervals
-(Student's t) over games; the actions' meaning in a zone is known, so heterogeneity changes nothing but the random team.
+Games are those of the zoo's size ``small``, and with twice as many agents at the same density. Means and 95 % intervals
+(Student's t) over games. The scripts know the actions of each zone, so heterogeneity affects only the random team.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ SIZES: Final[tuple[dict[str, int], ...]] = (
 
 
 class Row(NamedTuple):
-    """A line of the table: a level, who plays, and its team return with the ends of the interval."""
+    """A line of the table: level, team, team return and the ends of its interval."""
 
     task: str
     coordination: int
@@ -53,7 +55,7 @@ class Row(NamedTuple):
 
 
 def play(name: str, batch: GameBatch, seed: int) -> int:
-    """Return the team return of the episode that has begun in the only game of a batch."""
+    """Return the team return of the current episode in the only game of a batch."""
     params = batch.params
     team = TEAMS[name](params, np.random.default_rng(seed))
     zones, action_of = params.zone_of_column(), np.argsort(params.command_of(), axis=1)
@@ -85,7 +87,7 @@ def table(rows: list[Row]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the table, and write it where asked to."""
+    """Print the table, and write it to a file if given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=TASK_NAMES, default=list(TASK_NAMES))
     parser.add_argument("--coordination", nargs="+", type=int, default=[1, 2, 3])

@@ -1,7 +1,7 @@
 """
-Teams that learn nothing and know the rules. ``python -m benchmarks.scripted`` plays with them.
+Scripted teams, which know the rules; used by ``python -m benchmarks.scripted``.
 
-Each is made for an episode and gives the commands of all agents, step by step, for the only game of a batch.
+A team is created for one episode and returns the commands of all agents, step by step, for the only game of a batch.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ Cells = npt.NDArray[np.bool_]
 Costs = npt.NDArray[np.float64]
 Commands = npt.NDArray[np.int64]
 
-#: With 7 x 7 views: actions that an agent goes further for company, steps that it waits on a treasure, steps for which
-#: it then leaves treasures alone; how likely it walks towards others, and turns when it could go straight on.
+#: With 7 x 7 views: extra actions that an agent accepts for a treasure with agents nearby, steps that it waits on a
+#: treasure, steps for which it then ignores treasures; probabilities of moving towards others and of turning with a
+#: free way ahead.
 DETOUR, PATIENCE, LEAVE = 6, 6, 6
 FOLLOW, TURN = 0.7, 0.1
 
@@ -34,7 +35,7 @@ def cost_to_go(passable: Cells, costs: Costs) -> Costs:
     Compute the least number of actions to a target, plus the target's cost, from every cell and direction.
 
     :param passable: (W, W) cells that agents can enter
-    :param costs: (W, W) of ending at a cell; infinite where there is no target
+    :param costs: (W, W) of ending at a cell; infinite for cells that are no target
     :return: (W, W, 4)
     """
     width = len(costs)
@@ -53,7 +54,7 @@ def cost_to_go(passable: Cells, costs: Costs) -> Costs:
 
 
 class Sight:
-    """The only game of a batch as scripts read it; planes are indexed ``[x, y]``, rows are agents."""
+    """The state of the only game of a batch; planes are indexed ``[x, y]``, rows are agents."""
 
     def __init__(self, batch: GameBatch):
         state = batch.get_state()
@@ -70,7 +71,7 @@ class Sight:
         return costs
 
     def command(self, agent: int, field: Costs) -> Command:
-        """Choose the command that lowers the cost to go; pickup at a target, which is also how to wait for others."""
+        """Choose the command that lowers the cost to go; at a target, pickup, which also serves to wait."""
         (x, y), d = self.position[agent], self.direction[agent]
         front = tuple(self.position[agent] + STEP[d])
         after = {
@@ -84,7 +85,7 @@ class Sight:
 
 
 class FullSight:
-    """Groups that see everything (see :mod:`benchmarks.scripted`)."""
+    """Groups that see the whole map (see :mod:`benchmarks.scripted`)."""
 
     def __init__(self, params: HECOGridParams, _rng: np.random.Generator):
         self.c = params.coordination
@@ -104,7 +105,7 @@ class FullSight:
         return commands
 
     def _make_groups(self, position: npt.NDArray[np.int64]) -> list[list[int]]:
-        """Make groups of c agents near each other at a time; who is left over joins the nearest group."""
+        """Form groups of c nearby agents; remaining agents join the nearest group."""
         distance = np.abs(position[:, None] - position).sum(axis=2)
         left, groups = list(range(len(position))), []
         while len(left) >= self.c:
@@ -115,7 +116,7 @@ class FullSight:
         return groups
 
     def _field_of_goal(self, number: int, sight: Sight) -> Costs:
-        """Compute the cost to go to the group's treasure, which it keeps until that is collected."""
+        """Compute the cost to go to the group's treasure, which stays the same until it is collected."""
         goal, taken = self.goals.pop(number, None), set(self.goals.values())
         if goal is None or not sight.treasures[goal]:
             cells: list[Cell] = [(x, y) for x, y in np.argwhere(sight.treasures).tolist() if (x, y) not in taken]
@@ -126,14 +127,14 @@ class FullSight:
         return cost_to_go(sight.passable, sight.costs_of([goal]))
 
     def _arrival(self, number: int, sight: Sight, cell: Cell) -> float:
-        """Count the actions after which c members of a group can be at a cell."""
+        """Count the actions until c members of a group can be at a cell."""
         group, field = self.groups[number], cost_to_go(sight.passable, sight.costs_of([cell]))
         x, y = sight.position[group].T
         return float(np.sort(field[x, y, sight.direction[group]])[self.c - 1])
 
 
 class OwnViews:
-    """Agents that know what they see at the moment (see :mod:`benchmarks.scripted`)."""
+    """Agents that know only what they currently see (see :mod:`benchmarks.scripted`)."""
 
     def __init__(self, params: HECOGridParams, rng: np.random.Generator):
         self.c, self.radius, self.rng = params.coordination, params.support_radius, rng
@@ -164,7 +165,7 @@ class OwnViews:
         return Command.FORWARD if straight else Command(int(self.rng.integers(Command.FORWARD)))
 
     def _costs(self, agent: int, sight: Sight, seen: Cells, others: set[Cell]) -> Costs:
-        """Return the costs of ending at keys or else treasures, (W, W); those without company cost more."""
+        """Return the costs of ending at keys or else treasures, (W, W); those without agents nearby cost more."""
         if sight.needs_key[agent]:
             return np.where(sight.keys & seen, 0.0, np.inf)
         costs = np.full(seen.shape, np.inf)

@@ -1,8 +1,8 @@
 """
-Long runs in flat memory: resident memory of the process against steps, and its slope after warm-up.
+Check that memory stays constant in long runs: resident memory of the process by steps, and its slope after warm-up.
 
 ``python -m benchmarks.soak`` plays 10^8 agent-steps of all three tasks, 10 agents in each of 128 games; ``--training
-MINUTES`` trains SAF at the zoo's size ``small`` for so long instead. Both print a line per part and write a figure.
+MINUTES`` trains SAF at the zoo's size ``small`` instead. Both print a line per part and write a figure.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from hecogrid_envs import TASK_NAMES, make_vec_env
 from sb3_saf.training.settings import load_settings
 
 N_GAMES: Final = 128
-#: Of all samples, those that are left out of the slope.
+#: Share of the samples that is left out of the slope.
 WARM_UP: Final = 0.2
-#: Samples of the memory in a part.
+#: Memory samples per part.
 N_SAMPLES: Final = 200
 _MB: Final = 2**20
 
 
 class Soak(NamedTuple):
     """
-    Memory along a run.
+    Memory during a run.
 
-    :param name: what ran
+    :param name: of the run
     :param steps: agent-steps done at each sample
     :param memory: resident MB at each sample
     :param seconds: of the run
@@ -53,7 +53,7 @@ class Soak(NamedTuple):
 
     @property
     def spread(self) -> float:
-        """MB between the smallest and the largest sample after warm-up."""
+        """Difference of the largest and the smallest sample after warm-up, in MB."""
         late = self.memory[int(WARM_UP * len(self.memory)) :]
         return max(late) - min(late)
 
@@ -67,7 +67,7 @@ class Soak(NamedTuple):
 
 
 def resident() -> float:
-    """MB that this process has in memory."""
+    """Return the resident memory of this process in MB."""
     return float(psutil.Process().memory_info().rss) / _MB
 
 
@@ -75,9 +75,9 @@ def soak(name: str, agent_steps: int, play: Callable[[], int]) -> Soak:
     """
     Repeat some work.
 
-    :param name: what it is
-    :param agent_steps: of all of it
-    :param play: does a part and says how many agent-steps it was
+    :param name: of the work
+    :param agent_steps: in total
+    :param play: does a part and returns its agent-steps
     """
     steps: list[float] = []
     memory: list[float] = []
@@ -91,7 +91,7 @@ def soak(name: str, agent_steps: int, play: Callable[[], int]) -> Soak:
 
 
 def environments(agent_steps: int) -> Iterator[Soak]:
-    """A third of the steps in each task, resets included."""
+    """Play a third of the steps in each task, resets included."""
     for task in TASK_NAMES:
         venv = make_vec_env(task, N_GAMES, seed=0, observation="tiles")
         actions = np.random.default_rng(0).integers(7, size=(64, venv.num_envs))
@@ -108,7 +108,7 @@ def environments(agent_steps: int) -> Iterator[Soak]:
 
 class MemoryCallback(BaseCallback):
     """
-    Sample the memory at every rollout, and end training in time.
+    Sample the memory at every rollout, and end training after a given time.
 
     :param minutes: of training
     """
@@ -129,7 +129,7 @@ class MemoryCallback(BaseCallback):
 
 
 def training(algo: str, minutes: float, folder: Path) -> Soak:
-    """The zoo's size ``small`` with monitor, evaluation and exact checkpoints, as its command trains it."""
+    """Train the zoo's size ``small`` with monitor, evaluation and exact checkpoints, as its command does."""
     settings = load_settings(algo, "TeamSupport-v0", "small")
     env = settings.make_env(0, monitor_dir=folder)
     evaluation = sb3_saf.TeamEvalCallback(
@@ -142,7 +142,7 @@ def training(algo: str, minutes: float, folder: Path) -> Soak:
 
 
 def draw(soaks: list[Soak], path: Path) -> None:
-    """Memory against steps, one part after the other."""
+    """Draw memory against steps, one part after the other."""
     figure = Figure(figsize=(7, 3), dpi=110, layout="constrained")
     axes = figure.subplots()
     begin = 0.0

@@ -1,13 +1,12 @@
 """
-Where each millisecond of a training goes. ``python -m benchmarks.stages``
+Measure training time by stage: ``python -m benchmarks.stages``.
 
 One table per setting: SAF, MAPPO and IPPO in the ``small`` size of the zoo (light encoder), and SAF with the paper's
-network. Every stage counts its own time only: what the games take is not counted again in the rollout that steps them.
-Wall-clock; the stages are found by wrapping the functions that SB3's PPO calls, so the numbers are of the real program
-and sum to the whole.
+network. A stage excludes the stages inside it: for example, the rollout does not include the games that it steps.
+Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are of the real program and sum to the total.
 
-On a GPU, ``--device cuda --only "SAF, paper size"`` waits for the device between stages, so that each is charged with
-its own kernels, and ends with what 10 million game steps would take; ``--no-wait`` lets them overlap as in a training.
+On a GPU, ``--device cuda --only "SAF, paper size"`` waits for the device between stages, so that each includes its own
+kernels, and prints the time of 10 million game steps; ``--no-wait`` lets stages overlap as in training.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ TRANSFER: Final = "arrays to the device"
 
 class Stopwatch:
     """
-    Adds up the seconds of nested stages, each without those inside it.
+    Sums the seconds of nested stages, each without those inside it.
 
-    :param wait: waits until the device is done with what it was given; None where calls are done when they return
+    :param wait: waits until the device is idle; None if calls are synchronous
     """
 
     def __init__(self, wait: Callable[[], None] | None = None) -> None:
@@ -51,18 +50,18 @@ class Stopwatch:
         self._since = now
 
     def start(self) -> None:
-        """Forget everything; from now on it counts."""
+        """Reset all times."""
         self.seconds.clear()
         self._since = time.perf_counter()
 
     def stop(self) -> dict[str, float]:
-        """Seconds by stage."""
+        """Return seconds by stage."""
         self._charge()
         return dict(self.seconds)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """What happens inside counts for this stage."""
+        """Measure a block as this stage."""
         self._charge()
         self._stack.append(name)
         try:
@@ -72,7 +71,7 @@ class Stopwatch:
             self._stack.pop()
 
     def watch(self, owner: Any, method: str, name: str) -> None:
-        """Count the calls of a function or method for a stage."""
+        """Measure the calls of a function or method as a stage."""
         inner: Callable[..., Any] = getattr(owner, method)
 
         @wraps(inner)
@@ -83,7 +82,7 @@ class Stopwatch:
         setattr(owner, method, timed)
 
     def watch_items(self, owner: Any, method: str, name: str) -> None:
-        """The same for a generator: what it does between its items."""
+        """Measure a generator as a stage: the time between its items."""
         inner: Callable[..., Any] = getattr(owner, method)
 
         def timed(*args: Any, **kwargs: Any) -> Iterator[Any]:
@@ -99,7 +98,7 @@ class Stopwatch:
 
 
 class Setting(NamedTuple):
-    """What is trained: a policy, its games and PPO's arguments."""
+    """Settings of a training: a policy, its games and PPO's arguments."""
 
     policy: str
     encoder: type[Any]
@@ -117,13 +116,13 @@ SETTINGS: Final = {
     },
     "SAF, paper network, 16 games": Setting("SAFPolicy", PaperCNN, {}, 16, 1, 10),
 }
-#: The whole size takes a GPU; a minute per rollout without one.
+#: This size needs a GPU; without one, a rollout takes a minute.
 PAPER_SIZE: Final = {"SAF, paper size": Setting("SAFPolicy", PaperCNN, {}, 128, 1, 10)}
 PAPER_GAME_STEPS: Final = 10_000_000
 
 
 def make_model(setting: Setting, steps: int = 50, device: str = "cpu") -> PPO:
-    """The algorithm of a setting, on TeamSupport."""
+    """Create the algorithm of a setting, on TeamSupport."""
     env = make_team_env("TeamSupport", n_envs=setting.n_games, seed=0, **setting.env)
     rows = steps * env.num_envs
     return PPO(
@@ -145,7 +144,7 @@ def make_model(setting: Setting, steps: int = 50, device: str = "cpu") -> PPO:
 
 def watch(model: Any, wait: bool = True) -> Stopwatch:
     """
-    Watch everything that PPO does with its parts.
+    Measure everything that PPO does with its parts.
 
     :param wait: for a GPU, between stages
     """
@@ -171,7 +170,7 @@ def watch(model: Any, wait: bool = True) -> Stopwatch:
 
 
 def profile(setting: Setting, rollouts: int, device: str = "cpu", wait: bool = True) -> tuple[dict[str, float], int]:
-    """Seconds by stage, and agent-steps; one rollout and update before warm up."""
+    """Return seconds by stage, and agent-steps, after a rollout and update as warm-up."""
     model = make_model(setting, device=device)
     assert model.env is not None
     rows = model.n_steps * model.env.num_envs
@@ -185,7 +184,7 @@ def profile(setting: Setting, rollouts: int, device: str = "cpu", wait: bool = T
 
 @contextmanager
 def unpatched() -> Iterator[None]:
-    """Functions that are not the model's own are as before, afterwards."""
+    """Restore all wrapped functions that are not the model's own at the end."""
     owners: list[tuple[Any, str]] = [
         (th.Tensor, "backward"),
         (th.nn.utils, "clip_grad_norm_"),

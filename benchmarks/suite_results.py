@@ -1,9 +1,9 @@
 """
-What teams learn on the suites' tasks, beside the suites' own baselines: ``results/suites.md``.
+Measure what teams learn on the suites' tasks, compared with the suites' own baselines: ``results/suites.md``.
 
 ``python -m benchmarks.suite_results`` trains what is missing (``sb3_saf.experiments run``, one folder for each task)
-and writes the table of that page from whatever is there; ended at any time, the same command goes on. All tasks have
-their first seed before one has its second. What programs of others reach is in ``results/suites_baselines.csv``.
+and writes the table of that page from the finished cells; after an interruption, the same command continues. All tasks
+get their first seed before any gets its second. Results of other programs are in ``results/suites_baselines.csv``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ METHODS: Final = ("saf", "mappo", "ippo")
 SEEDS: Final = (0, 1, 2)
 BASELINES: Final = Path("results", "suites_baselines.csv")
 PAGE: Final = Path("results", "suites.md")
-#: What stands before and after the table on the page.
+#: Text before and after the table on the page.
 _MARKS: Final = ("<!-- table -->", "<!-- end of table -->")
 _NOT_RUN: Final = "not run"
 
@@ -47,7 +47,7 @@ class Task(NamedTuple):
         return self.env_id.replace("/", "-")
 
 
-#: The most telling first.
+#: The most important ones first.
 TASKS: Final = (
     Task("smax/3m", 100_000),
     Task("lbf/Foraging-8x8-2p-3f-v3", 60_000),
@@ -61,14 +61,14 @@ TASKS: Final = (
 
 
 def run(task: Task, seed: int, options: argparse.Namespace) -> None:
-    """Train and test what is missing of a task and seed, one cell after the other."""
+    """Train and test the missing cells of a task and seed, one after the other."""
     words = ["run", task.name, "--env", task.env_id, "--size", "small", "--workers", "1", "--seeds", str(seed)]
     words += ["-n", str(task.game_steps), "--methods", *options.methods, "-f", str(options.folder / task.name)]
     experiments(words)
 
 
 def row(task: Task, folder: Path, methods: Sequence[str], baselines: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return the cells of a task's line; what is not there says so."""
+    """Return the cells of a task's row; missing ones say so."""
     beside = "; ".join(f"{one['value']} ({one['program']}, {one['game_steps']} game steps)" for one in baselines)
     try:
         tests = read_results(folder, task.name).tests
@@ -94,7 +94,7 @@ def _figures(tests: pd.DataFrame) -> str:
 
 
 def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterator[str]:
-    """Yield the lines of the table, and of what it is made from."""
+    """Yield the lines of the table and of its sources."""
     with BASELINES.open(encoding="utf-8", newline="") as file:
         known = list(csv.DictReader(file))
     head = ["task", "game steps", "random", *methods, f"processor s ({' / '.join(methods)})", "others"]

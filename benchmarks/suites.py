@@ -1,11 +1,11 @@
 """
-The batched suites at 64 games: rows as an algorithm gets them, beside the engine alone and beside game by game.
+Measure the batched suites at 64 games: as rows of teams, compared with the engine alone and with single games.
 
-``python -m benchmarks.suites`` prints one table; names of tasks choose among them. Random legal actions. *Engine alone*
-is the suite's own step of all games at once, new episodes included, and nothing is read from it; *rows* is our VecEnv,
-with last observations, masks and infos; *training chain* also joins teams and monitors, copies included; *game by game*
-is the suite's own step of one game, as wrappers of single games call it. Agent-steps per second of processor time, best
-of rounds in which all take turns: it can be compared where the machine is not quiet.
+``python -m benchmarks.suites`` prints one table; names of tasks select rows. Random legal actions. *Engine alone* is
+the suite's own step of all games at once, including new episodes, without reading results; *rows* is our VecEnv, with
+last observations, masks and infos; *training chain* adds joint observations and monitors, copies included; *game by
+game* is the suite's own step of one game, as called by wrappers of single games. Agent-steps per second of processor
+time, best of rounds in which all take turns, so that other load on the machine matters little.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ STEPS = 40
 
 class Contestant(NamedTuple):
     """
-    Something that steps.
+    One measured program.
 
     :param step: one step of all its games
-    :param rows: agent-steps that it makes
+    :param rows: agent-steps per step
     """
 
     step: Callable[[], object]
@@ -39,7 +39,7 @@ class Contestant(NamedTuple):
 
 
 def rows_of(env: Any) -> Contestant:
-    """Step a VecEnv, below or above the wrappers of training."""
+    """Step a VecEnv, with or without the wrappers of training."""
     shown: dict[str, Any] = env.reset()
     rng = np.random.default_rng(0)
 
@@ -57,7 +57,7 @@ def rows_of(env: Any) -> Contestant:
 
 
 def jax_engine(env: Any, n_games: int, actions: Any) -> Contestant:
-    """JaxMARL's own ``step``, which begins new episodes itself."""
+    """Step JaxMARL's own ``step``, which begins new episodes itself."""
     import jax
 
     def one(key: Any, state: Any, chosen: Any) -> Any:
@@ -79,7 +79,7 @@ def jax_engine(env: Any, n_games: int, actions: Any) -> Contestant:
 
 
 def vmas_engine(env: Any, n_games: int, actions: Any) -> Contestant:
-    """VMAS's own step, and its own ``reset_at`` for games that have ended."""
+    """Step VMAS's own step, with its ``reset_at`` for games that have ended."""
     import torch as th
 
     env.reset()
@@ -95,7 +95,7 @@ def vmas_engine(env: Any, n_games: int, actions: Any) -> Contestant:
 
 
 def contestants(env_id: str) -> dict[str, Contestant]:
-    """Engine alone, rows, training chain, game by game."""
+    """Create engine alone, rows, training chain, game by game."""
     one = find_task(env_id)
     assert one is not None and one.suite.vec_env is not None
     venv = one.suite.vec_env(one.task, N_GAMES, 0)
@@ -123,7 +123,7 @@ def _vmas(scenario: str, n_games: int, actions: Any) -> Contestant:
 
 
 def rates(env_id: str, rounds: int, steps: int) -> dict[str, float]:
-    """Agent-steps per second of processor time, the best of rounds in turns."""
+    """Measure agent-steps per second of processor time, the best of rounds in turns."""
     found = contestants(env_id)
     best = dict.fromkeys(found, 0.0)
     for contestant in found.values():

@@ -1,16 +1,15 @@
 """
-Speed of training: SAF with the paper's network beside a bare PyTorch loop of the same CNN.
+Measure training speed: SAF with the paper's network, compared with a plain PyTorch loop of the same CNN.
 ``python -m benchmarks.training``
 
 One round of the paper's settings on one core: a rollout (one step of every game at a time), then 10 epochs of one
-minibatch. SAF does everything that training does: games, joint view, knowledge source, pool, advantages, Adam. The
-bare loop knows pictures and nothing else: it encodes every row once in the rollout and once per epoch, sends a
-gradient back through the CNN, and steps Adam; in one piece, as one minibatch asks for, and in chunks of 640 rows, which
-fit the cache. Both are given the same number of rows. ``--peak`` prints instead how much memory one rollout and one
-epoch of the paper's 128 games take at most.
+minibatch. SAF runs everything: games, joint observation, knowledge source, pool, advantages, Adam. The plain loop only
+encodes every row once in the rollout and once per epoch, backpropagates through the CNN, and steps Adam; either in one
+minibatch, or in chunks of 640 rows, which fit the cache. Both get the same number of rows. ``--peak`` prints instead
+the peak memory of one rollout and one epoch of the paper's 128 games.
 
-SAF is measured on views of an untrained policy, of which many are equal, and on random views, which all differ.
-Processor time instead of wall-clock, so that other programs disturb little.
+SAF is measured on views of an untrained policy, many of which are equal, and on random views, which all differ.
+Processor time instead of wall-clock, so that other programs matter little.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ from sb3_saf import CentralizedValueWrapper, PaperCNN, TeamMonitor, TeamRolloutB
 N_STEPS: Final = 50
 N_EPOCHS: Final = 10
 CHUNK: Final = 640
-#: The released SAF, agent-steps per second and core (measured for the anchors of this project).
+#: The released SAF, agent-steps per second and core (a reference value of this project).
 RELEASED: Final = 169
 
 
 class RandomViews(VecEnvWrapper):
-    """Replaces every view by random tile codes: no two are alike."""
+    """Replaces every view by random tile codes, which all differ."""
 
     def __init__(self, venv: Any) -> None:
         super().__init__(venv)
@@ -50,17 +49,17 @@ class RandomViews(VecEnvWrapper):
         return self._rng.integers(0, self._n_codes, size=like.shape, dtype=like.dtype)
 
     def reset(self) -> VecEnvObs:
-        """Random views of the first step."""
+        """Return random views of the first step."""
         return self._draw(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
-        """The game's step with random views."""
+        """Step the game and return random views."""
         obs, rewards, dones, infos = self.venv.step_wait()
         return self._draw(obs), rewards, dones, infos
 
 
 def make_saf(n_games: int, random_views: bool, **kwargs: Any) -> PPO:
-    """SAF as in the paper, but for the number of games."""
+    """Create SAF as in the paper, except for the number of games."""
     venv: Any = make_vec_env("TeamSupport", n_games, seed=0, observation="tiles")
     env = CentralizedValueWrapper(TeamMonitor(RandomViews(venv) if random_views else venv))
     settings: dict[str, Any] = {"n_steps": N_STEPS, "batch_size": N_STEPS * env.num_envs, "n_epochs": N_EPOCHS}
@@ -76,7 +75,7 @@ def make_saf(n_games: int, random_views: bool, **kwargs: Any) -> PPO:
 
 
 def saf_work(model: PPO) -> Callable[[], int]:
-    """One rollout and one update."""
+    """Run one rollout and one update."""
     assert model.env is not None
     n_rows = model.n_steps * model.env.num_envs
 
@@ -88,7 +87,7 @@ def saf_work(model: PPO) -> Callable[[], int]:
 
 
 def bare_work(n_games: int, chunk: int | None) -> Callable[[], int]:
-    """The paper's CNN on random pictures, every row every time."""
+    """Encode random images with the paper's CNN, every row every time."""
     n_rows = N_STEPS * n_games * 10
     model = make_saf(1, random_views=False)
     assert model.env is not None
@@ -114,20 +113,20 @@ def bare_work(n_games: int, chunk: int | None) -> Callable[[], int]:
 
 
 def print_peak() -> None:
-    """Most memory of this process after a rollout and an epoch of the paper's size; epochs do not add up."""
+    """Print this process's peak memory after a rollout and an epoch of the paper's size; further epochs add nothing."""
     for name, random_views in (("untrained policy's views", False), ("all views differ", True)):
         saf_work(make_saf(128, random_views, n_epochs=1))()
         print(f"{name}: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GiB")
 
 
 def rate(work: Callable[[], int]) -> float:
-    """Agent-steps per second of processor time."""
+    """Return agent-steps per second of processor time."""
     start = time.process_time()
     return work() / (time.process_time() - start)
 
 
 def main() -> None:
-    """Let all programs take turns and print Markdown."""
+    """Measure all programs in turns and print Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--games", type=int, default=16, help="the paper has 128")
     parser.add_argument("--rounds", type=int, default=3)

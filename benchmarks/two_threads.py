@@ -1,9 +1,9 @@
 """
-Two threads beside two processes that play half of the games each and share nothing: what a second processor is worth.
+Compare two threads with two independent processes that play half of the games each.
 ``python -m benchmarks.two_threads``
 
-On rented machines it may be worth much less than the first, and that changes within seconds: other guests use the same
-cores. So rounds are short and many, and ratios are taken round by round.
+On virtual machines the second core may add much less than the first, and this changes within seconds, because other
+guests use the same cores. So there are many short rounds, and ratios are computed within a round.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ ROUNDS = 41
 
 class TwoProcesses:
     """
-    Two processes, ready to be measured at the same time.
+    Two processes that are measured at the same time.
 
-    :param make: what each of them makes and then repeats; must be picklable
+    :param make: creates the work that each process repeats; must be picklable
     """
 
     def __init__(self, make: Callable[[], Work]):
@@ -48,7 +48,7 @@ class TwoProcesses:
         """
         Work at the same time.
 
-        :param seconds: at least
+        :param seconds: minimum
         :return: agent-steps per second of both together
         """
         for end in self._ends:
@@ -77,7 +77,7 @@ def _serve(end: Connection, make: Callable[[], Work]) -> None:
 
 def threads_table(seconds: float = SECONDS, rounds: int = ROUNDS) -> str:
     """
-    Measure.
+    Measure two threads and two processes.
 
     :param seconds: per program and round
     :return: Markdown
@@ -102,7 +102,7 @@ def threads_table(seconds: float = SECONDS, rounds: int = ROUNDS) -> str:
 
 def times(row: Row, other: Row) -> str:
     """
-    How many times as fast one is as the other, round by round.
+    Compute the speed ratio of two programs, round by round.
 
     :return: median, and quartiles
     """
@@ -111,7 +111,7 @@ def times(row: Row, other: Row) -> str:
 
 
 def main() -> None:
-    """Measure, print."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=SECONDS, help="per program and round")
     parser.add_argument("--rounds", type=int, default=ROUNDS)

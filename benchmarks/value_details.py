@@ -1,19 +1,20 @@
 """
-Do value normalisation, the agent's identity and orthogonal initialisation help MAPPO?
+Measure whether value normalisation, the agent's identity and orthogonal initialisation help MAPPO.
 ``python -m benchmarks.value_details``
 
-All eight combinations of the three are trained with the same seeds, on three tasks: two probes (``tests/probe_envs``,
-noise 10, three agents), whose rewards are one for the team or one for each agent, and HECOGrid's TeamSupport (three
-agents, 8 x 8 cells, 8 treasures, coordination 2). Two scores of each run, both of the policy as it acts in training:
+All eight combinations of the three are trained with the same seeds on three tasks: two probes (``tests/probe_envs``,
+noise 10, three agents), one with a team reward and one with individual rewards, and HECOGrid's TeamSupport (three
+agents, 8 x 8 cells, 8 treasures, coordination 2). Each run has two scores of the policy as it acts in training:
 
-- *whole*: its mean over the whole training, which is larger the earlier it learns;
+- *whole*: its mean over the whole training, higher for faster learning;
 - *end*: its mean over the last quarter of the training.
 
-Probes: the exact probability that an agent chooses right (a coin: 0.5). TeamSupport: team return, treasures of 8.
+Probes: the exact probability that an agent chooses the right action (chance: 0.5). TeamSupport: team return, treasures
+of 8.
 
 The effect of a detail is the mean difference between the combinations with it and those without it, one number per
-seed; its 95 % interval is Student's over seeds. Where the interval contains 0, the experiment says nothing. Effects
-of identity and initialisation are given apart for runs with and without value normalisation.
+seed; its 95 % interval is Student's t over seeds. If the interval contains 0, the experiment shows no effect. Effects
+of identity and initialisation are computed separately for runs with and without value normalisation.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ Floats = npt.NDArray[np.float64]
 
 class Scores(NamedTuple):
     """
-    Of one run; see the module's docstring.
+    Scores of one run; see the module's docstring.
 
     :param whole: mean over the training
     :param end: mean over its last quarter
@@ -55,13 +56,13 @@ class Scores(NamedTuple):
 
     @classmethod
     def of(cls, curve: list[float]) -> Scores:
-        """From one number per rollout."""
+        """Compute the scores from one number per rollout."""
         return cls(float(np.mean(curve)), float(np.mean(curve[-max(1, len(curve) // 4) :])))
 
 
 class Curve(BaseCallback):
     """
-    One number per rollout.
+    Records one number per rollout.
 
     :param score: from the model
     """
@@ -80,7 +81,7 @@ class Curve(BaseCallback):
 
 
 def run_probe(probe: Probe, seed: int, n_updates: int, max_grad_norm: float, details: dict[str, bool]) -> Scores:
-    """One run on a probe."""
+    """Train once on a probe."""
     rows = 32 * 4 * N_AGENTS
     model = PPO(
         "MAPPOPolicy",
@@ -112,7 +113,7 @@ def run_probe(probe: Probe, seed: int, n_updates: int, max_grad_norm: float, det
 
 
 def run_team_support(seed: int, n_updates: int, details: dict[str, bool]) -> Scores:
-    """One run on HECOGrid: a rollout is one episode of each of 32 games."""
+    """Train once on HECOGrid: a rollout is one episode of each of 32 games."""
     rows = 32 * 50 * N_AGENTS
     model = PPO(
         "MAPPOPolicy",
@@ -128,21 +129,21 @@ def run_team_support(seed: int, n_updates: int, details: dict[str, bool]) -> Sco
         seed=seed,
         device="cpu",
     )
-    # Every row of a team is given 1/N of each treasure.
+    # Every row of a team gets 1/N of each treasure.
     callback = Curve(lambda model: float(model.rollout_buffer.rewards.sum() / 32))
     model.learn(rows * n_updates, callback=callback)
     return Scores.of(callback.curve)
 
 
 def interval(values: Floats) -> str:
-    """Mean and 95 % interval."""
+    """Return the mean and its 95 % interval."""
     low, high = confidence_interval(values)
     return f"{values.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
 def print_task(name: str, scores: Floats, combinations: list[dict[str, bool]]) -> None:
     """
-    Tables of one task.
+    Print the tables of one task.
 
     :param scores: (combinations, seeds, 2)
     """
@@ -164,7 +165,7 @@ def print_task(name: str, scores: Floats, combinations: list[dict[str, bool]]) -
 
 def print_effect(name: str, scores: Floats, is_on: npt.NDArray[np.bool_], among: npt.NDArray[np.bool_]) -> None:
     """
-    One row of the table of effects.
+    Print one row of the table of effects.
 
     :param scores: (combinations, seeds, 2)
     :param is_on: (combinations,) which of them have the detail

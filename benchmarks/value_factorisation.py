@@ -1,8 +1,8 @@
 """
-Does value factorisation learn TeamSupport? ``python -m benchmarks.value_factorisation --algorithm qplex``
+Measure whether value factorisation learns TeamSupport: ``python -m benchmarks.value_factorisation --algorithm qplex``.
 
-The small size of the experiments (5 agents, grid 15, 25 treasures), the light encoder; team returns over fresh games
-against a random team. Prints the training speed, too.
+The small size of the experiments (5 agents, grid 15, 25 treasures), the light encoder; team returns over new games,
+compared with a random team. Also prints the training speed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """
-Count what a reader has to follow: the files of this project whose functions one short training runs.
+List the files of this project whose functions one short training runs.
 
 ``python -m benchmarks.walk`` trains ``PPO("SAFPolicy", env)`` for two rollouts under ``sys.setprofile``. It prints
-every file of ``hecogrid_envs`` and ``sb3_saf`` in which a function ran, in the order of the first call, with its
-lines, then the lines of packages and tests. Compiled kernels do not show; their files count when Python calls them.
+every file of ``hecogrid_envs`` and ``sb3_saf`` in which a function ran, in the order of the first call, with its lines,
+then the lines of packages and tests. Calls inside compiled kernels are not seen; their files count when Python calls
+them.
 """
 
 from __future__ import annotations

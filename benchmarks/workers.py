@@ -1,9 +1,9 @@
 """
-Baselines in processes of their own.
+Run baselines in separate processes.
 
-One line of JSON asks a process for a rate, one line of JSON answers. So baselines may have other versions of NumPy and
-Gymnasium than this project, may bring down their process without losing the other rows, and keep to one core (JAX would
-take all). ``python -m benchmarks.workers NAME`` is the process.
+Requests and answers are one line of JSON each. So baselines may use other versions of NumPy and Gymnasium than this
+project, may crash without affecting other rows, and use only one core (JAX would use all). ``python -m
+benchmarks.workers NAME`` is the process.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from benchmarks.baselines import BASELINES
 from benchmarks.rates import one_line, rate
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Interpreters of baselines that do not go with this project's versions.
+#: Interpreters of baselines whose requirements conflict with this project's.
 INTERPRETERS = Path(sys.prefix) / "baselines"
 
 
 def interpreter(name: str) -> Path:
     """
-    What runs a baseline.
+    Return the interpreter of a baseline.
 
     :param name: key of ``BASELINES``
     """
@@ -43,7 +43,7 @@ def interpreter(name: str) -> Path:
 
 def is_installed(name: str) -> bool:
     """
-    Whether the baseline can be started.
+    Check whether the baseline can be started.
 
     :param name: key of ``BASELINES``
     """
@@ -55,11 +55,11 @@ def is_installed(name: str) -> bool:
 
 class Worker:
     """
-    A baseline that waits in its process to be measured.
+    A baseline in a separate process.
 
     :param name: key of ``BASELINES``
     :raises ImportError: if it is not installed
-    :raises RuntimeError: if its process ends before it is ready, with the last line that it wrote
+    :raises RuntimeError: if its process ends before it is ready, with the last line of its output
     """
 
     def __init__(self, name: str) -> None:
@@ -75,7 +75,7 @@ class Worker:
                 stdout=subprocess.PIPE,
                 stderr=stderr,
                 text=True,
-                # PufferLib leaves a link in the current folder, so that is not the repository.
+                # PufferLib creates a link in the current folder, so that must not be the repository.
                 cwd=self._folder.name,
                 env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
             )
@@ -87,11 +87,11 @@ class Worker:
 
     def measure(self, seconds: float) -> dict[str, Any]:
         """
-        Let it work.
+        Measure its rate.
 
-        :param seconds: at least
+        :param seconds: minimum
         :return: ``rate`` in agent-steps/s, ``shape`` and ``checksum`` of the observations of the last step
-        :raises RuntimeError: if its process has ended, with the last line that it wrote
+        :raises RuntimeError: if its process has ended, with the last line of its output
         """
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
@@ -134,12 +134,12 @@ class Worker:
 
 def serve(name: str) -> None:
     """
-    Make a baseline and answer requests until there are no more.
+    Create a baseline and answer requests until there are no more.
 
     :param name: key of ``BASELINES``
     """
     answers = os.fdopen(os.dup(1), "w")
-    # What libraries print must not come between the answers.
+    # Output of libraries must not mix with the answers.
     os.dup2(2, 1)
     keep_to_one_core()
     baseline = BASELINES[name]
@@ -157,13 +157,13 @@ def serve(name: str) -> None:
 
 
 def keep_to_one_core() -> None:
-    """Where the system can do that; asked of it before libraries start their threads."""
+    """Use one core only, if the system supports it; call this before libraries start their threads."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def installed_version(distribution: str) -> str:
-    """Of what is built by hand, the version that it was built from is not known here."""
+    """Return the installed version; unknown for packages built by hand."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -171,7 +171,7 @@ def installed_version(distribution: str) -> str:
 
 
 def main() -> None:
-    """Serve; an error is told in one line, the last on stderr."""
+    """Serve; on an error, print one line to stderr."""
     try:
         serve(sys.argv[1])
     except Exception as error:

@@ -1,1 +1,1 @@
-"""Programs that show how to train on environments of others."""
+"""Examples of training on third-party environments."""

@@ -3,7 +3,7 @@ Train a team on a PettingZoo environment and compare it with a random one.
 
     python examples/train_pettingzoo.py --env simple_spread --algo SAF --game-steps 300000
 
-The environments and what is asked of each are in ``ENVIRONMENTS`` below; the results are in README.md beside this file.
+The environments and their settings are in ``ENVIRONMENTS`` below; the results are in README.md beside this file.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from sb3_saf import RandomPolicy, TeamRolloutBuffer, TurnsInParallel, evaluate_t
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.evaluation import EvaluationResult
 
-#: Evaluation games are seeded apart from training's.
+#: Evaluation games have other seeds than training games.
 EVALUATION_SEED = 10_000
 
 
 def hanabi(**params: Any) -> ParallelEnv[Any, Any, Any]:
-    """Hanabi, whose players take turns, in parallel form."""
+    """Create Hanabi, whose players take turns, in parallel form."""
     from pettingzoo.classic import hanabi_v5
 
     return TurnsInParallel(hanabi_v5.env(**params))
 
 
 def padded(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
-    """An environment whose agents differ in their spaces, which SuperSuit makes equal."""
+    """Create an environment whose agents have different spaces, padded by SuperSuit."""
     import supersuit
 
     env = supersuit.pad_observations_v0(import_module(module).parallel_env(**params))
@@ -45,19 +45,19 @@ def padded(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
 
 
 def module_env(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
-    """An environment that is a module with ``parallel_env``."""
+    """Create an environment from a module with ``parallel_env``."""
     return import_module(module).parallel_env(**params)
 
 
 class Example(NamedTuple):
     """
-    An environment and what is asked of it.
+    An environment and its settings.
 
     :param make: its factory
     :param params: the factory's arguments
     :param n_games: games played at once
     :param n_steps: game steps per rollout
-    :param ppo: what differs from :data:`PPO_SETTINGS`
+    :param ppo: differences from :data:`PPO_SETTINGS`
     """
 
     make: Callable[..., ParallelEnv[Any, Any, Any]]
@@ -78,7 +78,7 @@ PPO_SETTINGS: dict[str, Any] = {
 WALKERS = {"terminate_on_fall": False, "remove_on_fall": True, "shared_reward": False, "max_cycles": 200}
 SPREAD = {"learning_rate": 1e-3, "n_epochs": 10, "gamma": 0.9, "ent_coef": 0.003}
 ENVIRONMENTS: dict[str, Example] = {
-    # Rewards follow moves within a few steps; with gamma=0.99 nothing is learned in this many.
+    # Rewards follow moves within a few steps; with gamma=0.99 nothing is learned in so few steps.
     "simple_spread": Example(partial(module_env, "mpe2.simple_spread_v3"), n_steps=50, ppo=SPREAD),
     "simple_spread_continuous": Example(
         partial(module_env, "mpe2.simple_spread_v3"),
@@ -86,10 +86,10 @@ ENVIRONMENTS: dict[str, Example] = {
         n_steps=50,
         ppo={**SPREAD, "ent_coef": 0.0},
     ),
-    # A speaker that cannot move and a listener that cannot speak: unequal spaces, padded.
+    # A speaker that cannot move and a listener that cannot speak have different spaces, which are padded.
     "speaker_listener": Example(partial(padded, "mpe2.simple_speaker_listener_v4"), n_steps=50),
     "pursuit": Example(partial(module_env, "pettingzoo.sisl.pursuit_v5"), {"max_cycles": 200}, n_games=8),
-    # Walkers that fall are out of the game, the others go on.
+    # Walkers that fall are removed, the others continue.
     "multiwalker": Example(
         partial(module_env, "pettingzoo.sisl.multiwalker_v9"), WALKERS, n_games=8, ppo={"ent_coef": 0.0}
     ),
@@ -123,7 +123,7 @@ def make_env(options: argparse.Namespace, n_games: int, seed: int) -> Centralize
 
 
 def train(options: argparse.Namespace) -> PPO:
-    """Train with normalised rewards; evaluations count the environment's own."""
+    """Train with normalised rewards; evaluations count the environment's own rewards."""
     example = ENVIRONMENTS[options.env]
     env = make_env(options, example.n_games, options.seed)
     settings = {"batch_size": example.n_games * example.n_steps * env.n_agents // 4, **PPO_SETTINGS, **example.ppo}
@@ -145,7 +145,7 @@ def train(options: argparse.Namespace) -> PPO:
 
 
 def evaluate(options: argparse.Namespace, model: Any) -> EvaluationResult:
-    """Team returns of games that were not trained on, the same for every model."""
+    """Return the team returns of new games, the same for every model."""
     env = make_env(options, min(options.episodes, 20), EVALUATION_SEED + options.seed)
     result = evaluate_team(model, env, options.episodes, deterministic=False)
     env.close()

@@ -1,1 +1,1 @@
-"""Tutorials that run from top to bottom, and what runs them."""
+"""Tutorial notebooks, and the program that runs them."""

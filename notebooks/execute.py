@@ -1,9 +1,9 @@
 """
-Run the notebooks from top to bottom, each in a kernel of its own: ``python -m notebooks.execute``.
+Run the notebooks from top to bottom, each in its own kernel: ``python -m notebooks.execute``.
 
-By default with small numbers, to see that everything works (``make notebooks``, part of CI); nothing is written.
-``--full`` takes the numbers that the notebooks have, ``--save`` keeps what came out in the files. An exception or
-anything written to stderr, such as a warning, is an error.
+By default with small numbers, as a test (``make notebooks``, part of CI), without writing anything. ``--full`` uses the
+notebooks' own numbers, ``--save`` stores the outputs in the files. An exception or anything written to stderr, such as
+a warning, is an error.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from nbformat import NotebookNode
 import hecogrid_envs
 
 FOLDER: Final = Path(__file__).resolve().parent
-#: Tag of the one cell whose numbers can be replaced, as papermill and others have it.
+#: Tag of the parameters cell, as in papermill.
 PARAMETERS: Final = "parameters"
-#: Numbers for CI, in the place of those in the parameters cell.
+#: Small numbers for CI, which replace those in the parameters cell.
 QUICK: Final[dict[str, dict[str, object]]] = {
     "1_worlds.ipynb": {"n_games": 8},
     "2_train_and_compare.ipynb": {"game_steps": 800, "seeds": [0, 1], "n_games": 8},
@@ -40,7 +40,7 @@ TIMEOUT: Final = 3600
 
 
 class NotebookError(Exception):
-    """What went wrong in a notebook."""
+    """An error in a notebook."""
 
 
 def source_files() -> list[Path]:
@@ -63,7 +63,7 @@ def execute(path: Path, parameters: Mapping[str, object]) -> NotebookNode:
             notebook,
             timeout=TIMEOUT,
             kernel_name="python3",
-            extra_arguments=["--log-level=ERROR"],  # not that its sockets are not encrypted
+            extra_arguments=["--log-level=ERROR"],  # do not warn that its sockets are not encrypted
             resources={"metadata": {"path": folder}},
         )
         try:
@@ -79,7 +79,7 @@ def execute(path: Path, parameters: Mapping[str, object]) -> NotebookNode:
 
 def with_parameters(notebook: NotebookNode, parameters: Mapping[str, object]) -> NotebookNode:
     """
-    Put a cell with other numbers behind the parameters cell.
+    Insert a cell with other numbers after the parameters cell.
 
     :raises NotebookError: if there is no parameters cell
     """
@@ -94,19 +94,19 @@ def with_parameters(notebook: NotebookNode, parameters: Mapping[str, object]) ->
 
 
 def code_cells(notebook: NotebookNode) -> list[NotebookNode]:
-    """Cells that run."""
+    """Return the code cells."""
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
 def complaints(cell: NotebookNode) -> Iterator[str]:
-    """What a cell has written to stderr."""
+    """Yield what a cell wrote to stderr."""
     for output in cell.outputs:
         if output.output_type == "stream" and output.name == "stderr":
             yield output.text
 
 
 def tidied(notebook: NotebookNode) -> NotebookNode:
-    """The notebook without what differs from machine to machine, and without a second picture format."""
+    """Return the notebook without machine-dependent parts and without a second image format."""
     notebook.metadata = nbformat.from_dict(
         {
             "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
@@ -129,7 +129,7 @@ def run(path: Path, full: bool, save: bool) -> str:
     """
     Run one notebook.
 
-    :return: what to say about it
+    :return: a message about the result
     :raises NotebookError: if it fails
     """
     began = time.perf_counter()
@@ -141,7 +141,7 @@ def run(path: Path, full: bool, save: bool) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
-    Run notebooks and say how long each took.
+    Run notebooks and print how long each took.
 
     :return: 1 if one failed
     """
@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not paths:
         parser.error(f"no notebook begins with {' or '.join(names)}")
 
-    hecogrid_envs.GameBatch("TeamSupport", hecogrid_envs.HECOGridParams())  # on a new machine, says that it compiles
+    hecogrid_envs.GameBatch("TeamSupport", hecogrid_envs.HECOGridParams())  # on a new machine, prints that it compiles
 
     def tried(path: Path) -> str | NotebookError:
         try:
