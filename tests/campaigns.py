@@ -1,10 +1,10 @@
 """
-Try to break what docs/trust.md promises, one campaign after another, and print a table::
+Test the guarantees of docs/trust.md, one campaign after another, and print a table::
 
     python -m tests.campaigns --minutes 15 --write docs/trust.md
 
-Each campaign is a command of its own, which ``--list`` prints; how much it tries grows with ``--minutes``, of one
-quiet core. What is not installed is named and left out. Ends with 1 if a promise broke.
+Each campaign is a command, which ``--list`` prints; its number of repetitions scales with ``--minutes`` on one idle
+core. Campaigns whose packages are missing are named and left out. The exit code is 1 if a guarantee failed.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ BEGIN, END = "<!-- campaigns: begin -->", "<!-- campaigns: end -->"
 
 class Campaign(NamedTuple):
     """
-    Something that is tried many times.
+    A test that is repeated many times.
 
     :param name: in the table, after the number
     :param arguments: of Python; ``{n}`` is the number
-    :param number: how often, in 15 minutes for all campaigns together
-    :param variables: of the environment, the same way
-    :param least: as few as that
+    :param number: repetitions in 15 minutes for all campaigns together
+    :param variables: environment variables, the same way
+    :param least: minimum number of repetitions
     :param needs: packages
     """
 
@@ -47,15 +47,15 @@ class Campaign(NamedTuple):
     needs: tuple[str, ...] = ()
 
     def times(self, minutes: float) -> int:
-        """Return how often in a number of minutes."""
+        """Return the repetitions in a number of minutes."""
         return max(self.least, round(self.number * minutes / 15))
 
     def missing(self) -> list[str]:
-        """Return the packages that are not there."""
+        """Return the missing packages."""
         return [name for name in self.needs if importlib.util.find_spec(name) is None]
 
     def line(self, minutes: float) -> str:
-        """Return the command as a shell takes it."""
+        """Return the shell command."""
         n = self.times(minutes)
         return f"{self.variables.format(n=n)} python {self.arguments.format(n=n)}".strip()
 
@@ -98,7 +98,7 @@ CAMPAIGNS: Final = (
         "odd configurations under NUMBA_BOUNDSCHECK",
         f"{PYTEST} tests/test_invariants.py",
         1_500,
-        # Kernels without the check, which are kept on the disk, are not to be taken.
+        # Do not use kernels without the check from the disk cache.
         f"NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR={tempfile.gettempdir()}/sb3_saf_bounds EXAMPLES={{n}}",
     ),
     Campaign("run of the faults of games, 1 and 2 processes", f"{PYTEST} tests/test_misbehaving_games.py", 1, least=1),
@@ -108,12 +108,12 @@ CAMPAIGNS: Final = (
 
 class Outcome(NamedTuple):
     """
-    What came of a campaign.
+    The result of a campaign.
 
-    :param tried: how often
-    :param found: the words for the table
-    :param held: whether the promise did
-    :param seconds: of the processor
+    :param tried: repetitions
+    :param found: the text for the table
+    :param held: whether the guarantee held
+    :param seconds: of processor time
     """
 
     tried: str
@@ -123,7 +123,7 @@ class Outcome(NamedTuple):
 
 
 def carry_out(campaign: Campaign, minutes: float) -> Outcome:
-    """Run a campaign; what it says is printed if it breaks."""
+    """Run a campaign; print its output if it fails."""
     if missing := campaign.missing():
         return Outcome("0", f"not tried: no {', '.join(missing)}", True, 0.0)
     n = campaign.times(minutes)
@@ -146,7 +146,7 @@ def carry_out(campaign: Campaign, minutes: float) -> Outcome:
 
 
 def _in_short(text: str, status: int) -> str:
-    """Return how many kills ended equal, or how many tests passed."""
+    """Return how many killed runs ended equal, or how many tests passed."""
     kills = re.findall(r"(\d+) of (\d+) end bit-equal", text)
     if kills:
         equal, of = (sum(map(int, column)) for column in zip(*kills, strict=True))
@@ -156,7 +156,7 @@ def _in_short(text: str, status: int) -> str:
 
 
 def commit() -> str:
-    """Return the commit that is tried, and whether files were changed since."""
+    """Return the tested commit, and whether files were changed since."""
 
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
@@ -181,7 +181,7 @@ def table(found: dict[str, Outcome], minutes: float) -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """Put the table between its marks in a page."""
+    """Write the table between its marks in a page."""
     before, found, rest = path.read_text(encoding="utf-8").partition(BEGIN)
     _, ended, after = rest.partition(END)
     if not found or not ended:
@@ -190,7 +190,7 @@ def write(path: Path, text: str) -> None:
 
 
 def main() -> None:
-    """Carry out the campaigns."""
+    """Run the campaigns."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--minutes", type=float, default=15, help="of one quiet core, for all of them")
     parser.add_argument("--only", default="", metavar="WORD", help="those with this word in their name")

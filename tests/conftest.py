@@ -1,4 +1,4 @@
-"""What every test starts from: one thread, no window, the same random numbers."""
+"""Setup of every test: one thread, no window, the same random numbers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-# Read by the libraries when they are imported, so set before any test module imports them (and torch is not
-# imported for tests of the game alone). One thread each: the networks are small, the tests run in several processes,
-# and sums come out in the same order everywhere.
+# Libraries read these at import, so they are set before any test module imports them (torch is not imported for tests
+# of the game alone). One thread each: the networks are small, the tests run in several processes, and sums have the
+# same order everywhere.
 for variable, value in {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -21,7 +21,7 @@ for variable, value in {
     "PYGAME_HIDE_SUPPORT_PROMPT": "1",
     "SDL_AUDIODRIVER": "dummy",
     "SDL_VIDEODRIVER": "dummy",
-    # Where the key is kept that signs games in checkpoints.
+    # Folder of the key that signs games in checkpoints.
     "XDG_STATE_HOME": os.path.join(tempfile.gettempdir(), "sb3_saf_tests"),
 }.items():
     os.environ.setdefault(variable, value)

@@ -72,10 +72,10 @@ class MaskedTeams(ToyTeams):
 
 class CueTeams(ToyTeams):
     """
-    Each agent sees a cue of -1 or 1 at the first of three steps, then only how late it is. The last step pays.
+    Each agent sees a cue of -1 or 1 at the first of three steps, then only the time. Only the last step is rewarded.
 
-    :param pays: ``"own"`` pays 1 for the action that names the own cue (0 for -1, 1 for 1), else 0; ``"mate"`` pays
-        the next agent's cue, whatever the action
+    :param pays: ``"own"``: 1 for the action that matches the own cue (0 for -1, 1 for 1), else 0; ``"mate"``: the next
+        agent's cue, regardless of the action
     :param n_agents: N
     :param n_games: E
     """

@@ -1,4 +1,4 @@
-"""What the tests of the experiments share: engines without the package's own workers, readers of tables."""
+"""Helpers for the tests of experiments: engines without the package's own workers, readers of tables."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ WORKER = (sys.executable, str(Path(__file__).parent / "experiments_worker.py"))
 
 class InlineEngine(Engine):
     """
-    Jobs in this process, where everything is imported already; keeps what it was asked.
+    Runs jobs in this process, where everything is imported already; records the requests.
 
-    :param work: in the place of training and testing
+    :param work: replaces training and testing
     """
 
     def __init__(self, work: Callable[[Path], None] = run_job) -> None:
@@ -58,13 +58,13 @@ def order(folder: Path, name: str, words: str) -> Path:
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Return a table's rows without the columns that tell times."""
+    """Return a table's rows without the columns of times."""
     with path.open(encoding="utf-8", newline="") as file:
         return [{key: row[key] for key in row if key not in TIME_COLUMNS} for row in csv.DictReader(file)]
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process lives; one that nobody has waited for yet does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
     except FileNotFoundError:
@@ -73,7 +73,7 @@ def is_running(pid: int) -> bool:
 
 
 def wait_until(condition: Callable[[], Any], seconds: float = 120) -> None:
-    """Wait for something that other processes do."""
+    """Wait for a condition that other processes fulfil."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it never happened"

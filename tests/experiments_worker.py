@@ -1,4 +1,4 @@
-"""A worker of the tests: does what ``order.txt`` in its folder says, without importing anything of ours."""
+"""A worker for tests: follows ``order.txt`` in its folder, without importing this project."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def save(*_: object) -> None:
 
 
 def note_control_c(*_: object) -> None:
-    """Remember what was not meant for a worker."""
+    """Record a Ctrl-C, which should not reach a worker."""
     (folder / "interrupted").touch()
 
 

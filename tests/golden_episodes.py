@@ -1,8 +1,8 @@
 """
-Golden episodes: digests of whole episodes, so that a seed keeps its meaning from version to version.
+Golden episodes: digests of whole episodes, so that seeded games stay the same from version to version.
 
-``python -m tests.golden_episodes`` writes them anew; do so only for a change that is meant to change games, and say so
-in the CHANGELOG.
+``python -m tests.golden_episodes`` rewrites them; do so only for intended changes of games, and mention these in the
+CHANGELOG.
 """
 
 from __future__ import annotations

@@ -1,18 +1,18 @@
 """
-Kill training runs with SIGKILL, resume them, and compare what they end with, bit for bit, with undisturbed runs::
+Kill training runs with SIGKILL, resume them, and compare the results bit for bit with uninterrupted runs::
 
     python -m tests.kill_harness --algo saf --kills 20
 
-Kills go round these kinds, each at a moment drawn anew:
+Kills cycle through these kinds, each at a random moment:
 
 =========== ==================================================================================================
 rollout     after a step of the games, before SB3 has stored it
 update      after a step of the optimiser, in the middle of an update
-writing     around the syncing and renaming of a checkpoint, half of its file on the disk included
-clock       at any moment of the run's time; what the run was doing then is told
+writing     around the syncing and renaming of a checkpoint, including a half-written file
+clock       at any moment of the run's time; the run's phase at that moment is reported
 =========== ==================================================================================================
 
-All but the last are counted inside the run, so the same seed kills at the same moments on every machine.
+All kinds but the last are counted inside the run, so the same seed kills at the same moments on every machine.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from sb3_saf.checkpoints.callback import TeamCheckpointCallback
 from sb3_saf.checkpoints.store import CheckpointFolder
 from tests.killed_runs import ALGOS, GAMES, ROLLOUT, Games, Run, make_run
 
-#: What is counted in a run.
+#: Events that are counted in a run.
 KINDS: Final = ("rollout", "update", "writing")
 CLOCK: Final = "clock"
-#: What a run may be doing, by the number that it leaves in shared memory.
+#: Phases of a run, by the number that it writes to shared memory.
 PHASES: Final = ("between", "rollout", "update", "writing", "evaluation")
 
 
 class Moment(NamedTuple):
     """
-    When to kill.
+    The moment of a kill.
 
     :param kind: one of KINDS, or CLOCK
-    :param when: the how-manieth event of its kind since the process began, or seconds
+    :param when: number of events of this kind since the process started, or seconds
     """
 
     kind: str
@@ -65,9 +65,9 @@ class Moment(NamedTuple):
 
 class Watch:
     """
-    What a run tells about itself in shared memory, which outlives it; and where it kills itself.
+    The state of a run in shared memory, which outlives it; also kills the run.
 
-    :param moment: when; None to let it live
+    :param moment: of the kill; None for none
     """
 
     def __init__(self, moment: Moment | None = None) -> None:
@@ -82,14 +82,14 @@ class Watch:
 
     @property
     def phase(self) -> str:
-        """What the run was doing last."""
+        """The last phase of the run."""
         return PHASES[self._phase.value]
 
     def event(self, kind: str, last_words: Callable[[], object] | None = None) -> None:
         """
-        Count an event; if its time has come, it is the last one.
+        Count an event; kill the process if the moment has come.
 
-        :param last_words: called just before the end
+        :param last_words: called just before the kill
         """
         self._counts[KINDS.index(kind)] += 1
         if self.moment == (kind, self.counts[kind]):
@@ -98,7 +98,7 @@ class Watch:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def during(self, phase: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, which says what it does."""
+        """Wrap a function that is one phase."""
 
         def watched(*args: Any, **kwargs: Any) -> Any:
             before, self._phase.value = self._phase.value, PHASES.index(phase)
@@ -151,7 +151,7 @@ class Watch:
 
 
 def _halve(file: int) -> None:
-    """What a power cut may leave of a temporary file that was not synced."""
+    """Truncate a temporary file, as a power cut may do before it is synced."""
     if Path(os.readlink(f"/proc/self/fd/{file}")).name.startswith(".writing-"):
         os.ftruncate(file, os.fstat(file).st_size // 2)
 
@@ -160,7 +160,7 @@ def _halve(file: int) -> None:
 
 
 def train(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) -> None:
-    """The run: started again in the same folder, it goes on."""
+    """Train; started again in the same folder, it resumes."""
     th.set_num_threads(1)
     run = make_run(algo, folder, games)
     with watch.on(run):
@@ -171,7 +171,7 @@ def train(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) ->
 
 
 def start(algo: str, games: Games, folder: Path, rollouts: int, watch: Watch) -> BaseProcess:
-    """Start the run in a process of its own, which has all imports already where it is forked."""
+    """Start the run in a separate process; if forked, it has all imports already."""
     context = mp.get_context(games.start_method)
     process = context.Process(target=train, args=(algo, games, folder, rollouts, watch))  # type: ignore[attr-defined]
     process.start()
@@ -196,7 +196,7 @@ def kill(algo: str, games: Games, folder: Path, rollouts: int, moment: Moment) -
     """
     Start the run and kill it.
 
-    :return: what it was doing; None if it was done before its moment came
+    :return: its phase; None if it finished before the moment
     """
     watch = Watch(None if moment.kind == CLOCK else moment)
     process = start(algo, games, folder, rollouts, watch)
@@ -208,7 +208,7 @@ def kill(algo: str, games: Games, folder: Path, rollouts: int, moment: Moment) -
 
 
 def same(one: Path, other: Path) -> bool:
-    """Whether finished runs are equal: weights and replay bit for bit, evaluations, and episodes but for their time."""
+    """Whether finished runs are equal: weights and replay buffer bit for bit, evaluations, episodes except times."""
     return all(_same_arrays(one / name, other / name) for name in ("weights.npz", "evaluations.npz")) and (
         _episodes(one) == _episodes(other) != []
     )
@@ -231,7 +231,7 @@ def kill_in_a_row(algo: str, games: Games, rollouts: int, moments: Sequence[Mome
     """
     Kill one run several times, then let it finish.
 
-    :return: what it was doing at each kill, and whether it ended as the undisturbed run
+    :return: the phase at each kill, and whether the result equals the uninterrupted run's
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -243,9 +243,9 @@ def kill_in_a_row(algo: str, games: Games, rollouts: int, moments: Sequence[Mome
 
 def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: int) -> tuple[Counter[str], Counter[str]]:
     """
-    Kill as many runs, each once, at drawn moments; resume and compare each.
+    Kill several runs, each once, at random moments; resume and compare each.
 
-    :return: kills, and those that ended bit-equal, by their kind
+    :return: numbers of kills and of bit-equal results, by kind
     """
     rng = random.Random(seed)
     done, equal = Counter[str](), Counter[str]()
@@ -276,7 +276,7 @@ def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: in
 
 
 def main() -> None:
-    """Run the harness, or one run alone."""
+    """Run the harness, or a single run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
     parser.add_argument("--algo", choices=ALGOS, default="saf")
     parser.add_argument("--game", choices=GAMES, default="hecogrid")
@@ -292,7 +292,7 @@ def main() -> None:
         train(options.algo, games, options.train, options.rollouts, Watch())
         return
     if games.start_method == "fork":
-        make_run(options.algo, None, games).warm_up()  # they inherit what is compiled
+        make_run(options.algo, None, games).warm_up()  # they inherit compiled code
     if options.at:
         moments = [Moment(kind, int(number)) for kind, number in (text.split(":") for text in options.at)]
         doing, is_equal = kill_in_a_row(options.algo, games, options.rollouts, moments)

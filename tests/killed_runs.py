@@ -1,4 +1,4 @@
-"""The runs that the kill harness kills: small, with everything in them that a resumed run could lose."""
+"""The runs that the kill harness kills: small, with all kinds of state that a resumed run could lose."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Run(NamedTuple):
     every: int
 
     def warm_up(self) -> None:
-        """Compile what is compiled at its first use."""
+        """Compile everything that is compiled on first use."""
         self.model.learn(2 * ROLLOUT)
         self.close()
 
@@ -52,7 +52,7 @@ class Run(NamedTuple):
         self.evaluation.eval_env.close()
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """All that was learned, and what a replay buffer holds."""
+        """All that was learned, and the content of a replay buffer."""
         found = {name: tensor.numpy() for name, tensor in self.model.policy.state_dict().items()}
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None:
@@ -63,10 +63,10 @@ class Run(NamedTuple):
 
 class Games(NamedTuple):
     """
-    What is played.
+    The games of a run.
 
     :param name: one of GAMES
-    :param n_cpus: worker processes of games of others
+    :param n_cpus: worker processes of third-party games
     """
 
     name: str = "hecogrid"
@@ -78,7 +78,7 @@ class Games(NamedTuple):
         return "spawn" if self.name == "jax" else "fork"
 
     def make(self, n_games: int, seed: int, monitor_dir: str | None = None) -> sb3_saf.CentralizedValueWrapper:
-        """Make parallel games."""
+        """Create parallel games."""
         if self.name == "hecogrid":
             return sb3_saf.make_team_env("TeamTogether", n_games, seed=seed, monitor_dir=monitor_dir, **_TASK)
         make, n_cpus = GAMES[self.name], self.n_cpus
@@ -101,7 +101,8 @@ def _lazy() -> Any:
     return LazyEnv(n_agents=N_AGENTS, max_cycles=20)
 
 
-#: Games of N_AGENTS agents: this package's; MPE's and SISL's; one that makes its generator late; JaxMARL's, in a batch.
+#: Games of N_AGENTS agents: this package's; MPE's and SISL's; one that creates its generator late; JaxMARL's, in a
+#: batch.
 GAMES: Final[dict[str, Any]] = {
     "hecogrid": None,
     "spread": _spread,
@@ -113,11 +114,11 @@ GAMES: Final[dict[str, Any]] = {
 
 def make_run(algo: str, folder: Path | None, games: Games = Games()) -> Run:  # noqa: B008 - it is a tuple
     """
-    Make a run as a user's script makes it at every start.
+    Create a run as a user's script does at every start.
 
     :param algo: one of ALGOS
     :param folder: for monitor.csv, TensorBoard and evaluations; None for none
-    :param games: what is played
+    :param games: of the run
     """
     where = None if folder is None else str(folder)
     env = games.make(N_GAMES, 0, where)
@@ -146,7 +147,7 @@ def _saf(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None, networks
 
 
 def _qplex(env: sb3_saf.CentralizedValueWrapper, tensorboard: str | None, networks: dict[str, Any]) -> sb3_saf.QPLEX:
-    """Its replay buffer is full after a third of the run; targets, exploration and learning rate change all along."""
+    """QPLEX with a replay buffer that is full after a third of the run, and changing targets and schedules."""
     return sb3_saf.QPLEX(
         "QPLEXPoolPolicy",
         env,

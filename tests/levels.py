@@ -32,9 +32,9 @@ def level(text: str, agents: Sequence[tuple[int, int, int, bool]] = (), carrying
     Read a level.
 
     :param text: W lines of W characters; blank lines around it and spaces before and after each line are ignored
-    :param agents: further agents as (x, y, direction, has key), numbered after those drawn: the way to put agents onto
-        treasures and into cells that they share
-    :param carrying: numbers of agents that carry a key although they are drawn without
+    :param agents: further agents as (x, y, direction, has key), numbered after those drawn; use it for agents on
+        treasures and in shared cells
+    :param carrying: numbers of drawn agents that carry a key
     :return: the state mapping
     """
     lines = [line.strip() for line in text.strip().splitlines()]
@@ -65,7 +65,7 @@ def level(text: str, agents: Sequence[tuple[int, int, int, bool]] = (), carrying
 
 def params_for(state: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
     """
-    Parameters of a world that such a state fits into.
+    Parameters of a world that the state fits into.
 
     :return: n_agents, grid_size, and as many treasures and keys as the state has on the map; no clutter
     """

@@ -1,8 +1,8 @@
 """
-One agent in a process of its own: ``python lone_agent.py FOLDER RUNTIME AGENT``.
+One agent in a separate process: ``python lone_agent.py FOLDER RUNTIME AGENT``.
 
-Reads own observations from standard input, with masks of actions and starts of episodes where there are any, answers
-with actions and probabilities. What training needs cannot be imported here, as if it were not installed.
+Reads own observations from standard input, with action masks and starts of episodes if there are any, and answers
+with actions and probabilities. Packages for training cannot be imported here, as if they were not installed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TRAINING = {"stable_baselines3", "sb3_contrib", "gymnasium", "pettingzoo", "supe
 
 
 class Absent(importlib.abc.MetaPathFinder):
-    """Finds that some packages are not there."""
+    """Hides some packages from imports."""
 
     def __init__(self, names: set[str]):
         self.names = names

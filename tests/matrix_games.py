@@ -1,4 +1,4 @@
-"""Matrix games of two agents, for value factorisation: every value of every joint action is known."""
+"""Matrix games of two agents for value factorisation: the value of every joint action is known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 
 Floats = npt.NDArray[np.float64]
 
-#: QPLEX's and QTRAN's example: only the joint action (0, 0) is worth anything.
+#: QPLEX's and QTRAN's example: only the joint action (0, 0) has a positive payoff.
 ONE_STEP: Final = np.array([[8.0, -12.0, -12.0], [-12.0, 0.0, 0.0], [-12.0, 0.0, 0.0]])
 #: The climbing game of Claus and Boutilier (1998).
 CLIMBING: Final = np.array([[11.0, -30.0, 0.0], [-30.0, 7.0, 6.0], [0.0, 0.0, 5.0]])
@@ -35,24 +35,24 @@ class MatrixGame(ParallelEnv[str, Any, Any]):
         self._action_space = spaces.Discrete(len(payoffs))
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The same for both."""
+        """Return the same space for both."""
         return self._observation_space
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The same for both."""
+        """Return the same space for both."""
         return self._action_space
 
     def observe(self) -> dict[str, Any]:
-        """Each agent sees which one it is."""
+        """Each agent observes its own index."""
         return {agent: np.eye(2, dtype=np.float32)[i] for i, agent in enumerate(self.possible_agents)}
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Nothing is random."""
+        """Reset; nothing is random."""
         self.agents = self.possible_agents[:]
         return self.observe(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """Pay, and end."""
+        """Reward the team, and end the episode."""
         payoff = float(self.payoffs[int(actions["row"]), int(actions["column"])])
         agents, self.agents = self.agents, []
         ends = dict.fromkeys(agents, True)
@@ -67,12 +67,11 @@ class MatrixGame(ParallelEnv[str, Any, Any]):
 
 class TwoStates(MatrixGame):
     """
-    Two states (Wang et al. 2021, arXiv 2006.00587): in state 1 the joint action (0, 0) pays 1 and stays, (0, 1) and
-    (1, 0) stay, (1, 1) leads to state 0, where nothing pays and nothing changes. The time limit is no end: the value of
-    state 1 is 1 / (1 - gamma).
+    Two states (Wang et al. 2021, arXiv 2006.00587): in state 1 the joint action (0, 0) is rewarded with 1 and stays,
+    (0, 1) and (1, 0) stay, (1, 1) leads to state 0, which has no rewards and no way out. The time limit does not
+    terminate: the value of state 1 is 1 / (1 - gamma).
 
-    Under uniform data, additive factorisation fits (0, 0) with 3/4 + 5/4 gamma V, so that its values grow without bound
-    for gamma > 4/5.
+    With uniform data, additive factorisation fits (0, 0) with 3/4 + 5/4 gamma V, so its values diverge for gamma > 4/5.
 
     :param length: steps until the episode is truncated
     """
@@ -82,16 +81,16 @@ class TwoStates(MatrixGame):
         self.length, self.time, self.state_now = length, 0, 1
 
     def observe(self) -> dict[str, Any]:
-        """Both see the state."""
+        """Both agents observe the state."""
         return {agent: np.eye(2, dtype=np.float32)[self.state_now] for agent in self.possible_agents}
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """State 1."""
+        """Start in state 1."""
         self.time, self.state_now = 0, 1
         return super().reset(seed, options)
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """Pay, and move."""
+        """Reward and move."""
         row, column = int(actions["row"]), int(actions["column"])
         payoff = float(self.payoffs[row, column]) * self.state_now
         self.state_now = int(self.state_now and not row & column)

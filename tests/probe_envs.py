@@ -1,8 +1,8 @@
 """
-A ladder of probes: tiny PettingZoo games with a known answer, each one step harder than the one before.
+Probes: tiny PettingZoo games with a known answer, in order of difficulty.
 
-A probe that fails names what is broken: the value loss, the encoding of observations, discounting and bootstrapping,
-the policy's gradient, the joint baseline, the pool, the way from one agent's view to another agent's value.
+A failing probe shows what is broken: the value loss, the encoding of observations, discounting and bootstrapping, the
+policy's gradient, the joint baseline, the pool, or the path from one agent's view to another agent's value.
 
 In every probe an agent sees a few numbers and has two actions; rewards are functions of what all agents see and do
 (:meth:`Probe.rewards`), so tests can enumerate every situation. Letters: N agents, C contexts.
@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 
 class Probe(ParallelEnv[str, Any, Any], ABC):
     """
-    One context is drawn per episode and stays; agents see it, in parts, at every step.
+    One context is drawn per episode and does not change; agents see parts of it at every step.
 
     :param n_agents: N
     :param length: steps until the episode is truncated
@@ -51,7 +51,7 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
     @abstractmethod
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
         """
-        The rule.
+        Compute the rewards.
 
         :param bits: (N, n_bits) what each agent sees
         :param actions: (N,)
@@ -60,22 +60,22 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
         """
 
     def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
-        """(N, n_bits + length - 1): the bits, and which step it is (one-hot; the first step is all zeros)."""
+        """Return (N, n_bits + length - 1): the bits, and the step (one-hot; all zeros at the first step)."""
         clock = np.zeros((len(bits), self.length))
         clock[:, time % self.length] = 1.0
         return np.concatenate([bits, clock[:, 1:]], axis=1).astype(np.float32)
 
     def contexts(self) -> Floats:
-        """(C, N, n_bits): everything that can be drawn, all equally likely."""
+        """Return (C, N, n_bits): all contexts, which are equally likely."""
         shape = len(self.possible_agents), self.n_bits
         return np.array(list(product((-1.0, 1.0), repeat=shape[0] * shape[1]))).reshape(-1, *shape)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The same for all agents."""
+        """Return the same space for all agents."""
         return self._observation_space
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The same for all agents."""
+        """Return the same space for all agents."""
         return self._action_space
 
     def reset(
@@ -111,12 +111,12 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
 
 class ConstantReward(Probe):
     """
-    1 at every step, whatever happens. With steps that cannot be told apart and time limits that are no ends, the value
-    is ``1 / (1 - gamma)``; with one step that is an end, it is 1.
+    Reward 1 at every step. If steps are indistinguishable and time limits do not terminate, the value is
+    ``1 / (1 - gamma)``; with one step that terminates, it is 1.
     """
 
     def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
-        """Nothing."""
+        """Return nothing."""
         return np.zeros((len(bits), *(self._observation_space.shape or ())), dtype=np.float32)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
@@ -125,7 +125,7 @@ class ConstantReward(Probe):
 
 
 class OwnObservation(Probe):
-    """The number that the agent sees: its value is what it sees."""
+    """The reward is the number that the agent sees, and so is the value."""
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
         """See the class."""
@@ -133,7 +133,7 @@ class OwnObservation(Probe):
 
 
 class DelayedReward(Probe):
-    """The number that the agent sees, but after the last step only: the value is ``gamma ** steps_left`` times it."""
+    """The same, but only after the last step: the value is ``gamma ** steps_left`` times the number."""
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
         """See the class."""
@@ -141,7 +141,7 @@ class DelayedReward(Probe):
 
 
 class OwnAction(Probe):
-    """1 for action 1 where the agent sees 1 and action 0 where it sees -1, else 0."""
+    """Reward 1 for action 1 if the agent sees 1 and for action 0 if it sees -1, else 0."""
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
         """See the class."""
@@ -150,11 +150,11 @@ class OwnAction(Probe):
 
 class JointAction(Probe):
     """
-    One reward for the whole team: 1 if *all* agents chose as in :class:`OwnAction`, plus ``noise`` times the sum of
-    second numbers, of which an agent sees only its own.
+    A team reward: 1 if *all* agents chose as in :class:`OwnAction`, plus ``noise`` times the sum of second numbers, of
+    which an agent sees only its own.
 
-    A critic of the whole team predicts the sum, and what is left is what the actions were worth. To a critic that sees
-    one agent's view, the others' numbers are noise of standard deviation ``noise * sqrt(N - 1)``.
+    A critic of the whole team predicts the sum, which leaves the effect of the actions. For a critic of one agent's
+    view, the others' numbers are noise of standard deviation ``noise * sqrt(N - 1)``.
     """
 
     n_bits: ClassVar[int] = 2
@@ -168,8 +168,8 @@ class JointAction(Probe):
 
 class OwnActionInOthersNoise(JointAction):
     """
-    Every agent has a reward of its own: 1 if it chose as in :class:`OwnAction`, plus ``noise`` times the second number
-    of the *next* agent. To predict that, a critic must see the team and know whose value it is asked for.
+    Every agent has its own reward: 1 if it chose as in :class:`OwnAction`, plus ``noise`` times the second number of
+    the *next* agent. To predict it, a critic must see the team and know whose value to compute.
     """
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
@@ -179,9 +179,9 @@ class OwnActionInOthersNoise(JointAction):
 
 class ZoneAction(Probe):
     """
-    1 for the right action, else 0. What is right depends on the zone: in zone 1 action 1 where the second number is 1,
-    in zone -1 action 1 where it is -1. No policy whose logits are linear in (zone, number) is right in all four
-    situations: it is right in three at most. Two linear policies and a choice by zone are.
+    Reward 1 for the right action, else 0. The right action depends on the zone: in zone 1 it is action 1 if the second
+    number is 1, in zone -1 action 1 if it is -1. A policy whose logits are linear in (zone, number) is right in at most
+    three of the four situations. Two linear policies and a choice by zone are right in all.
     """
 
     n_bits: ClassVar[int] = 2
@@ -193,18 +193,17 @@ class ZoneAction(Probe):
 
 class Message(Probe):
     """
-    The number that the *next* agent sees (the last agent's is the first's). With the next agent's view the value is
-    that number; without it, the best guess is 0, and no guess has a root mean square error below 1.
+    The reward is the number that the *next* agent sees (the first agent's for the last). With the next agent's view the
+    value is that number; without it, the best guess is 0, and no guess has a root mean square error below 1.
 
-    Agents see their place in the team beside their number, so that whoever reads what all agents see knows which of
-    them is next.
+    Besides their number, agents see their place in the team, so the views of all agents show which of them is next.
     """
 
     def _n_numbers(self) -> int:
         return super()._n_numbers() + len(self.possible_agents)
 
     def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
-        """The base class's numbers, then the place (one-hot)."""
+        """Return the base class's numbers, then the place (one-hot)."""
         return np.concatenate([super().observe(bits, time), np.eye(len(bits), dtype=np.float32)], axis=1)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
@@ -214,15 +213,15 @@ class Message(Probe):
 
 class MessageWithoutPlace(Message):
     """
-    The same, but agents do not see their place. What all agents see, in order, still tells everything; one agent's view
-    beside those of the team does not, where teammates see the same: of three agents, an agent can tell who is next in
-    2 of 8 situations, one of the three agents can in the other 6. So the smallest root mean square error is
-    ``sqrt(6/8 * 2/3) = 0.7071``.
+    The same, but agents do not see their place. The views of all agents in order still contain everything; one agent's
+    view with those of the team does not, if teammates see the same: of three agents, all can identify the next one in 2
+    of 8 situations, and one of the three in the other 6. So the smallest root mean square error is ``sqrt(6/8 * 2/3) =
+    0.7071``.
     """
 
     def _n_numbers(self) -> int:
         return Probe._n_numbers(self)
 
     def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
-        """The base class's numbers alone."""
+        """Return only the base class's numbers."""
         return Probe.observe(self, bits, time)

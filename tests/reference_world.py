@@ -1,8 +1,8 @@
 """
-The rule book once more, slowly: one HECOGrid world in plain Python, the oracle for the fast kernels.
+A second implementation of the rules: one HECOGrid world in plain Python, to test the fast kernels.
 
-Nothing here is shared with ``hecogrid_envs`` and nothing is meant to be fast. It follows the sections of
-``spec/hecogrid.md`` one by one, and each is one group of methods below:
+It shares no code with ``hecogrid_envs`` and is not optimised. Its groups of methods follow the sections of
+``spec/hecogrid.md``:
 
 =====================  ==============================================================================
 section                here
@@ -11,12 +11,12 @@ Parameters             ``DEFAULTS``, ``ReferenceWorld.__init__``
 World, State           ``set_state``, ``get_state`` (``cells`` keeps the order of arrival)
 Actions                ``zone_of_column``, ``command``, ``step``, ``_forward``, ``_pickup``, ``_drop``
 Collecting             ``_try_to_collect``, ``_enough_agents``
-Reward and end         the last line of ``step``; the time limit is the environment's business
+Reward and end         the last line of ``step``; the environment handles the time limit
 Observation            ``visible``, ``view_cell``, ``observe``, ``_draw_tile``, ``_colour``
 Paper and released     each ``self.released``, with the number of the row of the table
 =====================  ==============================================================================
 
-Row 6 of that table (directions at reset) and the generation of levels are no part of it: a world starts from a state.
+Row 6 of that table (directions at reset) and the generation of levels are not included: a world starts from a state.
 """
 
 from __future__ import annotations
@@ -88,10 +88,10 @@ ZONE_COLOURS: list[Colour] = [
 
 class ReferenceWorld:
     """
-    One world under the rule book.
+    One world that follows the rule book.
 
     :param task: ``"TeamTogether"``, ``"TeamSupport"`` or ``"KeyForTreasure"``
-    :param params: parameters under the rule book's names; the others keep the rule book's defaults
+    :param params: parameters with the rule book's names; missing ones have the rule book's defaults
     """
 
     def __init__(self, task: str, **params: Any) -> None:
@@ -116,7 +116,7 @@ class ReferenceWorld:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """
-        Start from a state. Agents in one cell are taken to have arrived in index order, and no step has been made.
+        Start from a state. Agents in one cell are assumed to have arrived in index order, before the first step.
 
         :param state: the rule book's mapping; arrays or nested lists
         """
@@ -141,7 +141,7 @@ class ReferenceWorld:
         self.pos: list[Cell] = [(int(x), int(y)) for x, y in state["agent_pos"]]
         self.dir: list[int] = [int(d) for d in state["agent_dir"]]
         self.has_key: list[bool] = [bool(k) for k in state["agent_has_key"]]
-        self.cells: dict[Cell, list[int]] = {}  # agents in each cell that has any, first arrival first
+        self.cells: dict[Cell, list[int]] = {}  # agents in each occupied cell, in order of arrival
         for agent in range(n):
             self.cells.setdefault(self.pos[agent], []).append(agent)
         self.last_shown: list[Colour] = [BLUE] * n  # released rules, row 2: blue before the first step
@@ -172,7 +172,7 @@ class ReferenceWorld:
 
     def agents_in(self, cell: Cell) -> list[int]:
         """
-        Who stands in a cell.
+        Return the agents in a cell.
 
         :return: agent indices in order of arrival
         """
@@ -182,9 +182,9 @@ class ReferenceWorld:
 
     def zone_of_column(self, x: int) -> int:
         """
-        Zone of column x.
+        Return the zone of column x.
 
-        The released formula (row 1) makes one zone too many, or more, when h does not divide W.
+        The released formula (row 1) gives one or more extra zones if h does not divide W.
         """
         if self.released:
             return x // (self.size // self.heterogeneity)
@@ -192,10 +192,10 @@ class ReferenceWorld:
 
     def command(self, zone: int, action: int) -> int:
         """
-        What an action integer does in a zone.
+        Return the command of an action integer in a zone.
 
-        The rule book leaves open what follows the last of the 5040 permutations (the released rules have zones enough
-        to get there); here the list begins again.
+        The rule book does not define what follows the last of the 5040 permutations (with the released rules there are
+        enough zones to get there); here the list starts again.
         """
         stride = 500 if self.heterogeneity <= 11 else 5040 // self.heterogeneity
         triggered_by = ORDERS_OF_ACTIONS[(stride * zone) % 5040]
@@ -206,7 +206,7 @@ class ReferenceWorld:
         Let every agent act once.
 
         :param actions: one action integer per agent, by agent index
-        :param order: agent indices in the order in which they act; index order if left out
+        :param order: order in which agents act; default: by index
         :return: each agent's reward
         """
         if order is None:
@@ -215,7 +215,7 @@ class ReferenceWorld:
             raise ValueError(f"order must hold each of the {self.n_agents} agents once, got {list(order)}")
         n_collected = 0
         for agent in order:
-            # Nobody else can move this agent: its cell is still the one in which the step began.
+            # No other agent can move this agent, so its cell is still the one in which the step began.
             zone = self.zone_of_column(self.pos[agent][0])
             self.last_shown[agent] = self._present_colour(agent)
             n_collected += self._act(agent, self.command(zone, int(actions[agent])))
@@ -251,7 +251,7 @@ class ReferenceWorld:
         return self._try_to_collect(agent, before)
 
     def _pickup(self, agent: int) -> int:
-        # In this order: the key taken by this action comes too late for the treasure underfoot.
+        # In this order: a key picked up by this action is too late for the treasure in the same cell.
         n_collected = self._try_to_collect(agent, self.pos[agent])
         if self.front(agent) in self.keys and not self.has_key[agent]:
             self.keys.remove(self.front(agent))
@@ -297,7 +297,7 @@ class ReferenceWorld:
         return helpers >= self.coordination
 
     def _agents_around(self, agent: int, centre: Cell) -> int:
-        """Agents within the support radius of a cell. The acting agent always counts itself."""
+        """Return the agents within the support radius of a cell, always including the acting agent."""
         count = 1
         for other, (x, y) in enumerate(self.pos):
             distance = max(abs(x - centre[0]), abs(y - centre[1]))
@@ -309,7 +309,7 @@ class ReferenceWorld:
 
     def view_cell(self, agent: int, column: int, row: int) -> Cell:
         """
-        The cell of the map that an agent sees at a place of its view, row 0 being the farthest ahead.
+        Return the map cell at a place of an agent's view; row 0 is the farthest ahead.
 
         :return: (x, y), possibly beyond the map
         """
@@ -322,7 +322,7 @@ class ReferenceWorld:
 
     def visible(self, agent: int) -> npt.NDArray[np.bool_]:
         """
-        What an agent sees past the walls.
+        Return which cells of its view an agent sees, given the walls.
 
         :return: (view_size, view_size), indexed [column, row] as in the rule book
         """
@@ -359,7 +359,7 @@ class ReferenceWorld:
         for i in range(self.view):
             for j in range(self.view):
                 if seen[i, j]:
-                    # Tiles are drawn with north up, keys and grid lines too, and turn with the map.
+                    # Tiles, including keys and grid lines, are drawn with north up and rotate with the map.
                     tile = np.rot90(self._draw_cell(agent, self.view_cell(agent, i, j)), self.dir[agent] - NORTH)
                 else:
                     tile = _solid(t, INVISIBLE)
@@ -417,7 +417,7 @@ def _finish(tile: Image) -> Image:
 
 
 def _blend(treasure: Image, agent: Image) -> Image:
-    """Treasure where the agent's tile is dark, agent where it is bright; fractions are cut off."""
+    """Blend: treasure where the agent's tile is dark, agent where it is bright; fractions are truncated."""
     below, above = treasure.astype(int), agent.astype(int)
     a = above.sum(axis=2, keepdims=True)
     most = a.max()
@@ -444,9 +444,9 @@ def _agent_tile(t: int, heading: int, colour: Colour) -> Image:
 
 def _draw_shape(t: int, inside: Inside, colour: Colour) -> Image:
     """
-    A shape on black, sampled at the centres of 3 x 3 points per pixel.
+    Draw a shape on black, sampled at the centres of 3 x 3 points per pixel.
 
-    The mean of n coloured points out of 9, cut off to a whole number, is ``n * channel // 9``.
+    The truncated mean of n coloured points out of 9 is ``n * channel // 9``.
     """
     image = np.zeros((t, t, 3), dtype=np.uint8)
     for y in range(t):
@@ -466,7 +466,7 @@ def _disc(cx: float, cy: float, radius: float) -> Inside:
 
 
 def _turned(inside: Inside, quarters: int) -> Inside:
-    """A shape turned clockwise (on the screen, y down) around the tile's centre: the point is turned back instead."""
+    """Rotate a shape clockwise (on the screen, y down) around the tile's centre, by rotating points back."""
     angle = quarters * math.pi / 2
     cos, sin = math.cos(-angle), math.sin(-angle)
 
@@ -479,9 +479,9 @@ def _turned(inside: Inside, quarters: int) -> Inside:
 
 def _triangle(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> Inside:
     """
-    Points on the same side of each edge, or on it, on the way around.
+    Return points on the same side of each edge, or on it.
 
-    Up to 128 pixels a tile, only at 100 do sample points lie on an edge: there, and only there, rounding decides.
+    Up to 128 pixels per tile, sample points lie on an edge only at 100, where the result depends on rounding.
     """
 
     def side(p: tuple[float, float], q: tuple[float, float], x: float, y: float) -> float:

@@ -1,4 +1,4 @@
-"""A vector environment of teams whose every number is known, and which keeps no promise that it need not keep."""
+"""A vector environment of teams with known numbers, which gives no guarantees beyond the required ones."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 Array = npt.NDArray[Any]
-#: What agent i of game e sees at step t of episode k: (e, i, k, t) -> own observation.
+#: Own observation that agent i of game e sees at step t of episode k: (e, i, k, t) -> observation.
 See = Callable[[int, int, int, int], Any]
-#: What agent i of game e gets for step t (from 1) of its episode.
+#: Reward of agent i of game e for step t (from 1) of its episode.
 Reward = Callable[[int, int, int], float]
 
 VECTOR = spaces.Box(-np.inf, np.inf, (4,), np.float32)
@@ -32,7 +32,7 @@ class TeamVenv(VecEnv):
     """
     Flattened teams with known numbers.
 
-    All arrays are reused: each step overwrites what the one before returned. Dones are uint8, as SuperSuit's.
+    All arrays are reused: each step overwrites those of the previous one. Dones are uint8, like SuperSuit's.
 
     :param lengths: (E,) game steps per episode of each game
     :param n_agents: N

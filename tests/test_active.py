@@ -25,9 +25,9 @@ from tests.team_venv import Array
 from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv, UnequalEnv
 
 N_AGENTS, N_ACTIONS = 3, 4
-#: Agent 0 is there for steps 1 to 3, agent 1 from the observation after step 2, agent 2 until a time limit.
+#: Agent 0 is active for steps 1 to 3, agent 1 from the observation after step 2, agent 2 until a time limit.
 LIVES: dict[str, Any] = {"n_agents": N_AGENTS, "max_cycles": 5, "deaths": {0: 3}, "joins": {1: 2}}
-#: Who is active in the observation after 0, 1, ... steps.
+#: Active agents in the observation after 0, 1, ... steps.
 ACTIVE = [[1, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [0, 1, 1]]
 POLICIES: list[type[Any]] = [SAFPolicy, MAPPOPolicy, IPPOPolicy]
 
@@ -37,7 +37,7 @@ def legal(agent: int, step: int) -> list[int]:
 
 
 def expected_masks(step: int) -> list[list[int]]:
-    """Agents that take no part have action 0."""
+    """Masks of inactive agents allow only action 0."""
     return [legal(i, step) if ACTIVE[step][i] else [1, 0, 0, 0] for i in range(N_AGENTS)]
 
 
@@ -66,7 +66,7 @@ def test_rows_tell_who_is_active_what_is_legal_and_the_state(masks: str, n_cpus:
         assert obs["active"].tolist() == [ACTIVE[step]] * 6
         assert obs["action_mask"].tolist() == expected_masks(step) * 2
         assert obs["state"].tolist() == [[step, sum(ACTIVE[step])]] * 6
-        # Who takes no part sees zeros, and so do the others in its place.
+        # An inactive agent sees zeros, and other agents see zeros in its place.
         shown = [[step, i] if ACTIVE[step][i] else [0, 0] for i in range(N_AGENTS)]
         assert obs["obs"][:, :2].tolist() == shown * 2
         np.testing.assert_array_equal(obs["team"][0], obs["obs"][:3])
@@ -174,7 +174,7 @@ def test_random_teams_take_legal_actions_each_as_often() -> None:
     obs: Any = env.reset()
     policy = RandomPolicy(env.action_space, seed=0)
     counts = np.sum([np.eye(N_ACTIONS)[policy.predict(obs)[0]] for _ in range(2000)], axis=0)
-    assert counts[1].tolist() == [2000, 0, 0, 0]  # takes no part
+    assert counts[1].tolist() == [2000, 0, 0, 0]  # inactive
     assert counts[0] == pytest.approx([1000, 0, 1000, 0], abs=100)
     assert evaluate_team(policy, env, 3).lengths == [5, 5, 5]
 
@@ -187,7 +187,7 @@ def telling_spaces(n_agents: int = N_AGENTS, state: Any = spaces.Box(0, 100, (2,
 
 
 def fill(buffers: list[Any], env: CentralizedValueWrapper, n_steps: int, zero_values: bool) -> tuple[Array, Array]:
-    """Play first legal actions with made-up values; return active rows (T + 1, B) and values (T + 1, B)."""
+    """Play first legal actions with arbitrary values; return active rows (T + 1, B) and values (T + 1, B)."""
     rng = np.random.default_rng(0)
     obs: Any = env.reset()
     starts = np.ones(env.num_envs, dtype=bool)
@@ -216,7 +216,7 @@ def make_buffer(env: CentralizedValueWrapper, n_steps: int, kind: Any = TeamRoll
 
 @pytest.mark.parametrize("n_steps", [3, 5, 8, 13])
 def test_advantages_end_with_the_agent(n_steps: int) -> None:
-    """Against a loop over each life of each agent, which knows nothing of masks; n_steps=3 ends with a death."""
+    """Compare with a loop over each life of each agent, which uses no masks; n_steps=3 ends with a death."""
     env = telling_env()
     buffer = make_buffer(env, n_steps)
     active, values = fill([buffer], env, n_steps, zero_values=False)
@@ -236,7 +236,7 @@ def test_advantages_end_with_the_agent(n_steps: int) -> None:
 
 @pytest.mark.parametrize("n_steps", [3, 8, 13])
 def test_returns_of_the_dead_go_on_where_their_team_is_paid(n_steps: int) -> None:
-    """With one reward and one value for all of a team, advantages are those of agents that never end."""
+    """With one reward and one value for the team, advantages are those of agents that never end."""
     env = telling_env()
     team, immortal = (make_buffer(env, n_steps, ends="team") for _ in range(2))
     fill([team, immortal], env, n_steps, zero_values=True)
@@ -262,7 +262,7 @@ def test_minibatches_leave_out_who_takes_no_part_and_keep_the_rest() -> None:
     env = telling_env()
     team, stock = make_buffer(env, 8), make_buffer(env, 8, DictRolloutBuffer)
     active, _ = fill([team, stock], env, 8, zero_values=True)
-    # Where values of idle rows are zero, as our policies give them, SB3's recursion gives the same.
+    # If values of idle rows are zero, as our policies return them, SB3's recursion gives the same.
     rows = active[:8] == 1
     np.testing.assert_array_equal(team.advantages[rows], stock.advantages[rows])
 
@@ -283,7 +283,7 @@ def test_minibatches_leave_out_who_takes_no_part_and_keep_the_rest() -> None:
         assert len(sample.actions) <= 6
         seen = sample.observations
         assert seen["active"].gather(1, seen["agent"]).all()
-        # Teams stay together: as many rows of a team as there are active agents in it.
+        # Teams stay together: a team has as many rows as active agents.
         for joint in seen["team"].unique(dim=0):
             members = (seen["team"] == joint).flatten(1).all(dim=1)
             assert members.sum() == seen["active"][members][0].sum()
@@ -303,7 +303,7 @@ def test_states_are_stored_once_per_game() -> None:
 
 def test_minibatches_without_anybody_are_skipped() -> None:
     class Nobody(CentralizedValueWrapper):
-        """Nobody takes part in game 0."""
+        """All agents of game 0 are inactive."""
 
         def _joint_observation(self, obs: Any) -> Any:
             joint = super()._joint_observation(obs)
@@ -343,7 +343,7 @@ def make_policy(kind: type[Any], **kwargs: Any) -> Any:
 
 
 def random_rows(n_games: int = 6) -> dict[str, th.Tensor]:
-    """Rows of teams some of whose agents take no part; the first two games differ in nothing else."""
+    """Return rows of teams with inactive agents; the first two games differ only in these."""
     generator = th.Generator().manual_seed(1)
     own = th.rand(n_games, N_AGENTS, 3, generator=generator) * 2 - 1
     own[1] = own[0]
@@ -391,7 +391,7 @@ def test_equal_views_with_other_agents_active_are_other_teams(kind: Any) -> None
 
 
 def enumerated(policy: Any, obs: dict[str, th.Tensor]) -> th.Tensor:
-    """(B, A) probabilities, by arithmetic on what the networks give."""
+    """Compute (B, A) probabilities from the networks' outputs."""
     features = policy.extract_features(obs)
     mask = obs["action_mask"].double()
     actor = policy.actor
@@ -502,7 +502,7 @@ def make_model(policy: str = "SAFPolicy", env: Any = None, **kwargs: Any) -> PPO
     ],
 )
 def test_ppo_trains_saves_and_loads(policy: str, policy_kwargs: Any, time_limit: str, tmp_path: Path) -> None:
-    """The environment stops the test at the first illegal action; warnings of idle rows are errors."""
+    """The environment fails the test at the first illegal action; warnings of idle rows are errors."""
     model = make_model(policy, telling_env(time_limit=time_limit), policy_kwargs=policy_kwargs).learn(120)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     model.save(tmp_path / "model")
@@ -559,7 +559,7 @@ def test_sb3s_buffer_warns_once_that_idle_rows_enter_the_loss() -> None:
 
 def test_a_padded_environment_trains() -> None:
     class Both(UnequalEnv):
-        """Agent 1 sees more and can do more."""
+        """Agent 1 has larger observation and action spaces."""
 
         def action_space(self, agent: str) -> spaces.Space[Any]:
             return spaces.Discrete(7) if agent == "agent_1" else spaces.Discrete(4)

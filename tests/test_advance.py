@@ -1,4 +1,4 @@
-"""``GameBatch.advance``: what step, reset of games that are over and observe do, in one call."""
+"""``GameBatch.advance`` equals step, reset of finished games and observe."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SMALL: dict[str, Any] = {"n_agents": 5, "grid_size": 12, "n_treasures": 40, "max
 
 
 def batch_of(n_threads: int = 1, **params: Any) -> GameBatch:
-    """Games that end at different steps: they have begun one after the other, the last from a given state."""
+    """Create games that end at different steps: they begin one after the other, the last from a given state."""
     batch = GameBatch("TeamTogether", HECOGridParams(**{**SMALL, **params}), N_GAMES, n_threads)
     batch.reset(seeds=game_seeds(0, N_GAMES))
     for game in range(N_GAMES - 1):

@@ -1,4 +1,4 @@
-"""Wrong calls and what they answer, word for word: what was expected, what came, how to fix it."""
+"""Error messages of wrong calls, word for word: what was expected, what was given, how to fix it."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def small_env() -> HECOGridEnv:
 
 
 def state_with(**changes: Any) -> dict[str, Any]:
-    """A valid state of ``small_env`` with changes; None removes an entry."""
+    """Return a valid state of ``small_env`` with changes; None removes an entry."""
     walls = np.ones((6, 6), dtype=bool)
     walls[1:-1, 1:-1] = False
     state: dict[str, Any] = {

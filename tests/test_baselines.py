@@ -1,4 +1,4 @@
-"""Gridworlds of others that speeds are compared with: those that are installed run, the others are left out."""
+"""Third-party gridworlds of the speed comparison: installed ones run, the others are left out."""
 
 from __future__ import annotations
 

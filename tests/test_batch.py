@@ -1,4 +1,4 @@
-"""Batches: the same game whatever the batch size, the neighbours and the number of threads."""
+"""A game is the same for any batch size, other games in the batch and number of threads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PARAMS = HECOGridParams(n_agents=5, grid_size=12, coordination=2, heterogeneity=
 
 
 def play(batch: GameBatch, seeds: list[int], actions: np.ndarray[Any, Any]) -> list[np.ndarray[Any, Any]]:
-    """Two episodes and a bit, games resetting at their time limit: observations, rewards, directions of all steps."""
+    """Play a little over two episodes with resets at the time limit; return observations, rewards, directions."""
     batch.reset(seeds=seeds)
     frames = []
     for row in actions:
@@ -66,7 +66,7 @@ def test_levels_have_what_the_parameters_say(task: str) -> None:
 
 
 def test_levels_are_uniform() -> None:
-    """Each cell holds a treasure, and each direction an agent, equally often: chi-square within its 99.9 % bound."""
+    """Treasures are uniform over cells, and agents over directions: chi-square within its 99.9 % bound."""
     params = HECOGridParams(n_agents=3, grid_size=7, n_treasures=5, clutter_density=0.2)
     batch = GameBatch("TeamSupport", params, 4000)
     batch.reset(seeds=game_seeds(1, 4000))
@@ -139,7 +139,7 @@ def test_a_copy_plays_on_like_the_original() -> None:
 
 
 def wrong_calls(batch: GameBatch) -> dict[str, tuple[Callable[[], object], str]]:
-    """Calls that would read or write outside of an array, and what they say."""
+    """Return calls that would access an array out of bounds, and their error messages."""
     read_only = batch.observe()
     read_only.flags.writeable = False
     actions: Any = np.zeros((4, 5), dtype=int)

@@ -1,4 +1,4 @@
-"""Suites whose engines step all games at once, beside the engines themselves stepped game by game."""
+"""Suites whose engines step all games at once, compared with the engines stepped game by game."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ needs_jaxmarl, needs_vmas = _needs("jaxmarl"), _needs("vmas")
 
 
 def rows_of(env_id: str, n_envs: int, seed: int = 0, **params: Any) -> Any:
-    """The VecEnv of a task, below the wrappers of ``make_team_env``."""
+    """Create the VecEnv of a task, without the wrappers of ``make_team_env``."""
     one = find_task(env_id)
     assert one is not None and one.suite.vec_env is not None
     return one.suite.vec_env(one.task, n_envs, seed, **params)
@@ -47,10 +47,10 @@ def legal_actions(observations: dict[str, Array], rng: np.random.Generator, n_ac
 
 @needs_jaxmarl
 def test_rows_are_the_games_of_jaxmarl_one_by_one() -> None:
-    """Observations padded, last ones kept, actions masked, random streams per game; a listener and a speaker."""
+    """Padded observations, last observations, masks, random streams per game; a listener and a speaker."""
     import jax
 
-    venv = rows_of("jaxmarl/MPE_simple_speaker_listener_v4", 2, seed=7, max_steps=3)  # that are 4: it counts from 0
+    venv = rows_of("jaxmarl/MPE_simple_speaker_listener_v4", 2, seed=7, max_steps=3)  # 4 steps: it counts from 0
     env = venv.batch.env
     reset, step = jax.jit(env.reset), jax.jit(env.step_env)
     keys = [np.array(divmod(seed, 2**32), dtype=np.uint32) for seed in game_seeds(7, 2)]
@@ -110,7 +110,7 @@ def test_games_do_not_depend_on_their_number_and_actions_are_checked() -> None:
 
 @needs_jaxmarl
 def test_an_end_is_no_time_limit() -> None:
-    """Telling in the riddle ends it at once; its observations then count for nothing."""
+    """Telling in the riddle terminates it; its observations are then not bootstrapped."""
     venv = rows_of("jaxmarl/switch_riddle", 2, seed=3)
     venv.reset()
     tell = np.tile([2, 2, 2], 2)
@@ -123,7 +123,7 @@ def test_an_end_is_no_time_limit() -> None:
 
 @needs_jaxmarl
 def test_battles_of_smax() -> None:
-    """The dead are paid and can do nothing, masks are JaxMARL's, the world's state is the critic's, wins are told."""
+    """Dead agents are rewarded but cannot act; masks are JaxMARL's; the critic reads the state; wins are reported."""
     import jax
 
     env = make_team_env("smax/3m", n_envs=2, seed=0, state=True)
@@ -132,7 +132,7 @@ def test_battles_of_smax() -> None:
     assert observations["state"].shape == (6, 72)
     assert "active" not in observations
     n_dead, won = 0, []
-    for _ in range(120):  # allies walk up to the enemy, and all shoot at the same one
+    for _ in range(120):  # allies approach the enemy, and all shoot at the same one
         shots = observations["action_mask"][:, 5:]
         observations, rewards, dones, infos = env.step(np.where(shots.any(axis=1), 5 + shots.argmax(axis=1), 1))
         game = jax.tree.map(lambda leaf: leaf[1], venv.batch.games)
@@ -153,7 +153,7 @@ def test_battles_of_smax() -> None:
 
 @needs_jaxmarl
 def test_the_kitchen() -> None:
-    """Observations are bytes; rewards on the way, 3 for an onion in the pot, are added at a weight that falls."""
+    """Observations are bytes; shaped rewards (3 for an onion in the pot) are added with a decreasing weight."""
     shaped: dict[str, Any] = {"reward_shaping": 2.0, "reward_shaping_steps": 30}
     venv = rows_of("overcooked/cramped_room", 3, max_steps=11, **shaped)
     rows = venv.reset()
@@ -172,7 +172,7 @@ def test_the_kitchen() -> None:
 
 @needs_jaxmarl
 def test_soups_alone_are_evaluated() -> None:
-    """A cook puts onions into the pot, which only training pays: 3 for each, with this weight."""
+    """A cook puts onions into the pot, which is rewarded only in training: 3 for each, with this weight."""
     shaped = {"reward_shaping": 1.0, "reward_shaping_steps": 1_000_000, "max_steps": 11}
     settings = load_settings("ippo", "overcooked/cramped_room", "smoke", env_kwargs=shaped)
     left, right, up, interact = 3, 2, 0, 5
@@ -249,7 +249,7 @@ def test_rows_are_those_of_vmas_and_draw_from_a_stream_of_their_own(continuous: 
             np.testing.assert_array_equal(info["terminal_observation"]["obs"], last[game, 1])
             assert info["TimeLimit.truncated"] == bool(truncated[game] & ~terminated[game])
         if ended.any():
-            venv.seed(2)  # VMAS's own resets go on with the state that it keeps for all, so begin anew
+            venv.seed(2)  # VMAS's own resets continue one common random state, so seed again
             rows, own = venv.reset(), engine.reset(seed=seed)
     assert th.equal(before, th.get_rng_state()), "nothing is drawn from the caller's stream"
 

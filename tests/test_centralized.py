@@ -27,7 +27,7 @@ class AtlasSpace(spaces.Box):
 
 
 def bytes_of(shape: tuple[int, ...]) -> Callable[[int, int, int, int], Array]:
-    """Bytes that differ for all games, agents, episodes, steps and places."""
+    """Return bytes that differ for all games, agents, episodes, steps and places."""
     size = int(np.prod(shape))
 
     def see(game: int, agent: int, episode: int, step: int) -> Array:
@@ -65,7 +65,7 @@ def test_rows_of_two_games_with_three_agents() -> None:
         (spaces.MultiBinary(3), lambda e, i, k, t: [e, i % 2, t % 2]),
         (spaces.Box(0, 255, (9, 8, 3), np.uint8), bytes_of((9, 8, 3))),
         (spaces.Box(0, 255, (3, 9, 8), np.uint8), bytes_of((3, 9, 8))),
-        # The views of three agents, (3, 2, 7) bytes, look like a channel-last picture to SB3, and so do (3, 7, 2).
+        # SB3 takes the views of three agents, (3, 2, 7) bytes, for a channel-last image; the same for (3, 7, 2).
         (spaces.Box(0, 255, (2, 7), np.uint8), bytes_of((2, 7))),
         (spaces.Box(0, 255, (7, 2), np.uint8), bytes_of((7, 2))),
         (AtlasSpace((7, 7), 200), lambda e, i, k, t: bytes_of((7, 7))(e, i, k, t) % 200),
@@ -168,7 +168,7 @@ def test_images_are_transposed_once() -> None:
 
 
 def test_images_that_sb3_would_transpose_twice() -> None:
-    # Width below channels: SB3's rule, asked again after the transposition, would transpose again.
+    # Fewer columns than channels: applying SB3's rule again after the transposition would transpose again.
     venv = TeamVenv(own_space=spaces.Box(0, 255, (9, 3, 5), np.uint8), see=bytes_of((9, 3, 5)))
     with pytest.warns(UserWarning, match="Treating image space as channels-last"):
         env = CentralizedValueWrapper(venv)
@@ -204,7 +204,7 @@ def test_terminal_observation_is_the_rows_own_dict() -> None:
         assert "terminal_observation" not in infos[agent]
     assert isinstance(obs, dict)
     assert obs["obs"][3].tolist() == [1, 0, 1, 0], "the next episode has begun"
-    # The infos of the environment are its own.
+    # The environment's infos are not changed.
     assert venv.infos[3]["terminal_observation"].tolist() == last[0]
     assert venv.infos[3]["TimeLimit.truncated"] is True
 
@@ -223,7 +223,7 @@ def test_a_time_limit_is_a_true_end_unless_told_otherwise() -> None:
 
 
 class SeeRollout(BaseCallback):
-    """Keep the rewards of the first rollout, and the values of the last observations before anything is learned."""
+    """Record the rewards of the first rollout, and the values of the last observations before any training."""
 
     rewards: Array
 
@@ -334,7 +334,7 @@ def test_what_cannot_be_wrapped(make: Callable[[], Any], message: str) -> None:
 
 
 class Broken(TeamVenv):
-    """Teams with a fault that a test puts in after a correct step."""
+    """Teams with a fault that a test adds after a correct step."""
 
     def __init__(self, fault: Callable[[Broken], None], **kwargs: Any) -> None:
         super().__init__(**kwargs)

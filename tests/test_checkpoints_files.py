@@ -1,4 +1,4 @@
-"""Files of checkpoints: what they hold, damage, full disks, other formats, two runs in one folder."""
+"""Checkpoint files: content, damage, full disks, other formats, two runs in one folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agents that die or join, action masks, memory, masks from a second source and value normalisation, together."""
+"""Agents that die or join, action masks, memory, masks from two sources and value normalisation, combined."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from sb3_saf.networks.value_normalizer import ValueNormalizer
 from tests.toy_envs import TellingEnv
 
 N_AGENTS, N_ACTIONS = 3, 4
-#: Agent 0 is there for steps 1 to 3, agent 1 from the observation after step 2; agent i may do every second action.
+#: Agent 0 is active for steps 1 to 3, agent 1 from the observation after step 2; agent i may take every second action.
 LIVES: dict[str, Any] = {"n_agents": N_AGENTS, "max_cycles": 5, "deaths": {0: 3}, "joins": {1: 2}}
 
 
 class TwiceMaskedEnv(TellingEnv):
-    """Masks in observations, which allow every second action, and asked for, which forbid the lower of those."""
+    """Observations have masks that allow every second action; a method returns masks that forbid the lower of those."""
 
     def action_masks(self) -> dict[str, Any]:
         return {agent: np.arange(N_ACTIONS) >= 2 for agent in self.agents}
 
 
 class ShownMasksEnv(TellingEnv):
-    """Masks in observations or infos and no method that gives them."""
+    """Masks in observations or infos, without a method that returns them."""
 
     @property
     def action_masks(self) -> Any:
@@ -47,7 +47,7 @@ def small_policy(**kwargs: Any) -> dict[str, Any]:
 
 
 def learn(model: Any, n_rows: int) -> Any:
-    """Train where idle rows are expected in minibatches: the buffers of sb3-contrib keep them."""
+    """Train with idle rows in minibatches: the buffers of sb3-contrib keep them."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The minibatch has rows of agents that take no part")
         return model.learn(n_rows)
@@ -59,7 +59,7 @@ def active_rows(obs: Any) -> Any:
 
 @pytest.mark.parametrize("critic_lstm", [True, False])
 def test_memory_with_masks_and_agents_that_die(critic_lstm: bool) -> None:
-    """The environment stops the test at the first illegal action."""
+    """The environment fails the test at the first illegal action."""
     env = lively_env()
     model = RecurrentPPO(
         "SAFLstmPolicy",
@@ -84,7 +84,7 @@ def test_memory_with_masks_and_agents_that_die(critic_lstm: bool) -> None:
 
 
 def test_rollouts_of_memory_with_masks_are_evaluated_alike() -> None:
-    """PPO's ratio is 1 before the first step, whatever padding and idle agents do to the sequences."""
+    """PPO's ratio is 1 before the first step, independently of padding and idle agents in the sequences."""
     model = RecurrentPPO(
         "SAFLstmPolicy",
         lively_env(),
@@ -100,7 +100,7 @@ def test_rollouts_of_memory_with_masks_are_evaluated_alike() -> None:
     n_rows = 0
     policy, batches = model.policy, model.rollout_buffer.get(30)
     assert isinstance(policy, SAFLstmPolicy)
-    batch: Any  # sb3-contrib's samples, which its own annotations do not name
+    batch: Any  # the annotations of sb3-contrib do not name its samples
     for batch in batches:
         actions = batch.actions.long().flatten()
         values, log_prob, _ = policy.evaluate_actions(
@@ -146,7 +146,7 @@ def test_an_action_must_be_allowed_by_both_masks() -> None:
 
 
 def test_values_are_normalised_by_the_returns_of_those_who_take_part() -> None:
-    """The mean would be another if idle rows, whose returns are 0, counted."""
+    """The mean would differ if idle rows, whose returns are 0, were counted."""
     model = PPO(
         "MAPPOPolicy",
         lively_env(),
@@ -192,7 +192,7 @@ def test_normalised_values_with_every_critic_and_agents_that_die(policy_kwargs: 
 
 @pytest.mark.parametrize("masks", ["observation", "info"])
 def test_maskable_ppo_finds_the_masks_that_observations_show(masks: str) -> None:
-    """The game has no method action_masks(), and stops the test at the first illegal action."""
+    """The game has no method action_masks(), and fails the test at the first illegal action."""
     env = lively_env(ShownMasksEnv, masks=masks, deaths={}, joins={})
     assert is_masking_supported(env)
     obs: Any = env.reset()

@@ -1,4 +1,4 @@
-"""Kernels are compiled once, with a word to the user, and anew when any of their files changes."""
+"""Kernels are compiled once, with a message, and again when any of their files changes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ print(sum(play.play.stats.cache_hits.values()))
 
 
 def start(package: Path) -> tuple[str, bool]:
-    """How often compiled code was found on disk, and whether compiling was announced, in a new process."""
+    """Count in a new process how often compiled code was loaded from disk, and whether compiling was announced."""
     environment = {**os.environ, "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
-    command = [sys.executable, "-c", CODE]  # before Python 3.11 the folder where it runs comes first
+    command = [sys.executable, "-c", CODE]  # before Python 3.11 the working directory comes first
     process = subprocess.run(command, cwd=package.parent, env=environment, capture_output=True, text=True, check=True)
     return process.stdout.strip(), "once on this machine they are compiled" in process.stderr
 

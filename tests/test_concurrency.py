@@ -1,4 +1,4 @@
-"""Vector environments and models beside each other: in threads, processes and copies they play as if alone."""
+"""Several vector environments and models in threads, processes and copies do not affect each other."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MAKERS: Final = pytest.mark.parametrize("make", [native, supersuit])
 
 
 def played(venv: Any, n_steps: int = 20) -> list[bytes]:
-    """What is seen and earned with actions that are always the same."""
+    """Return observations and rewards of fixed actions."""
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(n_steps):
@@ -76,7 +76,7 @@ def test_two_threads_at_once(make: Callable[[int], Any]) -> None:
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_processes_that_are_started_in_the_middle_of_an_episode(make: Callable[[int], Any], method: str) -> None:
     expected = play_alone(make, 0)
-    venv = begun(make)  # its threads, if any, are at work
+    venv = begun(make)  # its threads, if any, are running
     played(venv, 3)
     with ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:
         assert pool.submit(play_alone, make, 0).result() == expected

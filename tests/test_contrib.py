@@ -34,16 +34,16 @@ from tests.toy_envs import CounterEnv
 from tests.toy_teams import VECTOR, ToyTeams, gather_rows, team_rows, to_numpy
 
 HIDDEN = 6
-#: Every algorithm that is declared for RecurrentPPO.
+#: All algorithms declared for RecurrentPPO.
 FAMILIES = sorted(one.name for one in DECLARATIONS if RecurrentPPO in one.policies)
 MASKABLE = [name for name in ACTIONS if name != "box"]
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"": TRPO, "Lstm": RecurrentPPO, "Maskable": MaskablePPO}
 NAMES = [f"{family}{kind}Policy" for kind in ALGORITHMS for family in FAMILIES]
-#: Policy classes by their names; an algorithm need not be among what `sb3_saf` exports.
+#: Policy classes by name; `sb3_saf` need not export all algorithms.
 CLASSES: dict[str, Any] = {
     policy.__name__: policy for one in DECLARATIONS for policies in one.policies.values() for policy in policies
 }
-#: Every way to set up a critic or an actor that changes what is computed.
+#: All options of critics and actors that change what is computed.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("IPPO", {}),
     ("IPPO", {"heads": "per_agent"}),
@@ -74,7 +74,7 @@ def sizes_of(name: str) -> dict[str, Any]:
 def make_policy(
     name: str, action_space: spaces.Space[Any] = ACTIONS["discrete"], noise: float = 0.3, **kwargs: Any
 ) -> Any:
-    """A small policy for three agents, with noise on the actor's small first weights so that every part matters."""
+    """Create a small policy for three agents; noise on the actor's small first weights makes every part matter."""
     th.manual_seed(0)
     policy_class: type[TeamPolicy] = CLASSES[name]
     space = TeamSpaces.of(VECTOR, 3).to_dict_space()
@@ -90,7 +90,7 @@ def make_venv(name: str, action: str = "discrete") -> ToyTeams:
 
 
 def make_model(name: str, venv: ToyTeams | None = None, seed: int = 0, **kwargs: Any) -> Any:
-    """An algorithm on 4 games of 3 agents; a rollout has 8 steps (96 rows), an episode 5."""
+    """Create an algorithm on 4 games of 3 agents; a rollout has 8 steps (96 rows), an episode 5."""
     settings: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "device": "cpu", "seed": seed}
     settings |= {} if kind_of(name) == "" else {"n_epochs": 2}
     policy_kwargs = sizes_of(name) | kwargs.pop("policy_kwargs", {})
@@ -134,7 +134,7 @@ def test_every_weight_is_trained(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "action"),
-    # The discrete ones are trained above; MaskablePPO takes no Box actions.
+    # Discrete ones are trained above; MaskablePPO does not support Box actions.
     [(kind, action) for kind in ALGORITHMS for action in (MASKABLE if kind == "Maskable" else list(ACTIONS))[1:]],
 )
 def test_every_action_space_is_trained(kind: str, action: str) -> None:
@@ -191,7 +191,7 @@ def test_game_steps_are_logged(tmp_path: Path) -> None:
     model.logger.close()
     with open(tmp_path / "progress.csv") as file:
         rows = list(csv.DictReader(file))
-    # 3 agents: 96 rows are 32 steps of games.
+    # With 3 agents, 96 rows are 32 game steps.
     assert [row["time/game_steps"] for row in rows] == ["32", "64"]
 
 
@@ -291,7 +291,7 @@ def test_training_sees_the_values_and_likelihoods_of_the_rollout(family: str, kw
     with th.no_grad():
         for parameter in model.policy.parameters():
             parameter.add_(0.3 * th.randn_like(parameter))
-    # The second rollout starts within an episode, with what was remembered of it.
+    # The second rollout starts within an episode, with its memory.
     model.learn(192)
     n_rows = 0
     for batch in model.rollout_buffer.get(37):
@@ -305,7 +305,7 @@ def test_training_sees_the_values_and_likelihoods_of_the_rollout(family: str, kw
 
 
 def lstm_by_hand(lstm: Any, inputs: th.Tensor, starts: list[bool]) -> th.Tensor:
-    """(T, H) outputs for one sequence (T, S), by the gates' equations."""
+    """Compute (T, H) outputs for one sequence (T, S) from the equations of the gates."""
     hidden, cell, outputs = th.zeros(HIDDEN), th.zeros(HIDDEN), []
     for x, start in zip(inputs, starts, strict=True):
         if start:
@@ -323,7 +323,7 @@ def test_memory_against_an_independent_loop(family: str, kwargs: dict[str, Any])
     policy = make_policy(f"{family}LstmPolicy", **kwargs)
     assert isinstance(policy.value_net, RecurrentCritic)
     n_steps, rows = 5, team_rows(VECTOR, n_games=10)
-    # Two sequences: agent 2 of games 0 to 4, and agent 0 of games 5 to 9 as if they were one game's steps.
+    # Two sequences: agent 2 of games 0 to 4, and agent 0 of games 5 to 9, used as the steps of one game.
     sequences = gather_rows(rows, [3 * t + 2 for t in range(n_steps)] + [15 + 3 * t for t in range(n_steps)])
     starts = [[False] * n_steps, [False, False, True, False, False]]
     values, log_prob, _ = policy.evaluate_actions(
@@ -377,7 +377,7 @@ def test_nothing_but_own_observation_and_own_memory_changes_an_action_by_a_bit(
     actor, critic = ((th.randn(1, 12, HIDDEN), th.randn(1, 12, HIDDEN)) for _ in range(2))
     starts = (th.arange(12) % 4 == 1).float()
     others = obs | {"team": team_rows(VECTOR, n_views=12, seed=1)["team"]}
-    # Row 7 keeps its memory; its teammates and all critics get other memories.
+    # Row 7 keeps its memory; the memories of its teammates and of all critics change.
     elsewhere: LstmStates = tuple(th.where((th.arange(12) == 7).view(1, -1, 1), s, th.randn_like(s)) for s in actor)
     th.manual_seed(3)
     actions, values, log_prob, states = policy(obs, RNNStates(actor, critic), starts)
@@ -422,7 +422,7 @@ CUE_SETTINGS = {"n_steps": 12, "batch_size": 384, "n_epochs": 8, "learning_rate"
 
 @pytest.mark.parametrize(("name", "solves"), [("SAFLstmPolicy", True), ("SAFPolicy", False)])
 def test_a_cue_seen_earlier_decides_the_right_action(name: str, solves: bool) -> None:
-    # The cue is gone when it pays to name it: with memory all are named, without memory half of them.
+    # The cue is no longer visible at the rewarded step: with memory all actions match it, without memory half of them.
     algorithm: type[OnPolicyAlgorithm] = RecurrentPPO if solves else PPO
     sizes = sizes_of(name) | ({"lstm_hidden_size": 16} if solves else {})
     model = algorithm(name, CueTeams("own"), policy_kwargs=sizes, seed=0, device="cpu", **CUE_SETTINGS)  # type: ignore[arg-type]
@@ -432,7 +432,7 @@ def test_a_cue_seen_earlier_decides_the_right_action(name: str, solves: bool) ->
 
 
 def error_of_last_values(policy: TeamRecurrentPolicy) -> float:
-    """Mean squared error of the values just before the only reward."""
+    """Return the mean squared error of the values just before the only reward."""
     venv = CueTeams("mate")
     venv.seed(5)
     obs, hidden = venv.reset(), policy.lstm_actor.hidden_size
@@ -454,7 +454,7 @@ def error_of_last_values(policy: TeamRecurrentPolicy) -> float:
     ],
 )
 def test_a_critic_remembers_what_a_teammate_saw(name: str, kwargs: dict[str, Any], knows: bool) -> None:
-    # -1 or 1 is paid, as the teammate's cue said two steps ago. Who cannot know it is wrong by 1, squared.
+    # The reward is -1 or 1, as the teammate's cue two steps ago. Without that information the squared error is 1.
     sizes = sizes_of(name) | {"lstm_hidden_size": 16} | kwargs
     settings: dict[str, Any] = CUE_SETTINGS | {"gae_lambda": 1.0, "vf_coef": 1.0}
     model = RecurrentPPO(name, CueTeams("mate"), policy_kwargs=sizes, seed=0, device="cpu", **settings)
@@ -464,7 +464,7 @@ def test_a_critic_remembers_what_a_teammate_saw(name: str, kwargs: dict[str, Any
 
 
 def test_time_limits_are_bootstrapped_from_single_rows() -> None:
-    # The only episode that ends within the rollout does so by a time limit, for 12 rows.
+    # The only episode that ends within the rollout is truncated, for 12 rows.
     model = make_model("SAFLstmPolicy", n_epochs=1)
     asked: list[int] = []
     predict_values = model.policy.predict_values
@@ -509,7 +509,7 @@ def test_recurrent_policy_saves_and_loads(kwargs: dict[str, Any], tmp_path: Path
     model = make_model("SAFLstmPolicy", policy_kwargs=kwargs)
     before = copy.deepcopy(model.policy)
     model.learn(96)
-    # The pool's choice begins with weights near 0, and so do the gradients of what comes before and after them.
+    # The pool's choice starts with weights near 0, and so do the gradients of the layers around it.
     assert unchanged(before, model.policy) <= {"actor.query_net.0.weight", "actor.signature_keys"}
 
 
@@ -525,7 +525,7 @@ def test_without_the_critics_lstm_it_is_ppos_critic() -> None:
 
 
 def evaluate(policy: TeamPolicy, obs: dict[str, th.Tensor], actions: th.Tensor) -> tuple[Any, Any, Any]:
-    """Values, log-likelihoods and entropies of 30 rows, as the policy's algorithm asks for them."""
+    """Evaluate 30 rows as the policy's algorithm does: values, log-likelihoods and entropies."""
     if isinstance(policy, TeamRecurrentPolicy):
         generator = th.Generator().manual_seed(1)
         states = [tuple(th.randn(1, 6, HIDDEN, generator=generator) for _ in range(2)) for _ in range(2)]
@@ -562,7 +562,7 @@ def test_naive_encoding_gives_the_same_loss_and_gradients(kind: str, family: str
 
 
 def enumerated(policy: TeamMaskablePolicy, obs: dict[str, th.Tensor], masks: np.ndarray) -> tuple[th.Tensor, th.Tensor]:
-    """All joint actions (J, D), and the exact probability of each for each row (B, J), by the definition."""
+    """Enumerate all joint actions (J, D), and their exact probabilities for each row (B, J), by definition."""
     pool, choices = policy.actor, choices_of(policy.action_space)
     assert isinstance(pool, PolicyPool)
     log_weights, parameters = pool.evaluate(policy.features_extractor(obs["obs"]))
@@ -654,8 +654,8 @@ def test_masks_that_allow_nothing_teach_nothing() -> None:
 
 
 def test_the_mask_leaves_the_choice_among_policies_as_it_is() -> None:
-    # Two policies, chosen alike: one sure of action 0, one undecided between 1 and 2. Masking 1 makes the second sure
-    # of 2, and both actions as likely. Masking the mixture (1/2, 1/4, 1/4) would give 2/3 and 1/3.
+    # Two policies, equally likely: one always takes action 0, one is undecided between 1 and 2. Masking 1 makes the
+    # second one always take 2, and both actions equally likely. Masking the mixture (1/2, 1/4, 1/4) gives 2/3, 1/3.
     parameters = th.tensor([[[50.0, 0.0, 0.0], [-50.0, 0.0, 0.0]]])
     masked = masked_parameters(ACTIONS["discrete"], parameters, th.tensor([[True, False, True]]))
     log_weights = th.full((1, 2), 0.5).log()

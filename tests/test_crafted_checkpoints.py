@@ -1,7 +1,7 @@
 """
-Checkpoints with right checksums and wrong contents: refused by an error of ours, or trained on; never a crash.
+Checkpoints with correct checksums and wrong contents either raise our errors or train; they never crash.
 
-``CRAFTED=1000 python -m pytest tests/test_crafted_checkpoints.py`` tries as many.
+``CRAFTED=1000 python -m pytest tests/test_crafted_checkpoints.py`` tries 1,000.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def learn(algorithm: str, folder: Path, rollouts: int) -> Any:
 
 @pytest.fixture(scope="module")
 def trees(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A checkpoint of each algorithm, as data."""
+    """Return a checkpoint of each algorithm, as data."""
     found = {}
     for algorithm in ALGORITHMS:
         folder = tmp_path_factory.mktemp(algorithm)
@@ -82,7 +82,7 @@ def trees(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def resume_from(algorithm: str, tree: Any, monitor: bytes, folder: Path) -> None:
-    """Go on from a tree, in a folder of a run with a monitor.csv."""
+    """Resume from a tree, in a folder of a run with a monitor.csv."""
     (folder / "ck").mkdir(parents=True)
     (folder / "ck" / "checkpoint-000000000036.ckpt").write_bytes(encode(tree, "1.0"))
     (folder / "monitor.csv").write_bytes(monitor)
@@ -176,7 +176,7 @@ EXTREMES = (
 
 
 def mutate_array(array: Any, rng: random.Random) -> Any:
-    """Other values, another shape, another dtype; sometimes one value less or more, or two exchanged."""
+    """Change values, shape or dtype; sometimes remove or add one value, or exchange two."""
     array = np.array(array)
     how = rng.randrange(7)
     if how == 0:
@@ -202,7 +202,7 @@ def mutate_array(array: Any, rng: random.Random) -> Any:
 
 
 def mutate(tree: Any, rng: random.Random) -> None:
-    """Change one entry, drawn by its depth first: arrays of games and leaves of small dicts alike."""
+    """Change one entry; its depth is drawn first, so arrays of games and leaves of small dicts are equally likely."""
     found = list(places(tree))
     owner, key = rng.choice(found)
     value = owner[key]

@@ -1,4 +1,4 @@
-"""Training on one level after another: sb3_saf.Curriculum, make_team_env(curriculum=), and the key of settings."""
+"""Training on several levels in order: sb3_saf.Curriculum, make_team_env(curriculum=), and the settings key."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _staged(**kwargs: Any) -> sb3_saf.CentralizedValueWrapper:
 
 
 class Played(NamedTuple):
-    """What a step of the vector environment gave, and the coordination after it."""
+    """Result of a step of the vector environment, and the coordination after it."""
 
     coordination: int
     obs: dict[str, np.ndarray]
@@ -56,7 +56,8 @@ def test_the_end_of_a_stage_truncates_what_is_not_over() -> None:
     env = _staged(time_limit="bootstrap")
     env.reset()
     seen = _play(env, 20)
-    # Episodes of 5 steps: the first stage ends with two whole ones, the second, of 6 steps, in the first step of one.
+    # Episodes of 5 steps: the first stage ends with two whole episodes, the second, of 6 steps, in the first step of
+    # one.
     assert [step for step, played in enumerate(seen) if played.dones.all()] == [4, 9, 14, 15]
     infos = seen[15].infos
     assert all(info["TimeLimit.truncated"] for info in infos)

@@ -1,4 +1,4 @@
-"""The diagnosis of trained teams reads the folder of an experiment."""
+"""The diagnosis of trained teams reads an experiment's folder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_saf.experiments.grid import RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.settings import load_settings
 
-#: A network of another shape than the zoo's: the diagnosis must read what was trained from the folder.
+#: A network shape other than the zoo's: the diagnosis must read the trained shape from the folder.
 OVERRIDES = {"policy_kwargs": {"features_extractor_class": "LightEncoder", "net_arch": [32]}}
 
 
@@ -46,7 +46,7 @@ def test_it_looks_into_every_trained_team(
     diagnosis.main()
     numbers = json.loads(kept.read_text())
     ippo, saf = numbers["TeamSupport c2-h3 ippo"], numbers["TeamSupport c2-h3 saf"]
-    assert saf["knowledge_source/read_entropy"] > 0.9  # untrained: nothing is chosen
+    assert saf["knowledge_source/read_entropy"] > 0.9  # untrained: attention is nearly uniform
     assert 0 <= saf["pool/zone_dependence"] < 0.1
     assert not any(name.startswith(("pool", "message")) for name in ippo)
     assert 0 <= ippo["greedy"] <= 25

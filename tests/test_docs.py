@@ -1,4 +1,4 @@
-"""The pages for readers: their code runs, their links lead somewhere, the names in them exist."""
+"""The documentation pages: their code runs, their links resolve, the names in them exist."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def text_of(page: Path) -> str:
-    """A page without its fenced blocks."""
+    """Return a page without its fenced blocks."""
     return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
 def heading_anchors(page: Path) -> set[str]:
-    """The anchors that hosts of Markdown make of headings."""
+    """Return the anchors that Markdown hosts create for headings."""
     titles = re.findall(r"^#+ (.+)$", text_of(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -66,8 +66,8 @@ class Page(NamedTuple):
     A page whose Python blocks are run, in order.
 
     :param path: of the page
-    :param small: what its numbers are replaced by, so that it is quick
-    :param given: names that it leaves to the reader
+    :param small: replacements of numbers, so that it runs fast
+    :param given: names that the page does not define
     """
 
     path: str

@@ -1,4 +1,4 @@
-"""Tiny PettingZoo games whose every number is known, for tests of whatever carries games."""
+"""Tiny PettingZoo games whose every number is known, for tests of wrappers and vector environments."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class CounterEnv(ParallelEnv[str, Any, Any]):
     def close(self) -> None:
         self.closed = True
 
-    # What callers reach through get_attr, env_method, ...
+    # Called through get_attr, env_method, ...
 
     def poke(self, amount: int = 1) -> int:
         self.pokes += amount
@@ -130,7 +130,7 @@ class CounterEnv(ParallelEnv[str, Any, Any]):
         return function(self.level)
 
     def action_masks(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """Agent ``i`` may do ``i`` only."""
+        """Agent ``i`` may only take action ``i``."""
         return {a: np.arange(4) == self._index(a) for a in self.agents}
 
     @property
@@ -139,7 +139,7 @@ class CounterEnv(ParallelEnv[str, Any, Any]):
 
 
 class ImageEnv(CounterEnv):
-    """The same with pictures that hold the draw in every pixel."""
+    """The same with images that show the draw in every pixel."""
 
     def _make_observation_space(self) -> spaces.Space[Any]:
         return spaces.Box(0, 255, (8, 8, 3), np.uint8)
@@ -164,7 +164,7 @@ class DictEnv(CounterEnv):
 
 
 class EagerEnv(CounterEnv):
-    """Bad on purpose: has its generator before the first reset, so copies of it play the same game."""
+    """Faulty: creates its generator before the first reset, so copies of it play the same game."""
 
     def __init__(self, **kwargs: Any):
         super().__init__(**kwargs)
@@ -172,7 +172,7 @@ class EagerEnv(CounterEnv):
 
 
 class ReusingEnv(CounterEnv):
-    """Allowed, but dangerous to share: returns the same arrays and the same infos at every step."""
+    """Returns the same arrays and infos at every step, which is allowed."""
 
     def __init__(self, **kwargs: Any):
         super().__init__(**kwargs)
@@ -195,7 +195,7 @@ class ReusingEnv(CounterEnv):
 
 
 class UnequalEnv(CounterEnv):
-    """Agents differ in their observation space, or in their action space."""
+    """Agents have different observation spaces or action spaces."""
 
     def __init__(self, kind: str, **kwargs: Any):
         self.kind = kind
@@ -215,7 +215,7 @@ class UnequalEnv(CounterEnv):
 
 
 class BareEnv(ParallelEnv[str, Any, Any]):
-    """As little as a ParallelEnv may have: no ``metadata``, no ``render_mode``; ended agents stay in ``agents``."""
+    """A minimal ParallelEnv: no ``metadata``, no ``render_mode``; ended agents stay in ``agents``."""
 
     def __init__(self) -> None:
         self.possible_agents = ["left", "right"]
@@ -256,14 +256,14 @@ class LateEnv(CounterEnv):
 
 class TellingEnv(CounterEnv):
     """
-    Agents join and die, have action masks, and there is a state: everything that rows may tell.
+    Uses everything that rows can contain: agents that join and die, action masks, and a state.
 
-    Agent ``i`` may do action ``a`` at step ``t`` if ``a + i + t`` is even; anything else ends the test. The state is
+    Agent ``i`` may take action ``a`` at step ``t`` if ``a + i + t`` is even; other actions end the test. The state is
     ``[step, number of agents]``.
 
-    :param joins: agent's index to the step after which it is there
+    :param joins: agent's index to the step after which it has joined
     :param masks: where masks are: "observation", "info" or nowhere
-    :param stuck: step at which agent 0 may do nothing
+    :param stuck: step at which agent 0 has no legal action
     """
 
     def __init__(
@@ -316,16 +316,16 @@ class TellingEnv(CounterEnv):
 
 
 class OddError(BaseException):
-    """Not an Exception."""
+    """Not a subclass of Exception."""
 
 
 class FaultyEnv(CounterEnv):
     """
-    Goes wrong at the second step if its generator was given the chosen seed.
+    Fails at the second step if its generator was given the chosen seed.
 
-    :param seed: of the game that goes wrong, None for all games
-    :param how: "raise", "exit", "die" (the process is gone at once), "shape", "dtype" (of the observation),
-        "info" (one that cannot be copied), "odd" (an exception that is none of Exception's)
+    :param seed: of the failing game, None for all games
+    :param how: "raise", "exit", "die" (the process ends at once), "shape", "dtype" (of the observation),
+        "info" (one that cannot be copied), "odd" (an error that is no Exception)
     """
 
     def __init__(self, how: str, seed: int | None = None, **kwargs: Any):
@@ -362,7 +362,7 @@ class UnpicklableEnv(CounterEnv):
 
 
 class LazyEnv(CounterEnv):
-    """Makes its generator when it draws for the first time, which is not in ``reset``; later episodes go on with it."""
+    """Creates its generator when it first draws, which is after ``reset``; later episodes continue with it."""
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -389,9 +389,9 @@ class GlobalEnv(CounterEnv):
 
 class StateEnv(CounterEnv):
     """
-    Gives its state as plain data.
+    Has its state as plain data.
 
-    :param forgets: whether it forgets its generator
+    :param forgets: whether the state lacks the generator
     """
 
     def __init__(self, forgets: bool = False, **kwargs: Any):
@@ -411,7 +411,7 @@ class StateEnv(CounterEnv):
 
 
 class StreamEnv(CounterEnv):
-    """Its future is in an object that cannot be copied."""
+    """Draws from an object that cannot be copied."""
 
     def __init__(self, **kwargs: Any):
         super().__init__(**kwargs)
@@ -429,13 +429,13 @@ class TracingEnv(CounterEnv):
         self.path = path
 
     def close(self) -> None:
-        if self.episode:  # the example from which the spaces are read never plays
+        if self.episode:  # the copy from which the spaces are read never plays
             with open(self.path, "a") as file:
                 file.write("closed\n")
 
 
 class OuterWrapper(BaseParallelWrapper[str, Any, Any]):
-    """A wrapper with an attribute of its own."""
+    """A wrapper with its own attribute."""
 
     def __init__(self, env: ParallelEnv[str, Any, Any]):
         super().__init__(env)
@@ -443,7 +443,7 @@ class OuterWrapper(BaseParallelWrapper[str, Any, Any]):
 
 
 class LockedFactory:
-    """Cannot be pickled itself."""
+    """A factory that cannot be pickled."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -456,7 +456,7 @@ MADE: list[CounterEnv] = []
 
 
 def recorded_env() -> CounterEnv:
-    """Keep what was made in ``MADE``."""
+    """Record what was created in ``MADE``."""
     MADE.append(CounterEnv())
     return MADE[-1]
 
@@ -465,5 +465,5 @@ SINGLETON = CounterEnv()
 
 
 def same_env_again() -> CounterEnv:
-    """A factory that is none."""
+    """Return the same environment every time."""
     return SINGLETON

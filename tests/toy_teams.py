@@ -1,4 +1,4 @@
-"""Small teams for tests of policies: spaces, rows, and a vector environment whose rows carry the joint view."""
+"""Small teams for tests of policies: spaces, rows, and a vector environment with joint observations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class CodeSpace(spaces.Box):
 
 
 def samples(space: spaces.Space[Any], count: int, seed: int = 0) -> npt.NDArray[Any]:
-    """Random own observations (count, *shape)."""
+    """Return random own observations (count, *shape)."""
     space.seed(seed)
     return np.stack([np.asarray(space.sample()) for _ in range(count)])
 
@@ -37,7 +37,7 @@ def samples(space: spaces.Space[Any], count: int, seed: int = 0) -> npt.NDArray[
 def team_rows(
     own: spaces.Space[Any], n_agents: int = 3, n_games: int = 4, n_views: int = 5, seed: int = 0
 ) -> dict[str, th.Tensor]:
-    """Rows of whole teams whose views are drawn from a few, so that many repeat."""
+    """Return rows of whole teams with few distinct views, so that many repeat."""
     rng = np.random.default_rng(seed)
     views = samples(own, n_views, seed)[rng.integers(n_views, size=(n_games, n_agents))]
     return {
@@ -54,7 +54,7 @@ def gather_rows(obs: PyTorchObs, rows: Sequence[int] | th.Tensor) -> dict[str, t
 
 
 def to_numpy(obs: dict[str, th.Tensor]) -> dict[str, np.ndarray]:
-    """Rows as an environment gives them."""
+    """Return rows as an environment does."""
     return {key: value.numpy() for key, value in obs.items()}
 
 
