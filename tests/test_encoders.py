@@ -1,4 +1,4 @@
-"""Encoders: sizes, layouts, and tiles that are the same as the pictures they stand for."""
+"""Encoders: sizes, layouts, and tile codes that equal the images they encode."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CHANNELS_LAST = spaces.Box(0, 255, (12, 12, 3), np.uint8)
 
 
 def painted(codes: th.Tensor, atlas: np.ndarray) -> th.Tensor:
-    """(K, C, H, W) pictures of tile codes, cell by cell."""
+    """Draw (K, C, H, W) images of tile codes, cell by cell."""
     n_views, rows, columns = codes.shape
     size = atlas.shape[1]
     pictures = np.zeros((n_views, 3, rows * size, columns * size), dtype=np.uint8)

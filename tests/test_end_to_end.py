@@ -1,4 +1,4 @@
-"""Stock PPO on the real tasks: the same seed gives the same weights, whatever the backend, and teams learn."""
+"""PPO on the real tasks: the same seed gives the same weights with any backend, and teams learn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIGHT: dict[str, Any] = {"features_extractor_class": sb3_saf.LightEncoder}
 
 
 def train_as_typed(backend: Any = None) -> PPO:
-    """The call of the README's users, with fewer epochs and steps; the paper's CNN, SB3's buffer and batch size."""
+    """Train as in the README, with fewer epochs and steps, the paper's CNN, and SB3's buffer and batch size."""
     env = sb3_saf.make_team_env("TeamTogether", n_envs=4, seed=0, backend=backend)
     with pytest.warns(UserWarning, match="You have specified a mini-batch size of 64"):
         model = PPO("SAFPolicy", env, n_steps=25, seed=0, n_epochs=1)

@@ -1,4 +1,4 @@
-"""Recorded episodes come out again bit for bit: those of the released environments, and our own golden ones."""
+"""Recorded episodes are reproduced bit for bit: those of the released environments, and our golden ones."""
 
 from __future__ import annotations
 

@@ -32,12 +32,12 @@ def teams(**kwargs: Any) -> CentralizedValueWrapper:
 
 
 def constant(*per_game: float) -> Any:
-    """Each agent of game e gets ``per_game[e]`` per step."""
+    """Reward each agent of game e with ``per_game[e]`` per step."""
     return lambda game, agent, step: per_game[game]
 
 
 class StillPolicy:
-    """Does nothing, and remembers what it was told."""
+    """Does nothing, and records the arguments of its calls."""
 
     def __init__(self) -> None:
         self.starts: list[Array | None] = []
@@ -66,14 +66,14 @@ class TestEvaluatePolicy:
         )
 
     def test_sb3_alone_counts_agents(self) -> None:
-        """The failing baseline: with 3 agents, 2 "episodes" are two agents of one game."""
+        """Without our evaluation, with 3 agents, 2 "episodes" are two agents of one game."""
         env = teams(lengths=(3, 2), n_agents=3, reward=constant(1, 10))
         with pytest.warns(UserWarning, match="one agent of a team of 3"):
             returns, _ = evaluate_rows(StillPolicy(), env, 2, return_episode_rewards=True, warn=False)
         assert returns == [20, 20]
 
     def test_short_episodes_are_not_favoured(self) -> None:
-        # Taking the first four to end would take three or four of the short game, and mean 3 x (1 to 3.25).
+        # The first four episodes to end would include three or four of the short game, with a mean of 3 x (1 to 3.25).
         env = teams(lengths=(10, 1), reward=constant(1, 1))
         returns, lengths = evaluate_policy(StillPolicy(), env, 4, return_episode_rewards=True)
         assert sorted(returns) == [3, 3, 30, 30]

@@ -1,4 +1,4 @@
-"""The example programs run, on environments that are installed."""
+"""The example programs run on installed environments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from examples.train_pettingzoo import ENVIRONMENTS, main
 NEEDS = {"multiwalker": "Box2D", "pursuit": "pettingzoo.sisl.pursuit_v5", "hanabi": "pyspiel"}
 
 
-@pytest.mark.filterwarnings("ignore")  # those of other projects
+@pytest.mark.filterwarnings("ignore")  # warnings of other projects
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_environments_of_others_train(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

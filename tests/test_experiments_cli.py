@@ -1,4 +1,4 @@
-"""Listing, planning, and one-line errors with a remedy."""
+"""Listing, planning, and one-line error messages."""
 
 from __future__ import annotations
 

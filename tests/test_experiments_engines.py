@@ -1,4 +1,4 @@
-"""Cells in processes of this machine: failures, deaths, interruptions; the real worker is in test_experiments_run."""
+"""Cells in local processes: failures, deaths, interruptions; test_experiments_run tests the real worker."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ DRIVER = """
 
 
 def test_control_c_is_for_the_driver_alone(tmp_path: Path) -> None:
-    """A terminal sends it to every process of the group; workers shall write a checkpoint instead."""
+    """A terminal sends it to every process of the group, but workers should write a checkpoint instead."""
     root = str(Path(__file__).parents[1])
     process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(DRIVER.format(folder=str(tmp_path)))],
@@ -79,7 +79,7 @@ def test_control_c_is_for_the_driver_alone(tmp_path: Path) -> None:
 
 
 def test_a_cell_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
-    """However that ended: its end of the pipe is closed by the system."""
+    """In any case: the system closes the other end of the pipe."""
     code = "import threading, time; from sb3_saf.experiments.cli import _end_with_stdin as end;"
     code += "threading.Thread(target=end, daemon=True).start(); print('up', flush=True); time.sleep(600)"
     worker = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -1,4 +1,4 @@
-"""The paper's experiments and one's own: what is in each, and what does not fit."""
+"""The paper's experiments and custom ones: what is in each, and what does not fit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def trained(grid: Grid) -> list[Cell]:
     return [cell for cell in grid.cells if cell.is_trained]
 
 
-#: Methods x tasks x levels x three seeds, and the levels that a random team plays.
+#: Methods x tasks x levels x three seeds, and the levels of the random team.
 SIZES = {
     "coordination": (3 * 3 * 3 * 3, 3 * 3 * 3),
     "heterogeneity": (3 * 3 * 5 * 3, 3 * 5 * 3),

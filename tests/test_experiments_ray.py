@@ -1,4 +1,4 @@
-"""The same experiments on a real Ray cluster of several nodes on this machine, one of which is killed."""
+"""Experiments on a real Ray cluster of several nodes on this machine, one of which is killed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.test_training_commands import failed
 
 CHOICE = Selection((0,), ("ippo", "mappo"))
 SMOKE = RunConfig("smoke")
-#: Ray's own default is to wait some 15 s before it takes a silent node for dead.
+#: By default, Ray waits about 15 s before it considers a silent node dead.
 IMPATIENT = {
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 1_000,
@@ -36,7 +36,7 @@ IMPATIENT = {
 }
 
 
-# First: the cluster of another test answers for a moment after its end.
+# First: the cluster of another test still answers for a moment after it was stopped.
 def test_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("ray")
     words = ["run", "joint", "--size", "smoke", "--address", "auto", "-f", str(tmp_path)]
@@ -47,7 +47,7 @@ def test_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """A head that runs nothing and two nodes of one processor each."""
+    """Start a head node that runs no jobs and two nodes with one processor each."""
     pytest.importorskip("ray")
     require_ray()
     from ray.cluster_utils import Cluster
@@ -62,9 +62,9 @@ def cluster() -> Iterator[Any]:
 
 class NodeKiller(RayEngine):
     """
-    An engine that kills a node a second after the first cell's end, when both nodes are busy again.
+    An engine that kills a node one second after the first cell has finished, when both nodes are busy again.
 
-    :param cluster: whose node
+    :param cluster: with the node
     """
 
     def __init__(self, cluster: Any) -> None:
@@ -100,7 +100,7 @@ def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any,
     assert (tmp_path / "ray/cells/TeamSupport-c2-h2/mappo/seed-0/model.zip").exists()
 
 
-#: Starts Ray as ``--ray`` does, and prints the addresses at which its processes listen.
+#: Starts Ray as ``--ray`` does, and prints the addresses on which its processes listen.
 LISTENING = """
 import psutil
 from sb3_saf.experiments.engines import RayEngine
@@ -153,13 +153,13 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any,
 
 
 def began(folder: Path) -> str:
-    """Return the line of monitor.csv that has the time of the first start."""
+    """Return the line of monitor.csv with the time of the first start."""
     return (folder / "training" / "monitor.csv").read_text().splitlines()[0]
 
 
 @pytest.mark.parametrize("is_shared", [True, False])
 def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, tmp_path: Path) -> None:
-    """There, what is killed goes on; elsewhere the result travels."""
+    """On such a node, killed cells resume; from other nodes, results are sent."""
     experiment = find_experiment("joint")
     (level, *_) = experiment.tests()
     job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}))

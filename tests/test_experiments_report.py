@@ -1,4 +1,4 @@
-"""What reports say, complete or not, of the paper's experiments and of one's own."""
+"""Reports, complete or incomplete, of the paper's experiments and of custom ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ N_CELLS = (2 + 1) * len(LEVELS) * 2
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of two tasks and two methods."""
+    """Create a finished run of two tasks and two methods."""
     path = tmp_path_factory.mktemp("coordination")
     selection = Selection((0, 1), ("saf", "ippo"), tuple(f"{task}-v0" for task in TASKS))
     config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80})
@@ -45,7 +45,7 @@ def report(folder: Path, *words: str, name: str = "coordination") -> str:
 
 
 def part_of(page: str, heading: str) -> str:
-    """Return what stands under a heading that begins so."""
+    """Return the text below a heading that starts with the given words."""
     return page.split(f"## {heading}")[1].split("\n## ")[0]
 
 
@@ -226,7 +226,7 @@ def test_a_winner_needs_intervals_apart() -> None:
     assert near is not None
     assert near.difference.high < 0
     assert near.verdict == "no winner: intervals overlap"
-    # Two seeds that agree are no proof.
+    # Two equal seeds are not enough.
     two = compare(table_of([1.0, 1.0]), table_of([2.0, 2.0]))
     assert two is not None
     assert (two.first, two.verdict) == (Estimate(1.0, 1.0, 1.0), "no winner: fewer than 3 seeds")
@@ -250,7 +250,7 @@ def test_aggregates_compare_like_with_like() -> None:
 
 @pytest.mark.parametrize("name", ["joint", "ood-ablation"])
 def test_other_experiments_run_and_report(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One method, one seed: nothing is known of spreads, and the page says so by leaving intervals out."""
+    """With one method and one seed there is no spread, so the page leaves intervals out."""
     monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
     monkeypatch.chdir(tmp_path)
     words = ["--size", "smoke", "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "0"]
@@ -267,7 +267,7 @@ def test_other_experiments_run_and_report(name: str, tmp_path: Path, monkeypatch
 
 
 def test_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any environment that ``sb3_saf.train`` takes, with a parameter that is varied."""
+    """Any environment of ``sb3_saf.train``, with a varied parameter."""
     monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
     monkeypatch.chdir(tmp_path)
     words = ["--env", "tests.toy_envs:CounterEnv", "--vary", "max_cycles:[3,5]", "--size", "smoke", "-n", "24"]

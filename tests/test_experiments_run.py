@@ -1,4 +1,4 @@
-"""Running: what is kept, what is never run again, what happens to a run that is killed."""
+"""Running experiments: what is kept, what is never run again, what happens to a killed run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sb3_saf.training.seeds import evaluation_seed
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 
 SMOKE = RunConfig("smoke")
-#: Two methods that are made in no time, and a random team, at two levels of ``joint``.
+#: Two methods that train fast, and a random team, at two levels of ``joint``.
 TWO = Selection((0, 1), ("ippo", "mappo"), (), ("2", "3"))
 N_CELLS = 2 * 2 * 2 + 2 * 2
 ONE = Selection((0,), ("ippo",), (), ("2",))
@@ -52,7 +52,7 @@ def run_inline(
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run, for reading only."""
+    """Return a finished run, read-only."""
     folder = tmp_path_factory.mktemp("undisturbed")
     summary, engine = run_inline(folder)
     assert summary == Summary(N_CELLS, [], [])
@@ -123,7 +123,7 @@ def test_finished_cells_are_never_run_again(undisturbed: Path) -> None:
 
 
 def test_cells_depend_on_nothing_but_themselves(undisturbed: Path, tmp_path: Path) -> None:
-    """In the other order, in two parts, after other cells: the same numbers."""
+    """In reverse order, in two parts, after other cells: the same numbers."""
     for number in (2, 1):
         run_inline(tmp_path, replace(TWO, seeds=(1, 0), methods=("mappo", "ippo")), shard=Shard(number, 2))
     ours, theirs = (read_table(folder / "joint" / "table.csv") for folder in (tmp_path, undisturbed))
@@ -131,7 +131,7 @@ def test_cells_depend_on_nothing_but_themselves(undisturbed: Path, tmp_path: Pat
 
 
 def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path: Path) -> None:
-    """With the real workers; one of them is killed as well, and its cell tried again."""
+    """With the real workers; one of them is killed too, and its cell retried."""
     words = ["joint", "--size", "smoke", "--methods", "ippo", "--levels", "2", "--seeds", "0", "1", "--workers", "1"]
     words += ["-f", str(tmp_path)]
     process = subprocess.Popen([sys.executable, "-m", "sb3_saf.experiments", "run", *words], stdout=subprocess.DEVNULL)
@@ -161,7 +161,7 @@ def worker_of(driver: int) -> int:
 
 
 def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> None:
-    """What was trained for one experiment is only tested for another. A fresh QPLEX would take random actions only."""
+    """Cells trained for one experiment are only tested for another. An untrained QPLEX would act at random."""
     one, short = Selection((0,), ("qplex",), ("TeamSupport-v0",)), replace(SMOKE, overrides={"game_steps": 40})
     run_inline(tmp_path / "both", one, "coordination", short)
     summary, engine = run_inline(tmp_path / "both", one, "ood-coordination", short)
@@ -176,7 +176,7 @@ def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> No
 
 
 def job_in(folder: Path, method: str = "ippo", tests: int = 1, **options: Any) -> Path:
-    """Make the folder of a job: a cell at c=2 of TeamSupport."""
+    """Create the folder of a job: a cell at c=2 of TeamSupport."""
     folder.mkdir(parents=True)
     levels = [Level.of(coordination=c, heterogeneity=1) for c in (2, 1)]
     cell = Cell(method, "TeamSupport-v0", levels[0], 0, tuple(levels[:tests]))
@@ -246,7 +246,7 @@ def test_other_settings_are_refused(undisturbed: Path) -> None:
 
 
 def test_changed_files_of_zoo_configs_are_refused(undisturbed: Path, tmp_path: Path) -> None:
-    """As if the YAML had said something else when the cell was trained."""
+    """The YAML differs from the one with which the cell was trained."""
     folder = shutil.copytree(undisturbed, tmp_path / "copy")
     path = cell_of(folder) / "config.json"
     config = json.loads(path.read_text())
@@ -263,7 +263,7 @@ def test_differences() -> None:
 
 class Interloper(InlineEngine):
     """
-    Starts another run in the same folder while it has its first cell.
+    Starts another run in the same folder during its first cell.
 
     :param folder: of the results
     """
@@ -280,11 +280,11 @@ class Interloper(InlineEngine):
 
 
 def test_runs_at_once_divide_the_cells(undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """``run`` and ``run --shard 1/2`` in one folder: each cell is run by one of them."""
+    """``run`` and ``run --shard 1/2`` in one folder: each cell is run by only one of them."""
     engine = Interloper(tmp_path)
     summary, _ = run_inline(tmp_path, replace(ONE, seeds=(0, 1)), engine=engine)
     assert engine.other is not None
-    assert (engine.other.finished, len(engine.other.elsewhere)) == (1, 1)  # of two, the first is at work
+    assert (engine.other.finished, len(engine.other.elsewhere)) == (1, 1)  # the other one of two is running
     assert (summary.finished, len(summary.elsewhere)) == (3, 1)
     assert "1 cells were left to another run" in capsys.readouterr().out
     ours = read_table(tmp_path / "joint" / "table.csv")
@@ -329,7 +329,7 @@ def test_damaged_settings_are_named_and_written_anew(
 
 
 def test_a_cell_appears_at_once_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cut off while its files are moved, it is not there."""
+    """If interrupted while its files are moved, it does not exist."""
 
     def cut_off(source: Path, target: Path) -> None:
         raise KeyboardInterrupt
@@ -354,7 +354,7 @@ def test_curve(tmp_path: Path) -> None:
 
 
 def struck_at(monkeypatch: pytest.MonkeyPatch, step: int | None) -> list[int]:
-    """Count the steps that vector environments play; at one of them the process dies, as far as anybody can tell."""
+    """Count the steps of vector environments; simulate the death of the process at one of them."""
     played, play = [0], NativeVecEnv.step_wait
 
     def counted(self: NativeVecEnv) -> Any:
@@ -368,7 +368,7 @@ def struck_at(monkeypatch: pytest.MonkeyPatch, step: int | None) -> list[int]:
 
 
 def attempt(folder: Path, step: int | None = None) -> int:
-    """Do a job, until it is struck if a step is given; return the steps that it played."""
+    """Do a job; if a step is given, die at this step; return the number of steps played."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         played = struck_at(monkeypatch, step)
         if step is None:
@@ -385,7 +385,7 @@ def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(method: str, tmp_pat
     n_steps = attempt(whole)
     n_tested = 2 * 10  # two tests, episodes of 10 steps
     first = attempt(killed, (n_steps - n_tested) * 2 // 3)
-    second = attempt(killed, (n_steps - n_tested) // 3 + 15)  # in a test: what is trained stays
+    second = attempt(killed, (n_steps - n_tested) // 3 + 15)  # in a test: the trained model is kept
     rest = attempt(killed)
     assert rest == n_tested
     assert first + second < n_steps + (n_steps - n_tested) / 2
@@ -393,7 +393,7 @@ def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(method: str, tmp_pat
 
 
 def what_counts(cell_folder: Path) -> dict[str, Any]:
-    """Return all that a cell's folder tells but times."""
+    """Return everything in a cell's folder except times."""
     tests = {path.name: json.loads(path.read_text())["returns"] for path in (cell_folder / "tests").iterdir()}
     files = sorted(str(path.relative_to(cell_folder)) for path in cell_folder.rglob("*") if path.is_file())
     with zipfile.ZipFile(cell_folder / "model.zip") as model:
@@ -413,7 +413,7 @@ def test_checkpoints_of_other_settings_are_left_alone_and_finished_cells_keep_no
     (failed, *_) = summary.failed
     folder = results.unfinished(failed)
     assert list(folder.glob("training/checkpoints/*.ckpt"))
-    (folder / "config.json").write_text("{}")  # as if the settings had been others
+    (folder / "config.json").write_text("{}")  # as if the settings had been different
     run_inline(tmp_path, ONE)
     assert results.is_finished(failed) and not (tmp_path / "unfinished").exists()
 

@@ -1,4 +1,4 @@
-"""Actors as files: what is written, who can read it, and what strangers can do with it."""
+"""Exported actors: content of the files, who can read them, and untrusted files."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ OWN: dict[str, spaces.Space[Any]] = {
 
 
 def exported(policy: TeamActorCriticPolicy | PPO, folder: Path, **kwargs: Any) -> Path:
-    """An export without ONNX, whose writing takes a second."""
+    """Create an export without ONNX, whose writing takes a second."""
     return export_actors(policy, folder, **({"onnx": False} | kwargs))
 
 
 def predicted(policy: TeamActorCriticPolicy, obs: np.ndarray, agent: int, deterministic: bool = True) -> np.ndarray:
-    """What the trained model does, told nothing but an agent's own observation and index."""
+    """Return the trained model's actions, given only an agent's own observation and index."""
     return policy.predict({"obs": obs, "agent": np.full(len(obs), agent)}, deterministic=deterministic)[0]
 
 
@@ -100,7 +100,7 @@ def test_decides_and_draws_as_the_model_does(kind: str, action: str, tmp_path: P
         th.manual_seed(seed)
         np.testing.assert_allclose(actor.act(own, deterministic=False), drawn[-1], atol=1e-5)
         np.testing.assert_allclose(actor.act(own, deterministic=False, rng=seed), drawn[-1], atol=1e-5)
-    assert not np.array_equal(drawn, actor.act(obs))  # so that drawing is not the same as deciding
+    assert not np.array_equal(drawn, actor.act(obs))  # so that sampled actions differ from the most likely ones
     if action == "discrete":
         n_draws = 4_000
         repeated = np.repeat(obs[:1], n_draws, axis=0)
@@ -131,7 +131,7 @@ def test_every_encoder_reads_every_space_that_it_can(
     with th.no_grad():
         probs = cast(Any, policy.get_distribution(th.as_tensor(obs))).distribution.probs
     np.testing.assert_allclose(actor.probabilities(obs), probs, atol=1e-6)
-    # One view alone is summed in another order than in a batch; the large picture has 14,000 numbers.
+    # The summation order differs between a single view and a batch; the large image has 14,000 numbers.
     np.testing.assert_allclose([actor.probabilities(one) for one in obs], probs, atol=5e-6)
 
 
@@ -193,7 +193,7 @@ def test_a_saved_loaded_and_exported_model_predicts_the_same(tmp_path: Path) -> 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[TeamActorCriticPolicy, Path]]:
-    """Exports with ONNX, one for each way in which graphs differ."""
+    """Create exports with ONNX, one for each kind of graph."""
     cases: dict[str, tuple[str, spaces.Space[Any], str, dict[str, Any]]] = {
         "mixture": ("codes", CodeSpace(), "discrete", {}),
         "mixture of pairs": ("picture", PICTURE, "multi-discrete", {"features_extractor_class": LightEncoder}),
@@ -245,7 +245,7 @@ def test_the_script_beside_the_graph_needs_nothing_else(
 
 
 class OwnEncoder(BaseFeaturesExtractor):
-    """An encoder that no file can name."""
+    """An encoder that exported files cannot name."""
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 4):
         super().__init__(observation_space, features_dim)
@@ -343,7 +343,7 @@ def test_an_actor_of_tile_codes_takes_pixels(encoder: type[BaseFeaturesExtractor
 
 
 class LoneAgent:
-    """A process with one agent in it, from which training's packages are hidden."""
+    """A process with one agent, in which the packages for training are hidden."""
 
     def __init__(self, folder: Path, runtime: str, agent: int):
         command = [sys.executable, str(ROOT / "tests" / "lone_agent.py"), str(folder), runtime, str(agent)]
@@ -461,7 +461,7 @@ def test_folders_are_replaced_only_if_they_are_exports(tmp_path: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == [MANIFEST_FILE, WEIGHTS_FILE]
     foreign = tmp_path / "foreign"
     foreign.mkdir()
-    exported(one, foreign)  # an empty folder is free
+    exported(one, foreign)  # an empty folder may be used
     (tmp_path / "file").write_text("mine")
     with pytest.raises(ExportError, match="expected a folder to write to"):
         exported(one, tmp_path / "file", overwrite=True)
@@ -532,7 +532,7 @@ def export(tmp_path: Path) -> Path:
 
 
 def rewrite(folder: Path, change: Callable[[dict[str, Any]], object], weights: bytes | None = None) -> None:
-    """Change the manifest as somebody would who knows how checksums are made."""
+    """Change the manifest and update its checksum, as an attacker would."""
     manifest = Manifest.from_json((folder / MANIFEST_FILE).read_bytes())
     if weights is not None:
         (folder / WEIGHTS_FILE).write_bytes(weights)
@@ -656,7 +656,7 @@ def test_weights_that_do_not_fit_are_refused(export: Path) -> None:
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """A few bytes changed, lost or doubled."""
+    """Change, remove or duplicate a few bytes."""
     result = bytearray(data)
     for _ in range(rng.choice((1, 1, 3))):
         place = rng.randrange(len(result))
@@ -673,7 +673,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
 
 
 def walk(value: Any) -> Iterator[tuple[Any, Any]]:
-    """Every place in nested containers."""
+    """Yield every place in nested containers."""
     for key in list(value) if isinstance(value, dict) else range(len(value)):
         yield value, key
         if isinstance(value[key], (dict, list)):
@@ -775,7 +775,7 @@ def saved(value: object) -> bytes:
 
 
 def packed(entry: bytes) -> bytes:
-    """The same file of tensors, compressed."""
+    """Compress the file of tensors."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(entry)) as old, zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new:
         for info in old.infolist():
@@ -823,7 +823,7 @@ def test_mutated_models_give_our_own_error_or_their_weights(tmp_path: Path) -> N
     for number in range(int(os.environ.get("MUTATIONS", "100"))):
         if number % 2:
             (tmp_path / "model.zip").write_bytes(mutated(original, rng))
-        else:  # inside the zip, where its checksum does not help
+        else:  # inside the zip, which its checksum does not cover
             zip_with(tmp_path / "model.zip", mutated(saved(model.policy.state_dict()), rng))
         try:
             load_weights(other, tmp_path / "model.zip")

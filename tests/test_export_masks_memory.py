@@ -1,4 +1,4 @@
-"""Exported actors that are told which actions are legal, and actors that remember."""
+"""Exported actors with action masks, and exported actors with memory."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STEPS = 6
 
 
 def masked_policy(policy_class: type[TeamActorCriticPolicy] = SAFPolicy, **kwargs: Any) -> TeamActorCriticPolicy:
-    """A policy for an environment whose observations have masks of three actions."""
+    """Create a policy for an environment whose observations have masks of three actions."""
     th.manual_seed(0)
     sizes: dict[str, Any] = SMALL | (SMALL_SAF if policy_class is SAFPolicy else {})
     space = TeamSpaces.of(VECTOR, 3, n_masked_actions=3).to_dict_space()
@@ -72,7 +72,7 @@ def test_with_masks_of_maskable_ppo_it_acts_as_the_model(name: str, action: str,
     policy = test_contrib.make_policy(name, space, noise=0.6)
     actor = Actor.load(exported(policy, tmp_path / "actor"), agent=2)
     obs, masks = samples(VECTOR, 40), random_masks(space, 40, np.random.default_rng(0))
-    masks[0] = False  # nothing is allowed: MaskablePPO's policies then do as they like
+    masks[0] = False  # nothing is allowed: MaskablePPO's policies then ignore the mask
     expected = policy.predict(obs, deterministic=True, action_masks=masks)[0]
     np.testing.assert_array_equal(actor.act(obs, action_mask=masks), expected)
     assert not np.array_equal(actor.act(obs), expected), "without masks everything is allowed"
@@ -115,14 +115,14 @@ def test_a_mask_for_an_actor_without(tmp_path: Path) -> None:
 
 
 def remembering(policy_name: str, action: str = "discrete", **kwargs: Any) -> Any:
-    """A policy whose memory matters."""
+    """Create a policy whose memory matters."""
     policy = test_contrib.make_policy(policy_name, ACTIONS[action], noise=1.0, **kwargs)
     with th.no_grad():
         for parameter in policy.lstm_actor.parameters():
             parameter.add_(th.randn_like(parameter))
         for name, parameter in policy.actor.named_parameters():
             if name.endswith("bias"):
-                parameter.zero_()  # or it has its mind made up, whatever it sees
+                parameter.zero_()  # or its actions would not depend on observations
     return policy
 
 

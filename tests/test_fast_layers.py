@@ -1,4 +1,4 @@
-"""Compiled and joined layers give the numbers and the gradients of the plain ones."""
+"""Compiled and merged layers give the numbers and the gradients of the plain ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_saf.networks.tanh import Tanh
 
 
 def gradients(function: Callable[..., th.Tensor], *inputs: th.Tensor) -> list[th.Tensor]:
-    """The output, and the gradients of a curved function of it."""
+    """Return the output, and the gradients of a nonlinear function of it."""
     leaves = [one.clone().requires_grad_() for one in inputs]
     output = function(*leaves)
     return [output.detach(), *th.autograd.grad(output.sin().sum(), leaves)]

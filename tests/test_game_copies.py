@@ -1,4 +1,4 @@
-"""Copies of SuperSuit's games play on as the games do."""
+"""Copies of SuperSuit's games continue like the originals."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_copies_play_on_as_the_games(name: str, n_cpus: int) -> None:
 
 def test_a_slow_game_is_tried_for_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(10**6))
-    monkeypatch.setattr("sb3_saf.envs.game_copies.time.monotonic", lambda: next(clock) ** 2 / 40)  # ever slower
+    monkeypatch.setattr("sb3_saf.envs.game_copies.time.monotonic", lambda: next(clock) ** 2 / 40)  # slower and slower
     venv = SuperSuitVecEnv(LazyEnv, 1, seed=0)
     venv.reset()
     assert "pickled" in venv.checkpoint_state()["games"][0]
@@ -103,5 +103,5 @@ def test_a_key_is_made_once_and_is_the_users_alone(tmp_path: Path, monkeypatch: 
     assert game_copies.key_file().stat().st_mode & 0o777 == 0o600
     assert [path.name for path in game_copies.key_file().parent.iterdir()] == ["key"]
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))  # no folder can be made there
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))  # no folder can be created there
     assert game_copies.signature(data) == game_copies.signature(data) != signed

@@ -1,4 +1,4 @@
-"""Nobody trains on garbage: NaN and infinity, rows in another order, games of training in evaluation."""
+"""Invalid training data is detected: NaN and infinity, rows in another order, training games in evaluation."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ LIGHT: dict[str, Any] = {"features_extractor_class": sb3_saf.LightEncoder, "net_
 
 class Spoiled(VecEnvWrapper):
     """
-    Games whose observations or rewards are spoiled from a step on.
+    Games with invalid observations or rewards from a given step on.
 
     :param venv: games with observations in bytes, which become numbers
     :param what: "observations" or "rewards"
-    :param value: what they become
+    :param value: the invalid value
     :param step: from 1
     """
 
@@ -180,7 +180,7 @@ def test_evaluation_on_the_games_of_training_is_refused(backend: Any) -> None:
 
 
 class Reordered(VecEnvWrapper):
-    """Rows the other way round."""
+    """Rows in reverse order."""
 
     def _turned(self, obs: Any) -> Any:
         return {key: part[::-1].copy() for key, part in obs.items()}

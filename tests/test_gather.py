@@ -1,4 +1,4 @@
-"""Rows are gathered so that gradients, and with them trainings, repeat on any number of threads."""
+"""Gathering rows has gradients that repeat on any number of threads, and so do trainings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_saf.networks.layers import gather, gather_agents
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    """Of torch, for one test."""
+    """Set torch to two threads for one test."""
     before = th.get_num_threads()
     th.set_num_threads(2)
     yield

@@ -1,4 +1,4 @@
-"""Importing the package adds names to ``policy_aliases`` and changes nothing else of the libraries."""
+"""Importing the package adds names to ``policy_aliases`` and changes nothing else in other libraries."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ print("same", len(before))
 
 
 def test_importing_changes_nothing_of_the_libraries() -> None:
-    """All modules and classes of SB3, sb3-contrib and SuperSuit before and after, in a process of its own."""
+    """Compare all modules and classes of SB3, sb3-contrib and SuperSuit before and after, in a separate process."""
     script = _SCRIPT.replace("IMPORTS", "import sb3_saf, hecogrid_envs")
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", script], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]

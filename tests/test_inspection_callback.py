@@ -1,4 +1,4 @@
-"""The inspection callback in real training: what it writes, what it leaves out, and that training never notices."""
+"""The inspection callback in real training: what it writes, what it leaves out, and that training does not change."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def learn(
     n_updates: int = 2,
     **policy_kwargs: Any,
 ) -> Any:
-    """Four games of five steps a rollout."""
+    """Train with rollouts of four games of five steps."""
     env = env or ToyTeams()
     extra: dict[str, Any] = {}
     if algorithm is not A2C:
@@ -92,7 +92,7 @@ def level_games() -> CentralizedValueWrapper:
 
 
 def events(folder: Path) -> EventAccumulator:
-    """The run's own file, not those of lines below it."""
+    """Return the run's own event file, not those of its sub-runs."""
     (file,) = folder.glob("*/events.*")
     return EventAccumulator(
         str(file), size_guidance=dict.fromkeys(("scalars", "images", "histograms", "tensors"), 0)
@@ -115,7 +115,7 @@ def groups(tags: Any) -> set[str]:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> EventAccumulator:
-    """SAF on a small HECOGrid, everything on."""
+    """Train SAF on a small HECOGrid, with everything turned on."""
     folder = tmp_path_factory.mktemp("page")
     env = make_team_env("TeamSupport", n_envs=4, seed=0, **LEVEL)
     eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
@@ -201,7 +201,7 @@ class TestPage:
         assert groups(page.Tags()["scalars"]) <= explained
 
     def test_before_during_and_after_training(self, page: EventAccumulator) -> None:
-        # 20 game steps a rollout; what SB3 logs itself is on the same axis.
+        # A rollout has 20 game steps; what SB3 logs is on the same axis.
         assert [event.step for event in page.Scalars("team/return")] == [0, 20, 40, 60]
         assert [event.step for event in page.Scalars("time/fps")] == [20, 40, 60]
 
@@ -290,7 +290,7 @@ def test_reward_normalisation_is_that_of_training(tmp_path: Path) -> None:
 
 
 def hand_made(policy_class: type[TeamPolicy], env: Any, **kwargs: Any) -> Any:
-    """A policy whose features are the observation."""
+    """Create a policy whose features are the observation."""
     return policy_class(
         env.observation_space, env.action_space, lambda _: 0.0, features_extractor_class=FlattenExtractor, **kwargs
     )
@@ -301,7 +301,7 @@ def play(env: Any, policy: TeamPolicy, n_episodes: int = 64, zones: Any = None, 
 
 
 class ExactCritic(nn.Module):
-    """Of DelayedReward with three steps: gamma ** steps_left times the number seen."""
+    """The exact critic of DelayedReward with three steps: gamma ** steps_left times the number seen."""
 
     reads_agent = False
 
@@ -337,7 +337,7 @@ class TestCritic:
 
     @pytest.mark.parametrize(("time_limit", "bias"), [("bootstrap", 0.0), ("terminal", 2 - (1.5 + 1) / 2)])
     def test_time_limits_are_those_of_training(self, time_limit: Any, bias: float) -> None:
-        """1 at every step is worth 2 if the time limit is no end, 1.5 and then 1 if it is."""
+        """Reward 1 at every step: the value is 2 if the time limit does not terminate, otherwise 1.5 and then 1."""
         env = make_team_env(ConstantReward(length=2), n_envs=4, time_limit=time_limit)
         policy = hand_made(IPPOPolicy, env)
         policy.value_net = Always(2.0)
@@ -356,7 +356,7 @@ class TestCritic:
 
 class TestWhatCounts:
     def test_each_game_plays_its_share_of_episodes(self) -> None:
-        """Three episodes in two games of three and two steps: one and two."""
+        """Three episodes in two games, of three and of two steps: one and two."""
         env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
         game = play(env, hand_made(IPPOPolicy, env), n_episodes=3)
         assert game.counted[:, ::3].T.tolist() == [[True, True, True, False], [True] * 4]
@@ -364,13 +364,13 @@ class TestWhatCounts:
         assert game.episode_lengths == [2, 3, 2]
 
     def test_agents_that_take_no_part_do_not_count(self) -> None:
-        """Illegal actions stop this environment; agents die and join."""
+        """Illegal actions fail in this environment; agents die and join."""
         env = make_team_env(TellingEnv(**LIVES), n_envs=2)
         policy = hand_made(SAFPolicy, env)
         game = play(env, policy, n_episodes=2)
         active = np.array(ACTIVE, dtype=bool)
         np.testing.assert_array_equal(game.counted, np.tile(active, 2))
-        # Agent 0 ends with step 3, and all with step 5; who is not there yet has nothing to end.
+        # Agent 0 ends with step 3, all with step 5; an agent that has not joined does not end.
         assert game.ends[:, 0].tolist() == [False, False, True, True, True]
         assert game.ends[:, 2].tolist() == [False, False, False, False, True]
         assert game.write_attention is not None and game.pool_actions is not None
@@ -382,7 +382,7 @@ class TestWhatCounts:
 
 
 class ZonedProbe(Probe):
-    """Two zones, told by the sign of what an agent sees."""
+    """Two zones, given by the sign of what an agent sees."""
 
     def rewards(self, bits: Any, actions: npt.NDArray[np.int64], time: int) -> Any:
         return bits[:, 0]
@@ -451,7 +451,7 @@ class TestZones:
 
 class TestMessages:
     def test_a_critic_that_needs_messages_is_wrong_without(self) -> None:
-        """The value is what the next agent sees, -1 or 1: no guess without the message has an error below 1."""
+        """The value is what the next agent sees, -1 or 1: every guess without the message has an error of 1 or more."""
         policy = train_on_probe("SAFPolicy", Message(n_agents=3), n_updates=15)
         scalars = message_scalars(play(make_team_env(Message(n_agents=3), n_envs=64), policy, 128, gamma=0.9))
         assert scalars["message/value_error"] < 0.3

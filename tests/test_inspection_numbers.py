@@ -1,4 +1,4 @@
-"""Inspection's arithmetic, against numbers worked out by hand."""
+"""Inspection's numbers, compared with numbers computed by hand."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ class TestReturns:
         [
             # 1 + 2 / 2 + 4 / 4 and 8 / 4; 2 + 4 / 2 and 8 / 2; 4 and 8.
             ({}, 1, [[3, 2], [4, 4], [4, 8]]),
-            # Nothing comes back from the next episode.
+            # The next episode does not contribute.
             ({"ends": np.array([[True] * 2, [False] * 2, [True] * 2])}, 1, [[1, 0], [4, 4], [4, 8]]),
-            # A time limit that is no true end is followed by a value.
+            # A time limit that does not terminate is followed by a value.
             ({"last_values": LAST}, 1, [[4, 4], [6, 8], [8, 16]]),
-            # An agent's own end ends its return alone.
+            # The end of an agent ends only its own return.
             ({"ends": np.array([[False, True], [False, False], [True, True]])}, 1, [[3, 0], [4, 4], [4, 8]]),
             # One step, then the value.
             ({"values": VALUES}, 0, [[6, 10], [17, 20], [4, 8]]),
@@ -112,7 +112,7 @@ class TestCalibration:
 
 
 class TestSelection:
-    #: Zone 0 takes policy 0, zone 2 policies 0 and 1 alike; nobody is in zone 1, one row is in no zone.
+    #: Zone 0 uses policy 0, zone 2 policies 0 and 1 equally; zone 1 is empty, one row is in no zone.
     WEIGHTS = np.array([[1, 0], [1, 0], [0.5, 0.5], [0, 1]])
     ZONES = np.array([0, 0, 2, -1])
 
@@ -198,7 +198,7 @@ class TestDifferences:
 
 class TestAttention:
     def test_entropy_of_one_and_of_the_mean(self) -> None:
-        # The slot attends to agent 0, then to agent 1: decided each time, even on average.
+        # The slot attends to agent 0, then to agent 1: selective at each step, uniform on average.
         found = attention_of(np.array([[[1.0, 0.0]], [[0.0, 1.0]]]))
         assert found.mean.tolist() == [[0.5, 0.5]]
         assert found.entropy == pytest.approx(0)

@@ -1,4 +1,4 @@
-"""The inspection callback with QPLEX: values of the team, best actions, heads of a pool, and training undisturbed."""
+"""The inspection callback with QPLEX: team values, best actions, heads of a pool; training does not change."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ QUICK: dict[str, Any] = {"buffer_size": 200, "learning_starts": 8, "batch_size":
 
 
 def telling(**kwargs: Any) -> VecEnv:
-    """Four games whose agents join and die, with legal actions and a state; illegal actions stop them."""
+    """Create four games whose agents join and die, with legal actions and a state; illegal actions fail."""
     settings: dict[str, Any] = {"n_agents": 3, "max_cycles": 5, "deaths": {1: 3}, "joins": {2: 1}} | kwargs
     return make_team_env(TellingEnv(**settings), n_envs=4, seed=0, state=True)
 
@@ -99,7 +99,7 @@ def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
 
 @pytest.mark.parametrize(("time_limit", "mean_return"), [("terminal", 2 * (1.5 + 1) / 2), ("bootstrap", None)])
 def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> None:
-    """Two agents with 1 each at both steps; a time limit that is no end is followed by the value of what comes."""
+    """Two agents get 1 each at both steps; a time limit that does not terminate is followed by the next value."""
     env = make_team_env(ConstantReward(n_agents=2, length=2), n_envs=4, time_limit=time_limit)
     team = policy_on(env)
     recording = record_episodes(team, env, 4, seed=0, gamma=0.5)

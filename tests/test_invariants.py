@@ -1,5 +1,5 @@
 """
-Any configuration, any actions: what is true of every game.
+Properties that hold for any configuration and any actions.
 
 Ten thousand examples: ``EXAMPLES=10000 python -m pytest tests/test_invariants.py --timeout 3600``.
 """
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import hecogrid_envs
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridEnv, HECOGridParams
 
-#: What is drawn: values of a small game, of which not all fit together, and now and then one of anything.
+#: Values of small games that need not be compatible, and sometimes one arbitrary value.
 USUAL: dict[str, st.SearchStrategy[Any]] = {
     "n_agents": st.integers(1, 6),
     "grid_size": st.integers(3, 11),
@@ -43,7 +43,7 @@ ANYTHING = st.one_of(
     st.lists(st.integers(), max_size=2),
     st.sampled_from((0, 4, 10**6, "Paper", b"rgb", np.float32(0.5), np.array(3), {}, object)),
 )
-#: Steps that are played of a game; some are a million steps long.
+#: Maximum number of steps played in a game; some games have a million.
 LONGEST = 60
 ODD_ACTIONS: tuple[Any, ...] = (-1, 7, 2**40, 1.5, "left", None, [0], np.nan)
 
@@ -51,7 +51,7 @@ ODD_ACTIONS: tuple[Any, ...] = (-1, 7, 2**40, 1.5, "left", None, [0], np.nan)
 @st.composite
 def configurations(draw: st.DrawFn) -> dict[str, Any]:
     params = {name: draw(values) for name, values in USUAL.items() if draw(st.booleans())}
-    # The default game is large; left out are other parameters.
+    # The default game is large, so only other parameters are left out.
     params |= {name: draw(USUAL[name]) for name in ("n_agents", "grid_size", "n_treasures") if name not in params}
     if draw(st.integers(0, 3)):
         limits = {"coordination": params["n_agents"], "heterogeneity": params["grid_size"] - 2, "view_offset": 0}
@@ -64,7 +64,7 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
 
 
 class Count(NamedTuple):
-    """What a state holds of what never comes or goes."""
+    """Numbers of things in a state that are constant."""
 
     walls: bytes
     treasures: int
@@ -80,7 +80,7 @@ class Count(NamedTuple):
 
 
 def check_places(state: Any) -> None:
-    """Nobody is in a wall, on a key or outside."""
+    """No agent is in a wall, on a key or outside the map."""
     x, y = state["agent_pos"].T
     assert not (state["walls"] | state["keys"])[x, y].any()
     ring = np.ones_like(state["walls"])
@@ -90,8 +90,8 @@ def check_places(state: Any) -> None:
 
 def check_views(env: HECOGridEnv, params: dict[str, Any], observations: dict[str, Any]) -> None:
     """
-    Views are those drawn anew from the state, which leaves open who came first to a cell; under the released rules also
-    the colours of agents, which are those of a step before.
+    Views equal those drawn from the state alone, which does not store the order of arrival in a cell; with the released
+    rules, agents' colours are those of the previous step.
     """
     state = env.get_state()
     if params.get("rules") == "released":
@@ -105,7 +105,7 @@ def check_views(env: HECOGridEnv, params: dict[str, Any], observations: dict[str
 
 
 def check_odd_action(env: HECOGridEnv, action: Any) -> None:
-    """It is refused, and nothing has happened."""
+    """The action is refused, and the game does not change."""
     before = env.get_state()
     actions = dict.fromkeys(env.agents, 0) | {env.agents[-1]: action}
     try:
@@ -118,7 +118,7 @@ def check_odd_action(env: HECOGridEnv, action: Any) -> None:
 
 
 def check_step(before: Any, env: HECOGridEnv, rewards: dict[str, float]) -> int:
-    """Each treasure pays once, and all agents alike: how many were collected."""
+    """Each treasure is rewarded once, for all agents equally: the number of collected treasures."""
     state = env.get_state()
     check_places(state)
     assert Count.of(state) == Count.of(before)
@@ -147,7 +147,7 @@ def test_what_is_true_of_every_game(task: str, params: dict[str, Any], seed: int
     steps = 0
     while env.agents and steps < LONGEST:
         before = env.get_state()
-        # Forward is what changes most; in other zones it is another number.
+        # Forward changes most; in other zones it has another number.
         actions = rng.choice(7, size=len(env.agents), p=(0.1, 0.1, 0.4, 0.15, 0.15, 0.05, 0.05))
         observations, rewards, terminated, truncated, _ = env.step(dict(zip(env.agents, actions, strict=True)))
         steps += 1

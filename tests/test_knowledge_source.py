@@ -1,4 +1,4 @@
-"""The knowledge source: its arithmetic, its size, and that agents are a set."""
+"""The knowledge source: its computation, its size, and that the order of agents does not matter."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def attended(queries: Array, sources: Array, attention: Attention) -> tuple[Arra
 
 
 def reference(source: KnowledgeSource, messages: Array, states: Array) -> tuple[Array, Array, Array]:
-    """Slots (L, d), write attention (L, N) and what agents read (N, d)."""
+    """Compute slots (L, d), write attention (L, N) and what agents read (N, d)."""
     slots = source.slots.detach().numpy()
     marked = messages + source.agent_embeddings.detach().numpy()
     write = source.write_block
@@ -88,7 +88,7 @@ def reference(source: KnowledgeSource, messages: Array, states: Array) -> tuple[
 
 
 def test_agrees_with_an_independent_account(source: KnowledgeSource) -> None:
-    for parameter in source.parameters():  # norms and biases too shall matter
+    for parameter in source.parameters():  # so that norms and biases matter too
         nn.init.normal_(parameter, std=0.5)
     source = source.double()
     messages, states = random_team().double(), random_team().double()
@@ -130,7 +130,7 @@ def test_inactive_agents_are_not_heard(source: KnowledgeSource) -> None:
     changed = messages.clone()
     changed[~active] = 1e3
     assert th.equal(source.write(changed, active).slots, written.slots)
-    # A team of the active agents alone writes the same.
+    # A team of only the active agents writes the same.
     alone = KnowledgeSource(4, SIZE)
     alone.load_state_dict(source.state_dict() | {"agent_embeddings": source.agent_embeddings[[0, 1, 3, 4]]})
     th.testing.assert_close(alone.write(messages[:1, [0, 1, 3, 4]]).slots, written.slots[:1], rtol=0, atol=1e-6)
@@ -146,7 +146,7 @@ def test_a_team_without_active_agents_gives_numbers(source: KnowledgeSource) -> 
 
 
 def test_cost_is_linear_in_the_number_of_agents() -> None:
-    """Multiply-adds, exactly; benchmarks.knowledge_source measures seconds, too."""
+    """Multiply-adds, exactly; benchmarks.knowledge_source also measures seconds."""
 
     def cost(n_agents: int) -> int:
         module = KnowledgeSource(n_agents, SIZE)

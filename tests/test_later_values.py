@@ -1,4 +1,4 @@
-"""Values that are computed at the end of a rollout are those of its steps."""
+"""Values computed at the end of a rollout equal those computed at each step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 
 
 class Eager(BaseCallback):
-    """Computes the values of every step in that step."""
+    """Computes the values at every step."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -24,7 +24,7 @@ SMALL: dict[str, Any] = {"n_agents": 3, "grid_size": 10, "n_treasures": 12, "max
 
 
 def episode(env: CentralizedValueWrapper, n_steps: int = 13) -> list[Array]:
-    """All numbers of some steps with fixed actions."""
+    """Return all numbers of some steps with fixed actions."""
     rng = np.random.default_rng(0)
     obs = env.reset()
     numbers = [*obs.values()]

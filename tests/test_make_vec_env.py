@@ -1,7 +1,7 @@
 """
-The two flattened forms: native and SuperSuit give the same numbers, row for row, bit for bit.
+Native and SuperSuit backends give the same numbers, row by row, bit for bit.
 
-That the native form's are those of ``parallel_env``, also at the end of episodes, is in ``test_advance``.
+``test_advance`` compares the native backend with ``parallel_env``, including ends of episodes.
 """
 
 from __future__ import annotations
@@ -124,8 +124,8 @@ def test_attributes_and_rendering_per_row(backend: Any) -> None:
 @pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
 @pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy"])
 def test_the_game_trains_in_the_stock_stack(policy: str) -> None:
-    """SuperSuit's own functions and SB3's own algorithm, without anything of this repository but the game."""
-    # NatureCNN takes pictures of at least 36 x 36.
+    """Only SuperSuit's own functions and SB3's own algorithm, with nothing of this repository but the game."""
+    # NatureCNN needs images of at least 36 x 36.
     env = hecogrid_envs.parallel_env("TeamSupport", **{**SMALL, "view_tile_size": 6})
     flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
     venv = VecMonitor(supersuit.concat_vec_envs_v1(flat, 2, num_cpus=1, base_class="stable_baselines3"))

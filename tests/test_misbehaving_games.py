@@ -1,4 +1,4 @@
-"""Games that break PettingZoo's rules: each fault has an error that says which agent, which step, what was expected."""
+"""Games that break PettingZoo's rules: each error names the agent, the step, and what was expected."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stable_baselines3 import PPO
 from sb3_saf import TeamRolloutBuffer, make_team_env
 from tests.toy_envs import CounterEnv, TellingEnv
 
-#: Changes what a step returned: observations, rewards, terminations, truncations and infos by agent.
+#: Changes what a step returns: observations, rewards, terminations, truncations and infos by agent.
 Fault = Callable[[CounterEnv, list[Any]], Any]
 
 
@@ -24,7 +24,7 @@ class MisbehavingEnv(CounterEnv):
     """
     A game with a fault at its second step, or in its reset.
 
-    :param at_step: changes, or replaces, what the second step returns
+    :param at_step: changes or replaces what the second step returns
     :param at_reset: the same for observations and infos of resets
     :param setup: changes the game itself
     :param space: of observations, whose values are ``seen``
@@ -74,7 +74,7 @@ def gives(part: int, value: Any) -> dict[str, Fault]:
 
 
 def lacks(part: int) -> dict[str, Fault]:
-    """Agent 1 is left out at step 2."""
+    """Agent 1 is missing at step 2."""
 
     def fault(env: CounterEnv, result: list[Any]) -> None:
         del result[part]["agent_1"]
@@ -83,17 +83,17 @@ def lacks(part: int) -> dict[str, Fault]:
 
 
 def replaces(part: int, value: Any) -> dict[str, Fault]:
-    """A whole part of what step 2 returns is something else."""
+    """Replace a whole part of the results of step 2."""
     return {"at_step": lambda env, result: (*result[:part], value, *result[part + 1 :])}
 
 
 def lists(*names: Any) -> Fault:
-    """Agents are others."""
+    """Change the list of agents."""
     return lambda env, result: setattr(env, "agents", list(names))
 
 
 def sees(space: spaces.Space[Any], value: Any, first: Any = None) -> dict[str, Any]:
-    """Observations at step 2, and those before."""
+    """Set the observations at step 2, and those before."""
     return {"space": space, "seen": lambda step: value if step == 2 else first}
 
 
@@ -261,7 +261,7 @@ def test_a_state_of_another_shape() -> None:
 
 
 def test_observations_outside_the_bounds_of_floats_are_warned_of_once() -> None:
-    """Rounding alone may cause it, and policies take any float."""
+    """Rounding alone may cause it, and policies accept any float."""
     game = sees(spaces.Box(0, 1, (2,)), [0.5, 1.5], [0, 0])
     env = make_team_env(MisbehavingEnv, 2, **game)
     env.reset()
@@ -304,7 +304,7 @@ def test_what_is_unusual_but_clear_is_taken(fault: dict[str, Any], reward: float
 
 
 def test_a_games_own_words_in_infos_do_not_collide_with_those_of_sb3() -> None:
-    """SB3 takes an entry "episode" for a monitor's, and dies of its missing "r", "l", "t"."""
+    """SB3 treats an entry "episode" as a monitor's, and fails if "r", "l", "t" are missing."""
     own = {"episode": {"r": 1}, "l": 1, "r": 2, "t": 3, "active": "yes", "terminal_observation": 4}
 
     class Game(CounterEnv):

@@ -23,7 +23,7 @@ from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.evaluation import RandomPolicy
 from tests.team_venv import TeamVenv, still
 
-#: Team return of an episode of game e that lasts n steps: agents 0, 1, 2 get 100 e + 10 i + step.
+#: Team return of an episode of n steps of game e: agents 0, 1, 2 get 100 e + 10 i + step.
 RETURN_OF_GAME_0 = 3 * 30 + 3 * (1 + 2 + 3)
 RETURN_OF_GAME_1 = 2 * 330 + 3 * (1 + 2)
 
@@ -114,7 +114,7 @@ Monitors = Callable[..., TeamMonitor]
 
 @pytest.fixture
 def monitors(tmp_path: Path) -> Iterator[Monitors]:
-    """Make monitors of one game that write to one folder; their files are closed after the test."""
+    """Create monitors of one game that write to one folder; their files are closed after the test."""
     made: list[TeamMonitor] = []
 
     def make(length: int, **kwargs: Any) -> TeamMonitor:
@@ -220,7 +220,7 @@ def test_sb3_logs_team_episodes() -> None:
 
 
 def test_sb3_alone_counts_every_agent_as_an_episode() -> None:
-    """The failing baseline: 5 team episodes are logged as 15."""
+    """Without our monitor, 5 team episodes are logged as 15."""
     model = PPO("MlpPolicy", VecMonitor(TeamVenv(lengths=(3, 2))), n_steps=6, batch_size=36, n_epochs=1, device="cpu")
     model.learn(36)
     assert model.ep_info_buffer is not None
@@ -231,7 +231,7 @@ OURS = r"take each of these 6 rows .* team of 3: .* sb3_saf.evaluate_policy .*Te
 
 
 def test_sb3s_own_evaluation_returns_though_it_counts_agents() -> None:
-    """What its users get who have not read on: a warning, and agents for episodes, but no endless loop."""
+    """SB3's own evaluation warns and counts agents as episodes, but does not loop endlessly."""
     env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(2, 2))))
     with pytest.warns(UserWarning, match=OURS):
         returns, lengths = evaluate_rows(
@@ -252,7 +252,7 @@ def test_sb3s_own_monitor_around_teams_or_below_is_warned_of() -> None:
     assert len(told) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        VecMonitor(CentralizedValueWrapper(TeamVenv(lengths=(2, 2), n_agents=1)))  # an agent alone is an environment
+        VecMonitor(CentralizedValueWrapper(TeamVenv(lengths=(2, 2), n_agents=1)))  # a single agent is an environment
 
 
 def logged(model: BaseAlgorithm, folder: Path, n_steps: int) -> list[dict[str, str]]:
@@ -286,7 +286,7 @@ def test_environments_without_teams_log_what_they_did(tmp_path: Path) -> None:
 def test_off_policy_algorithms_log_them_too(tmp_path: Path) -> None:
     env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2), action_space=spaces.Discrete(2))))
     model = DQN("MultiInputPolicy", env, learning_starts=100, buffer_size=100, device="cpu")
-    # SB3 writes once per ended row: the first time of a step has what callbacks recorded.
+    # SB3 writes once per ended row: the first write of a step has what callbacks recorded.
     rows = [row for row in logged(model, tmp_path, 60) if row["time/game_steps"]]
     assert rows
     assert all(int(row["time/game_steps"]) * 3 == int(row["time/total_timesteps"]) > 0 for row in rows)

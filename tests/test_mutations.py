@@ -1,5 +1,5 @@
 """
-Settings, levels and states from strangers: mutations of valid ones give ValueErrors or work, and nothing hangs.
+Mutations of valid settings, levels and states raise ValueErrors or work, and nothing hangs.
 
 A thousand of each, and of exported actors and models: ``MUTATIONS=1000 python -m pytest -k mutat``.
 """
@@ -28,7 +28,7 @@ from sb3_saf.training.settings import ALGOS, ENV_IDS, load_settings
 from sb3_saf.training.yaml_files import SIZES, load_yaml
 
 COUNT = int(os.environ.get("MUTATIONS", "100"))
-#: Seconds of the processor after which a mutation counts as a hang.
+#: Processor seconds after which a mutation counts as a hang.
 PATIENCE = 30
 SMALL: dict[str, Any] = {
     "n_agents": 3,
@@ -56,17 +56,17 @@ def no_hang() -> Iterator[None]:
 
 
 def refused(attempt: Callable[[], object]) -> bool:
-    """Whether something is refused by an error of ours; any other error fails the test."""
+    """Whether one of our errors is raised; any other error fails the test."""
     with no_hang():
         try:
             attempt()
         except ValueError as error:
-            return bool(str(error))  # one without a word is none of ours
+            return bool(str(error))  # our errors have a message
     return False
 
 
 def scrambled(text: str, rng: random.Random) -> str:
-    """A few characters, words or lines changed, lost, doubled or exchanged."""
+    """Change, remove, duplicate or exchange a few characters, words or lines."""
     for _ in range(rng.choice((1, 1, 1, 4))):
         place, other = sorted(rng.randrange(len(text) + 1) for _ in range(2))
         change = rng.randrange(6)
@@ -136,7 +136,7 @@ def a_game(seed: int = 0) -> hecogrid_envs.HECOGridEnv:
 
 
 def play_on(env: hecogrid_envs.HECOGridEnv, rng: random.Random) -> None:
-    """Two steps and a look, which a state that was let in has to survive."""
+    """Play two steps and observe, which must work for every accepted state."""
     for _ in range(2):
         env.step({agent: rng.randrange(7) for agent in env.possible_agents})
     env.state()
@@ -144,7 +144,7 @@ def play_on(env: hecogrid_envs.HECOGridEnv, rng: random.Random) -> None:
 
 
 def odd_array(array: np.ndarray[Any, Any], rng: random.Random) -> Any:
-    """An entry of a state as it should not be; sometimes it could be."""
+    """Return an invalid entry of a state; sometimes a valid one."""
     flat = rng.randrange(array.size)
     changed = array.astype(np.int64)
     changed.flat[flat] = rng.choice((0, 1, 2, 3, -1, 7, 255, 256, 2**31, -(2**63)))

@@ -1,4 +1,4 @@
-"""The notebooks as files, and what runs them; ``make notebooks`` runs them."""
+"""The notebook files, and the program that runs them; ``make notebooks`` runs them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.test_docs import LINK, exists
 
 FILES = source_files()
 EVERY_NOTEBOOK = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-#: Bytes. Larger ones are slow to read on GitHub.
+#: Size limit in bytes. Larger notebooks are slow on GitHub.
 LARGEST = 1_500_000
 
 
@@ -24,12 +24,12 @@ def read(path: Path) -> NotebookNode:
 
 
 def python_of(cell: NotebookNode) -> str:
-    """A cell without the lines that only notebooks know: magics and shell commands."""
+    """Return a cell without notebook syntax: magics and shell commands."""
     return re.sub(r"^[%!].*$", "pass", cell.source, flags=re.MULTILINE)
 
 
 def written_by(cell: NotebookNode) -> str:
-    """All text that came out of a cell."""
+    """Return all text output of a cell."""
     texts = [output.get("text", "") for output in cell.outputs]
     return "".join([*texts, *(output.get("data", {}).get("text/plain", "") for output in cell.outputs)])
 
@@ -89,7 +89,7 @@ def test_links_lead_somewhere(path: Path) -> None:
 
 
 def save(path: Path, *cells: str) -> Path:
-    """A notebook whose first cell has the parameters."""
+    """Write a notebook whose first cell has the parameters."""
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in cells])
     notebook.cells[0].metadata["tags"] = [PARAMETERS]
     nbformat.write(notebook, path)

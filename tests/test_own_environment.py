@@ -1,4 +1,4 @@
-"""What people who bring an environment of their own get wrong at first, and what they are told."""
+"""Common mistakes in custom environments, and their error messages."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tests.toy_envs import CounterEnv, TellingEnv
 
 
 class SilentReset(CounterEnv):
-    """Gives observations alone at a reset, as in older versions of PettingZoo."""
+    """Returns only observations at a reset, as in older versions of PettingZoo."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         return super().reset(seed, options)[0]
 
 
 class OneDone(CounterEnv):
-    """Gives one dict of dones at a step, as in older versions of PettingZoo."""
+    """Returns one dict of dones at a step, as in older versions of PettingZoo."""
 
     def step(self, actions: dict[str, Any]) -> Any:
         observations, rewards, terminations, _, infos = super().step(actions)
@@ -30,7 +30,7 @@ class OneDone(CounterEnv):
 
 
 class NoTuple(CounterEnv):
-    """Gives lists by agent instead of dicts."""
+    """Returns lists by agent instead of dicts."""
 
     def step(self, actions: dict[str, Any]) -> Any:
         return tuple(list(part.values()) for part in super().step(actions))
@@ -44,14 +44,14 @@ class Unseeded(CounterEnv):
 
 
 class BrokenReset(CounterEnv):
-    """Goes wrong in a reset with a TypeError of its own."""
+    """Raises a TypeError in its reset."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         return len(3)  # type: ignore[arg-type]
 
 
 class SpaceTable(CounterEnv):
-    """Has a dict where PettingZoo has a method."""
+    """Has a dict instead of PettingZoo's method."""
 
     @property
     def observation_space(self) -> Any:
@@ -99,7 +99,7 @@ def test_a_type_error_of_the_game_itself_comes_out_as_it_is() -> None:
 
 def test_sb3s_own_policy_warns_that_it_sees_the_team() -> None:
     env = make_team_env(CounterEnv, n_envs=2, seed=0)
-    with pytest.raises(ValueError, match="You must use `MultiInputPolicy`"):  # SB3's own advice, which leads here:
+    with pytest.raises(ValueError, match="You must use `MultiInputPolicy`"):  # SB3's advice, which users then follow:
         PPO("MlpPolicy", env)
     settings: dict[str, Any] = {"n_steps": 2, "batch_size": 8, "n_epochs": 1, "device": "cpu"}
     model = PPO("MultiInputPolicy", env, **settings)
@@ -147,7 +147,7 @@ def test_observations_by_agent_give_actions_by_agent(policy: str) -> None:
     stacked, _ = model.predict(np.stack(list(observations.values())), deterministic=True)
     assert actions == dict(zip(observations, stacked, strict=True))
     assert model.predict({"agent_1": observations["agent_1"]}, deterministic=True)[0] == {"agent_1": stacked[1]}
-    with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a mistake in it is no dict of agents
+    with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a misspelt key is not a dict of agents
         model.predict({"obs": observations["agent_1"], "team_view": observations["agent_1"]})
     with pytest.raises(ValueError, match=r"expected observations of at most 2 agents, got 3"):
         model.predict({**observations, "agent_2": observations["agent_1"]})

@@ -1,4 +1,4 @@
-"""The files around the code: what is installed, with which versions, and what a first command finds."""
+"""Packaging: what is installed, with which versions, and what the first commands find."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("hecogrid_envs", "sb3_saf", "zoo_configs")
-#: Files that decide where software comes from.
+#: Files that determine the sources of software.
 INSTALL_FILES = ("setup.cfg", "pyproject.toml", "constraints.txt", "Makefile", ".ci/run")
 
 
@@ -52,7 +52,7 @@ def test_every_declared_dependency_is_pinned_inside_its_range(group: str, requir
 
 
 def _third_party_imports() -> set[str]:
-    """Top-level modules that our packages import anywhere, neither Python's nor ours."""
+    """Return top-level modules that our packages import anywhere, except Python's and ours."""
     names: set[str] = set()
     for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -90,7 +90,7 @@ def test_installed_versions_are_the_pinned_ones() -> None:
             installed = metadata.version(pin.name)
         except metadata.PackageNotFoundError:
             continue  # of an extra that is not installed here
-        if pin.name != "pip":  # may be newer: it installs, it is not used
+        if pin.name != "pip":  # may be newer: pip installs, but is not used
             assert installed in pin.specifier, f"{pin.name} {installed} is installed, constraints.txt says {pin}"
 
 
@@ -102,7 +102,7 @@ def test_version_is_written_once() -> None:
 
 
 def _modules_after(statement: str) -> set[str]:
-    """Top-level modules that a fresh interpreter holds after ``statement``."""
+    """Return the top-level modules loaded by a new interpreter after ``statement``."""
     code = f"{statement}\nimport sys\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     return set(result.stdout.split())
@@ -121,7 +121,7 @@ def test_the_learning_does_not_need_the_game() -> None:
 
 
 def _make_commands(text: str) -> list[str]:
-    """Targets of the ``make`` calls in a page's code, in order."""
+    """Return the targets of the ``make`` calls in a page's code, in order."""
     code = re.findall(r"```.*?```|`[^`\n]+`", text, flags=re.DOTALL)
     return [target for piece in code for target in re.findall(r"\bmake ([\w-]+)", piece)]
 

@@ -1,4 +1,4 @@
-"""The paper's parameter table, to the last weight."""
+"""The paper's parameter table."""
 
 from __future__ import annotations
 

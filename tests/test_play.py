@@ -1,4 +1,4 @@
-"""Playing: keys become the right action integers, and the program runs in a terminal, from a pipe and in a window."""
+"""Playing: keys become the right action integers; the program runs in a terminal, from a pipe and in a window."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ZONE_1 = list(permutations(range(7)))[500]
 
 
 class NotedGame(TeamSupportEnv):
-    """Remembers what it was asked to do."""
+    """Records its calls."""
 
     def __init__(self, **params: Any) -> None:
         super().__init__(**params)
@@ -57,7 +57,7 @@ class NotedGame(TeamSupportEnv):
 def noted_session(
     seed: int | None = 0, raw: bool = False, others: Others = "wait", **params: Any
 ) -> tuple[Session, NotedGame]:
-    """A session on the level above, and its game."""
+    """Create a session on the level above, and its game."""
     world = {"n_agents": 3, "grid_size": 10, "n_treasures": 1, "n_keys": 0, "clutter_density": 0.0} | params
     game = NotedGame(observation="tiles", agent_order="index", **world)
     session = Session(game, seed, raw, others)
@@ -133,7 +133,7 @@ def test_leaving(key: str) -> None:
 def test_new_games_continue_the_seed() -> None:
     session, game = noted_session(seed=5)
     session.press("r")
-    assert game.seeds == [5, None, None]  # the second one is that of the level
+    assert game.seeds == [5, None, None]  # the second one is the level's
 
 
 def test_an_ended_game_waits_for_a_new_one() -> None:
@@ -241,7 +241,7 @@ def test_escape_alone_is_a_key() -> None:
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, int]]:
-    """The player's end and the program's end of a terminal."""
+    """Return the two ends of a terminal: the player's and the program's."""
     pty = pytest.importorskip("pty", reason="no terminals of this kind on Windows")
     player, program = pty.openpty()
     yield player, program
@@ -255,11 +255,11 @@ def test_playing_key_by_key_in_a_terminal(terminal: tuple[int, int], monkeypatch
     monkeypatch.delenv("NO_COLOR", raising=False)
     player, program = terminal
     before = termios.tcgetattr(program)
-    # No newline anywhere: keys count as they are pressed.
+    # No newlines: keys take effect when pressed.
     keys = iter([b"\x1b[A", b"\x1b[A", b"q"])
 
     class Screen(io.StringIO):
-        """The player presses a key whenever a new page is there."""
+        """Presses a key whenever there is a new page."""
 
         def flush(self) -> None:
             os.write(player, next(keys))

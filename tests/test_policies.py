@@ -1,4 +1,4 @@
-"""SAFPolicy, MAPPOPolicy and IPPOPolicy inside stock SB3."""
+"""SAFPolicy, MAPPOPolicy and IPPOPolicy in SB3's algorithms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import DECLARATIONS, register
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, gather_rows, team_rows, to_numpy
 
-#: Every policy that is declared for PPO, sorted by name.
+#: All policies declared for PPO, sorted by name.
 POLICIES: list[type[TeamActorCriticPolicy]] = sorted(
     (cast(Any, policy) for one in DECLARATIONS for policy in one.policies.get(PPO, ())), key=lambda one: one.__name__
 )
@@ -39,7 +39,7 @@ ACTIONS: dict[str, spaces.Space[Any]] = {
     "multi-binary": spaces.MultiBinary(2),
     "box": spaces.Box(-1.0, 1.0, (2,), np.float32),
 }
-#: Every way to set up a policy that changes what is computed.
+#: All options of a policy that change what is computed.
 VARIANTS: list[tuple[type[TeamActorCriticPolicy], dict[str, Any]]] = [
     (IPPOPolicy, {}),
     (IPPOPolicy, {"heads": "per_agent"}),
@@ -58,7 +58,7 @@ VARIANTS: list[tuple[type[TeamActorCriticPolicy], dict[str, Any]]] = [
     (SAFPolicy, {"actor_identity": True}),
 ]
 VARIANTS += [(policy, {}) for policy in POLICIES if policy not in dict(VARIANTS)]
-#: Encoders do not know what stands above them: every policy on vectors, one on pictures and on codes.
+#: Encoders are independent of the rest: every policy on vectors, one on images and on codes.
 VARIANTS_AND_SPACES: list[tuple[type[TeamActorCriticPolicy], dict[str, Any], spaces.Space[Any]]] = [
     *((*variant, VECTOR) for variant in VARIANTS),
     (SAFPolicy, {}, PICTURE),
@@ -80,7 +80,7 @@ def make_policy(
     noise: float = 0.3,
     **kwargs: Any,
 ) -> TeamActorCriticPolicy:
-    """A small policy for three agents, with noise on the actor's small first weights so that every part matters."""
+    """Create a small policy for three agents; noise on the actor's small first weights makes every part matter."""
     th.manual_seed(seed)
     sizes: dict[str, Any] = SMALL | (SMALL_SAF if policy_class is SAFPolicy else {})
     space = TeamSpaces.of(own, 3).to_dict_space()
@@ -151,7 +151,7 @@ def test_no_other_agents_observation_changes_an_action_by_a_bit(
             th.manual_seed(3)
             log_probs = []
             for action in all_actions:
-                # The same draw of a policy for each, under "gumbel".
+                # With "gumbel", all sample the same policy.
                 th.manual_seed(3)
                 log_probs.append(policy.evaluate_actions(variant, action[list(rows)])[1])
             th.manual_seed(3)
@@ -238,7 +238,7 @@ def test_whole_teams_are_judged_without_search_and_as_rows_in_any_order(
     values = policy.predict_values(obs)
     assert not searched
     th.testing.assert_close(values[shuffled], expected, rtol=0, atol=1e-6)
-    # Agents in order, and what row 0's team sees is what rows 0 to 2 see; but row 1 is of another team.
+    # Agents in order, and row 0's team equals rows 0 to 2; but row 1 is of another team.
     obs["team"][1, 0] = obs["obs"][9]
     other = policy.predict_values(obs)
     assert searched
@@ -664,7 +664,7 @@ def test_the_ratio_is_one_before_the_weights_change(action_space: spaces.Space[A
 
 
 def test_with_gumbel_it_is_not() -> None:
-    # Policies drawn anew are compared with those that acted. (They start alike: make them differ.)
+    # Newly sampled policies are compared with those that acted. (They are initially equal, so make them differ.)
     ratios = first_epochs_ratios(120, policy_kwargs={"selection": "gumbel", "ortho_init": False})
     assert (ratios - 1).abs().max() > 1e-2
 

@@ -1,4 +1,4 @@
-"""The policy pool's likelihood, entropy and choices, against enumeration and counting."""
+"""The policy pool's likelihood, entropy and choices, compared with enumeration and counting."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ENUMERABLE = [DISCRETE, MULTI_DISCRETE, MULTI_BINARY]
 
 
 def random_mixture(space: spaces.Space[Any]) -> tuple[th.Tensor, th.Tensor]:
-    """Log weights (B, U) and parameters (B, U, P), far from uniform."""
+    """Return log weights (B, U) and parameters (B, U, P), far from uniform."""
     log_weights = (2.0 * th.randn(N_ROWS, N_POLICIES)).log_softmax(dim=1)
     return log_weights, 2.0 * th.randn(N_ROWS, N_POLICIES, n_action_parameters(space))
 
@@ -46,7 +46,7 @@ def joint_actions(space: spaces.Space[Any]) -> list[tuple[int, ...]]:
 
 
 def probability(space: spaces.Space[Any], parameters: list[float], action: tuple[float, ...]) -> float:
-    """One policy's probability (or density) of one action, by schoolbook arithmetic."""
+    """Compute one policy's probability (or density) of one action by its definition."""
     if isinstance(space, spaces.Box):
         means, log_stds = parameters[:2], parameters[2:]
         densities = [
@@ -76,7 +76,7 @@ def mixture_probability(
 
 
 def as_actions(space: spaces.Space[Any], action: tuple[float, ...]) -> th.Tensor:
-    """The same action in every row, as SB3 hands actions over."""
+    """Return the same action in every row, as SB3 passes actions."""
     if isinstance(space, spaces.Discrete):
         return th.full((N_ROWS,), int(action[0]))
     dtype = th.int64 if isinstance(space, spaces.MultiDiscrete) else th.float32
@@ -116,7 +116,7 @@ def test_mixture_of_gaussians_agrees_with_schoolbook_densities() -> None:
 
 
 def test_the_mixtures_mode_need_not_be_any_policys_favourite() -> None:
-    # Two policies that like actions 0 and 1 best and both like action 2 second best.
+    # Two policies that prefer actions 0 and 1, and both have action 2 as second choice.
     logits = th.tensor([[[0.5, 0.1, 0.4], [0.1, 0.5, 0.4]]]).log()
     log_weights = th.tensor([[0.5, 0.5]]).log()
     assert mixture_of(spaces.Discrete(3), log_weights, logits).mode().tolist() == [2]
@@ -200,7 +200,8 @@ def test_unknown_action_spaces_are_refused() -> None:
 
 
 def test_drawn_policies_follow_their_weights() -> None:
-    # Adding the noise to probabilities instead of logits draws the favourite less than half of the time.
+    # If the noise is added to probabilities instead of logits, the most likely policy is drawn less than half of the
+    # time.
     weights, count = th.tensor([0.8, 0.15, 0.05]), 50_000
     actions = th.eye(3).expand(count, -1, -1)
     shares = draw_policy(weights.log().expand(count, -1), actions).mean(dim=0)

@@ -1,8 +1,8 @@
 """
-The ladder of probes, climbed by real PPO on ``make_team_env``; see ``tests/probe_envs.py`` for the games.
+PPO on the probe games of ``tests/probe_envs.py``, with ``make_team_env``.
 
-Every probe says what the right answer is and who must fail to find it, with the number. Numbers "over seeds" are of
-``train`` with seeds 0 to 4; tests run one seed.
+Every test states the right answer and which methods cannot find it. Numbers "over seeds" are of ``train`` with seeds 0
+to 4; tests run one seed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def train(
     learning_rate: float = 3e-3,
     **policy_kwargs: Any,
 ) -> TeamActorCriticPolicy:
-    """Small networks, one minibatch, ten epochs."""
+    """Train with small networks, one minibatch, ten epochs."""
     sizes: dict[str, Any] = {"net_arch": [32], "features_extractor_kwargs": {"features_dim": 16}}
     if policy == "SAFPolicy":
         sizes |= {"latent_dim": 16, "projection_arch": (32,)}
@@ -76,7 +76,7 @@ def train(
 
 
 def rows_of(probe: Probe, time: int = 0) -> dict[str, th.Tensor]:
-    """What a critic sees in all contexts: C * N rows."""
+    """Return what a critic sees in all contexts: C * N rows."""
     own = np.stack([probe.observe(bits, time) for bits in probe.contexts()])
     n_contexts, n_agents, _ = own.shape
     return {
@@ -88,14 +88,14 @@ def rows_of(probe: Probe, time: int = 0) -> dict[str, th.Tensor]:
 
 
 def values_of(policy: TeamActorCriticPolicy, probe: Probe, time: int = 0) -> Array:
-    """(C, N)"""
+    """Return (C, N) values."""
     with th.no_grad():
         values = policy.predict_values(rows_of(probe, time))
     return values.view(-1, len(probe.possible_agents)).double().numpy()
 
 
 def probability_of_1(policy: TeamActorCriticPolicy, probe: Probe) -> Array:
-    """(C, N) probability of each agent's action 1."""
+    """Return (C, N) probabilities of each agent's action 1."""
     distribution = policy.get_distribution(rows_of(probe))
     assert isinstance(distribution, CategoricalDistribution)
     probabilities = distribution.distribution.probs.detach()[:, 1]
@@ -103,7 +103,7 @@ def probability_of_1(policy: TeamActorCriticPolicy, probe: Probe) -> Array:
 
 
 def probability_of_right(policy: TeamActorCriticPolicy, probe: Probe, is_1_right: npt.NDArray[np.bool_]) -> Array:
-    """(C, N)"""
+    """Return (C, N) probabilities of the right action."""
     ones = probability_of_1(policy, probe)
     return np.where(is_1_right, ones, 1.0 - ones)
 
@@ -149,7 +149,7 @@ def test_probes_are_what_they_say(probe_class: type[Probe], length: int) -> None
 
 
 def test_what_others_see_decides_only_where_it_should() -> None:
-    """Rewards of agent 0 over all contexts, by what it sees: their means, which are what IPPO's critic can know."""
+    """Means of agent 0's rewards over all contexts, by what it sees, are all that IPPO's critic can know."""
     for probe_class, means in ((Message, [0.0, 0.0]), (OwnObservation, [-1.0, 1.0])):
         probe = probe_class(n_agents=3)
         rewards = np.array([probe.rewards(bits, np.zeros(3, dtype=np.int64), 0)[0] for bits in probe.contexts()])
@@ -162,7 +162,7 @@ def test_what_others_see_decides_only_where_it_should() -> None:
 
 @pytest.mark.parametrize(("name", "normalize"), [("IPPOPolicy", True), ("MAPPOPolicy", False), ("SAFPolicy", True)])
 def test_constant_reward_for_ever(name: str, normalize: bool) -> None:
-    """1 + 0.9 + 0.81 + ... = 10: time limits are bootstrapped. With true ends it would be 3.6 on average."""
+    """1 + 0.9 + 0.81 + ... = 10: time limits are bootstrapped. With terminations it would be 3.6 on average."""
     probe = ConstantReward(length=8)
     settings: dict[str, Any] = {"n_games": 4, "n_steps": 8, "time_limit": "bootstrap", "normalize_values": normalize}
     values = values_of(train(name, probe, n_updates=30, **settings), probe)
@@ -196,7 +196,7 @@ def test_own_action(name: str) -> None:
 
 
 def joint_success(policy: TeamActorCriticPolicy, probe: JointAction) -> float:
-    """Probability that all agents do the right thing; 0.25 for two agents that toss coins."""
+    """Return the probability that all agents act right; 0.25 for two random agents."""
     return float(probability_of_right(policy, probe, probe.contexts()[:, :, 0] > 0).prod(axis=1).mean())
 
 
@@ -209,14 +209,14 @@ def test_joint_action_with_a_joint_critic(name: str) -> None:
 
 def test_joint_action_without_one() -> None:
     """
-    IPPO's baseline leaves noise of standard deviation 10 around a signal of at most 1.
+    The noise that IPPO's baseline leaves has standard deviation 10, the signal at most 1.
 
-    Over seeds: 0.51, 0.25, 0.29, 0.64, 0.25; mean 0.39 (a coin: 0.25).
+    Over seeds: 0.51, 0.25, 0.29, 0.64, 0.25; mean 0.39 (random: 0.25).
     """
     probe = JointAction()
     policy = train("IPPOPolicy", probe, n_updates=30)
     assert joint_success(policy, probe) < 0.7
-    # The noise itself: no critic of the own view has a smaller error than what the other agent's number does.
+    # The noise itself: a critic of the own view cannot have a smaller error than the other agent's number causes.
     expected = probe.noise * probe.contexts()[:, :, 1].sum(axis=1, keepdims=True)
     assert rmse(values_of(policy, probe), np.broadcast_to(expected, (16, 2))) > 9.0
 
@@ -228,7 +228,7 @@ def test_joint_action_with_value_normalisation() -> None:
 
 def test_joint_action_where_advantages_are_made_of_normalised_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """
-    The failing baseline of value normalisation: values of the rollout are not de-normalised, those trained are.
+    Value normalisation without de-normalising the values of the rollout.
 
     Over seeds: 0.80, 0.26, 0.29, 0.63, 0.65; mean 0.53 instead of 0.9998.
     """
@@ -264,9 +264,10 @@ def test_zone_action_with_a_pool_of_linear_policies() -> None:
 
 def test_zone_action_with_one_linear_policy() -> None:
     """
-    One linear policy is right in 3 of 4 situations at most. Over seeds: 0.71 to 0.74.
+    One linear policy is right in at most 3 of 4 situations. Over seeds: 0.71 to 0.74.
 
-    (With a hidden layer, one policy can do it, too: 0.97, 0.75, 0.998, 0.996, 0.998. 4 policies: 0.999 and more, all.)
+    (One policy with a hidden layer is able to: 0.97, 0.75, 0.998, 0.996, 0.998. 4 policies: 0.999 or more for all
+    seeds.)
     """
     assert zone_success(1, **LINEAR) < 0.76
 
@@ -275,7 +276,7 @@ def test_zone_action_with_one_linear_policy() -> None:
 
 
 def message_error(name: str, probe: Probe, **kwargs: Any) -> float:
-    """Root mean square error of the values, over all contexts of three agents."""
+    """Return the root mean square error of the values, over all contexts of three agents."""
     values = values_of(train(name, probe, n_updates=25, **kwargs), probe)
     return rmse(values, np.roll(probe.contexts()[:, :, 0], -1, axis=1))
 
@@ -287,15 +288,15 @@ def test_message(name: str) -> None:
 
 
 def test_message_without_a_joint_critic() -> None:
-    """IPPO cannot: the best guess, 0, has an error of exactly 1, any other a larger one. Over seeds: 1.001 to 1.011."""
+    """For IPPO, the best guess, 0, has an error of exactly 1, others a larger one. Over seeds: 1.001 to 1.011."""
     assert 1.0 <= message_error("IPPOPolicy", Message(n_agents=3)) < 1.1
 
 
 def test_mappo_needs_the_agents_identity() -> None:
     """
-    With one value for the whole team, the best is the mean of the three numbers: an error of sqrt(2/3) = 0.8165.
+    If the whole team has one value, the best is the mean of the three numbers: an error of sqrt(2/3) = 0.8165.
 
-    Over seeds 0 to 2: 0.817. The identity leaves 0.01 to 0.04.
+    Over seeds 0 to 2: 0.817. With the identity: 0.01 to 0.04.
     """
     error = message_error("MAPPOPolicy", Message(n_agents=3), agent_identity=False)
     assert error == pytest.approx(np.sqrt(2.0 / 3.0), abs=0.01)
@@ -303,9 +304,9 @@ def test_mappo_needs_the_agents_identity() -> None:
 
 def test_saf_needs_to_be_told_whose_value_is_asked() -> None:
     """
-    Messages say who sent them, but the query that reads them is made of the own view alone: without the place in the
-    view, SAF's error is the smallest that this allows, sqrt(1/2). A value head for each agent, or one on the whole
-    team's states that reads the identity (``critic_input="team"``), leaves 0.01 to 0.05.
+    Messages identify their sender, but the query that reads them depends only on the own view: without the place in the
+    view, the smallest possible error is sqrt(1/2), which SAF reaches. With a value head for each agent, or one on the
+    whole team's states that reads the identity (``critic_input="team"``), it is 0.01 to 0.05.
     """
     probe = MessageWithoutPlace(n_agents=3)
     assert message_error("SAFPolicy", probe) == pytest.approx(np.sqrt(0.5), abs=0.01)

@@ -1,4 +1,4 @@
-"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, games with an answer."""
+"""QPLEX as an algorithm of Stable-Baselines3: learning, units, exploration, saving, export, known answers."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ SMALL_NETS: dict[str, Any] = {"net_arch": [16], "mixer_hidden": 16, "kernel_arch
 
 
 def toy_env(n_games: int = 4) -> CentralizedValueWrapper:
-    """Three agents, five steps, time limits that are ends."""
+    """Create games of three agents and five steps, with time limits that terminate."""
     return telling_env(n_games, masks=None, joins={}, deaths={})
 
 
 def telling_env(n_games: int = 4, time_limit: TimeLimit = "terminal", **kwargs: Any) -> CentralizedValueWrapper:
-    """Agents join and die, masks that end the test where they are broken, a state."""
+    """Create games whose agents join and die, with a state, and masks whose violation fails the test."""
     settings: dict[str, Any] = {"n_agents": 3, "max_cycles": 5, "deaths": {1: 3}, "joins": {2: 1}} | kwargs
     masks = settings.get("masks", "observation") is not None
     return make_team_env(
@@ -80,7 +80,7 @@ def same(one: list[th.Tensor], other: list[th.Tensor]) -> bool:
 
 
 def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:
-    """Payoff of the greedy joint action after learning from 1,000 uniformly drawn ones."""
+    """Return the payoff of the greedy joint action after learning from 1,000 uniformly drawn ones."""
     env = make_team_env(MatrixGame(ONE_STEP), n_envs=8, active=False)
     nets = {"n_kernels": 10, "kernel_arch": (64, 64), "mixer_hidden": 64, "net_arch": [128, 128]}
     model = make_model(
@@ -95,13 +95,13 @@ def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:
 
 
 def test_qplex_learns_the_joint_action_worth_8() -> None:
-    """20 of 20 seeds with ``python -m benchmarks.matrix_games`` (QMIX: 1, VDN: none; else the payoff is 0)."""
+    """20 of 20 seeds with ``python -m benchmarks.matrix_games`` (QMIX: 1, VDN: none; otherwise the payoff is 0)."""
     assert learn_matrix("qplex", seed=0, n_updates=400) == 8.0
 
 
 def test_vdn_does_not() -> None:
     """
-    Its best fit to uniform data is -56/9 for the first action of both, and -32/9 for any two of the others.
+    The best fit to uniform data is -56/9 if both agents take the first action, and -32/9 if both take other ones.
 
     Published: -6.2 and -3.6 (arXiv 2008.01062).
     """
@@ -110,9 +110,9 @@ def test_vdn_does_not() -> None:
 
 def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
     """
-    Off-policy learning with additive factorisation grows without bound (arXiv 2006.00587); QPLEX finds the value.
+    Off-policy learning with additive factorisation diverges (arXiv 2006.00587); QPLEX finds the value.
 
-    With gamma = 0.9 the value is 10. VDN's iteration is V <- 3/4 + 1.125 V under uniform data.
+    With gamma = 0.9 the value is 10. VDN's iteration is V <- 3/4 + 1.125 V with uniform data.
     """
     values = {}
     mixers: tuple[MixerName, ...] = ("vdn", "qplex")
@@ -158,7 +158,7 @@ def test_the_target_is_double_q_learning_by_hand() -> None:
     model = make_model(env, mixer="vdn", learning_starts=10)
     model.learn(60 * 3)
     samples, policy = model._buffer().sample(40), model.policy
-    for parameter in policy.target_networks.parameters():  # so that its best actions are others
+    for parameter in policy.target_networks.parameters():  # so that their best actions differ
         parameter.data.add_(th.randn_like(parameter))
     error = team_errors(policy, samples, gamma=0.9)
     assert samples.now.active is not None and samples.after.active is not None and samples.after.masks is not None
@@ -225,7 +225,7 @@ def test_memory_in_training_is_memory_in_play() -> None:
         obs = {"obs": samples.now.own[t].numpy(), "agent": np.arange(3)}
         actions, state = policy.predict(obs, state, np.full(3, t % 4 == 0))
         assert np.array_equal(actions, trained[t])
-        state = (*state[:2], samples.actions[t].numpy())  # what was really done
+        state = (*state[:2], samples.actions[t].numpy())  # the actions that were taken
 
 
 # --- playing ----------------------------------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ def test_memory_in_training_is_memory_in_play() -> None:
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_agents_learn_where_some_die_join_and_may_not_do_everything(policy: str) -> None:
-    """TellingEnv itself fails at an illegal action."""
+    """TellingEnv fails at an illegal action."""
     env = telling_env(time_limit="bootstrap")
     model = make_model(env, policy)
     before = weights(model)
@@ -248,7 +248,7 @@ def test_each_agent_tosses_its_own_coin() -> None:
     greedy, _ = model.predict(obs, deterministic=True)
     model.exploration_rate = 0.5
     differs = np.array([model.predict(obs)[0] != greedy for _ in range(50)])
-    # 4 actions: a coin at 1/2 changes 3/8 of the actions. One coin for all would change 3/4 of them or none at a time.
+    # 4 actions: exploring with 1/2 changes 3/8 of the actions. A common draw for all would change 3/4 of them or none.
     assert differs.mean() == pytest.approx(0.375, abs=0.03)
     assert differs.mean(axis=1).std() < 0.1
     model.exploration_rate = 0.0
@@ -310,7 +310,7 @@ def test_seeded_runs_repeat_bit_for_bit(policy: str) -> None:
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path: Path) -> None:
-    """Model, replay buffer, games and random numbers restored."""
+    """Model, replay buffer, games and random numbers are restored."""
     model = make_model(ToyTeams(), policy).learn(60 * 3)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
@@ -372,7 +372,7 @@ def test_evaluation_callback(tmp_path: Path) -> None:
 def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], onnx: bool, tmp_path: Path) -> None:
     env = make_team_env("TeamSupport", n_envs=4, n_agents=3, grid_size=9, n_treasures=3)
     model = make_model(env, policy, policy_kwargs={"features_extractor_class": LightEncoder} | kwargs).learn(60 * 3)
-    # Heads that differ: a short training leaves their values close to zero.
+    # Heads must differ: a short training leaves their values close to zero.
     for parameter in model.policy.actor.parameters():
         parameter.data.add_(th.randn_like(parameter) * 0.3)
     export_actors(model, tmp_path / "actor", onnx=onnx)

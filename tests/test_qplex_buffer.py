@@ -1,4 +1,4 @@
-"""The replay buffer of teams against a list of what happened."""
+"""The replay buffer of teams, compared with a list of all transitions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make_buffer(game_steps: int = 30, **kwargs: Any) -> TeamReplayBuffer:
 
 
 class Story:
-    """Random games whose transitions are written down."""
+    """Random games whose transitions are recorded."""
 
     def __init__(self, seed: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
@@ -53,7 +53,7 @@ class Story:
         return {"obs": obs, "agent": agents, "state": state, "action_mask": masks, "active": active}
 
     def step(self, buffer: TeamReplayBuffer, cut: bool = False) -> None:
-        """One step; ``cut`` starts new episodes afterwards although none ended."""
+        """Take one step; ``cut`` starts new episodes afterwards although none ended."""
         actions = self.rng.integers(N_ACTIONS, size=(N_GAMES, N_AGENTS))
         rewards = self.rng.random((N_GAMES, N_AGENTS)).astype(np.float32)
         after, ended = self._views(), self.rng.random(N_GAMES) < 0.3
@@ -80,7 +80,7 @@ class Story:
 
 
 def check(story: Story, samples: TeamReplaySamples, oldest: int, terminal: bool = False) -> set[tuple[int, int]]:
-    """Find every sampled step in the story; what follows a true end does not matter."""
+    """Find every sampled step in the story; what follows a termination does not matter."""
     found = set()
     for i in range(len(samples.rewards)):
         own = samples.now.own[i].numpy()
@@ -109,7 +109,7 @@ def check(story: Story, samples: TeamReplaySamples, oldest: int, terminal: bool 
 
 @pytest.mark.parametrize("kwargs", [{}, {"active": True, "n_masked_actions": 4, "state": spaces.Box(0, 255, (1,))}])
 def test_samples_are_what_happened(kwargs: dict[str, Any]) -> None:
-    """Also after the ring has gone round, with time limits and resets in between."""
+    """Also after the ring was overwritten, with time limits and resets in between."""
     buffer, story = make_buffer(30, **kwargs), Story()
     for t in range(47):
         story.step(buffer, cut=t in (5, 17, 31, 44))
@@ -117,7 +117,7 @@ def test_samples_are_what_happened(kwargs: dict[str, Any]) -> None:
         assert buffer.n_stored == N_GAMES * n_kept
         if t in (0, 3, 11, 46):
             found = check(story, buffer.sample(200), oldest=t + 1 - n_kept)
-            assert len(found) == N_GAMES * n_kept  # all of them, none else
+            assert len(found) == N_GAMES * n_kept  # all of them, and no others
 
 
 def test_observations_are_stored_once() -> None:
@@ -126,7 +126,7 @@ def test_observations_are_stored_once() -> None:
         story.step(buffer)
     n_slots = 1_001 * N_GAMES
     assert buffer.seen["obs"].nbytes == n_slots * N_AGENTS * 3
-    # Put aside: last observations of time limits among the kept steps, no leak over the turns of the ring.
+    # Stored separately: last observations of time limits among the kept steps; they do not accumulate.
     assert len(buffer.aside["obs"]) < n_slots / 3
     per_step = buffer.nbytes / n_slots
     assert per_step < 25

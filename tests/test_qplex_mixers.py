@@ -1,4 +1,4 @@
-"""Mixers by enumeration: what agents do alone is what is best together."""
+"""Mixers, by enumeration: each agent's best actions together are the best joint action."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def make_mixer(name: str, n_agents: int) -> Mixer:
 def joint_values(
     mixer: Mixer, values: th.Tensor, state: th.Tensor, active: th.Tensor | None
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Q_tot (G, A**N) of every joint action, and the joint actions (A**N, N): values (G, N, A)."""
+    """Return Q_tot (G, A**N) of all joint actions, and the joint actions (A**N, N), from values (G, N, A)."""
     n_steps, n_agents, n_actions = values.shape
     joint = th.tensor(list(product(range(n_actions), repeat=n_agents)))
     best = values.max(dim=2).values
@@ -64,7 +64,7 @@ def test_qmix_never_falls_when_an_agents_value_rises(n_agents: int) -> None:
 
 
 def test_qplex_is_the_published_sum() -> None:
-    """Sum V' + sum lambda A', and in the gradient no advantage trains an agent."""
+    """Sum V' + sum lambda A', where advantages have no gradient for the agents."""
     mixer, n_steps, n_agents = QPLEXMixer(STATE_DIM, 3, N_ACTIONS), 40, 3
     state, values = th.randn(n_steps, STATE_DIM), th.randn(n_steps, n_agents, N_ACTIONS, requires_grad=True)
     actions = th.randint(N_ACTIONS, (n_steps, n_agents))
@@ -84,9 +84,9 @@ def test_qplex_is_the_published_sum() -> None:
 @pytest.mark.parametrize(("n_agents", "state_dim"), [(2, 128), (5, 320)])
 def test_lambda_tells_joint_actions_apart_from_the_start(n_agents: int, state_dim: int) -> None:
     """
-    Standard deviation of log lambda over joint actions, and of what is left of it after a sum over agents.
+    Standard deviation of log lambda over joint actions, and of its remainder after fitting a sum over agents.
 
-    Measured for (2, 128): 0.33 and 0.06. With torch's own initialisation: 0.005 and 0.0007.
+    Measured for (2, 128): 0.33 and 0.06. With torch's default initialisation: 0.005 and 0.0007.
     """
     mixer = QPLEXMixer(state_dim, n_agents, N_ACTIONS)
     joint = th.tensor(list(product(range(N_ACTIONS), repeat=n_agents)))

@@ -1,4 +1,4 @@
-"""``make train`` in small: everything it promises is there, and its model can be replayed."""
+"""``make train`` with small numbers: all its outputs exist, and its model can be replayed."""
 
 from __future__ import annotations
 

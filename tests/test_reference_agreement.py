@@ -1,4 +1,4 @@
-"""The kernels agree with the plain-Python reference world, step by step, on random configurations of both rule sets."""
+"""The kernels equal the plain-Python reference world, step by step, on random configurations of both rule sets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STATE_ENTRIES = ("walls", "treasures", "keys", "agent_pos", "agent_dir", "agent_
 
 @st.composite
 def configurations(draw: st.DrawFn, max_tile: int = 14) -> dict[str, Any]:
-    """Parameters that fit on their map, small and crowded so that agents meet."""
+    """Return parameters that fit on their map, small and crowded so that agents meet."""
     size = draw(st.integers(4, 10))
     cells = (size - 2) ** 2
     n_agents = draw(st.integers(1, 7))
@@ -58,7 +58,7 @@ def assert_same_views(batch: GameBatch, world: ReferenceWorld) -> None:
 
 
 def crowded(state: StateMapping, rng: np.random.Generator) -> StateMapping:
-    """Gather the agents around one of them, some with keys: they share cells, block drops and see each other."""
+    """Move the agents around one of them, some with keys: they share cells, block drops and see each other."""
     x, y = state["agent_pos"][0]
     near = [
         (i, j)
@@ -73,7 +73,7 @@ def crowded(state: StateMapping, rng: np.random.Generator) -> StateMapping:
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
-# Thirty examples miss that released support is counted from where the agent came; a hundred find it.
+# Thirty examples do not detect that released support is counted from the previous cell; a hundred do.
 @settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(5, 25))
 def test_kernels_agree_with_the_reference(task: str, params: dict[str, Any], seed: int, n_steps: int) -> None:

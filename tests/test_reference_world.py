@@ -1,4 +1,4 @@
-"""The slow world against recorded episodes and against answers worked out by hand from the rule book."""
+"""The reference world, compared with recorded episodes and with results worked out by hand from the rule book."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def world_of(state: State, task: str = "TeamTogether", **params: Any) -> Referen
 
 
 def tile_at(world: ReferenceWorld, viewer: int, ahead: int, aside: int = 0) -> npt.NDArray[np.uint8]:
-    """The tile so many cells ahead of a viewer and to its right."""
+    """Return the tile at a position ahead of a viewer and to its right."""
     t = world.tile
     row, column = world.view - 1 - world.offset - ahead, world.view // 2 + aside
     return world.observe(viewer)[row * t : (row + 1) * t, column * t : (column + 1) * t]
 
 
 def colour_at(world: ReferenceWorld, viewer: int, ahead: int, aside: int = 0) -> tuple[int, ...]:
-    """Colour in the middle of a tile: of the agent if one is drawn, else of the cell. Needs tiles of 12 pixels."""
+    """Return the colour in the middle of a tile: the agent's if drawn, else the cell's. Needs tiles of 12 pixels."""
     assert world.tile == 12, "in small tiles no pixel lies wholly inside the triangle"
     return tuple(tile_at(world, viewer, ahead, aside)[6, 6].tolist())
 
@@ -227,14 +227,14 @@ def test_agents_keep_their_order_of_arrival() -> None:
     world = world_of(level("#####\n#>.<#\n#.^.#\n#...#\n#####"))
     world.step([FORWARD] * 3, order=[2, 0, 1])
     assert world.agents_in((2, 1)) == [2, 0, 1]
-    assert world_of(world.get_state()).agents_in((2, 1)) == [0, 1, 2]  # a state knows no arrivals: index order
-    world.step([TOGGLE, TOGGLE, RIGHT])  # turning is not leaving
+    assert world_of(world.get_state()).agents_in((2, 1)) == [0, 1, 2]  # a state has no arrivals: index order
+    world.step([TOGGLE, TOGGLE, RIGHT])  # turning is not leaving the cell
     assert world.agents_in((2, 1)) == [2, 0, 1]
     world.step([TOGGLE, TOGGLE, FORWARD])  # the first leaves
     assert world.agents_in((2, 1)) == [0, 1]
     world.step([RIGHT, RIGHT, RIGHT])
     world.step([TOGGLE, TOGGLE, RIGHT])
-    world.step([TOGGLE, TOGGLE, FORWARD])  # and comes back as the last
+    world.step([TOGGLE, TOGGLE, FORWARD])  # and returns as the last
     assert world.agents_in((2, 1)) == [0, 1, 2]
 
 
@@ -242,7 +242,7 @@ def test_agents_keep_their_order_of_arrival() -> None:
 @pytest.mark.parametrize("cell", [".", "$", "o"])
 @both_rules
 def test_first_arrival_is_drawn_unless_the_viewer_is_there(first: int, cell: str, rules: str) -> None:
-    # Agent 0 enters from the west, 1 from the east, 2 looks on from the south; three on the cell would be needed.
+    # Agent 0 enters from the west, 1 from the east, 2 watches from the south; the treasure needs three on the cell.
     world = world_of(level(f"#####\n#>{cell}<#\n#...#\n#.^.#\n#####"), coordination=3, rules=rules)
     world.step([FORWARD, FORWARD, TOGGLE], [first, 1 - first, 2])
     for there, facing in [(0, EAST), (1, WEST)]:
@@ -286,7 +286,7 @@ def test_pickup_collects_underfoot(rules: str) -> None:
     world = world_of(state, coordination=2, rules=rules)
     assert world.step([FORWARD, PICKUP]) == [0, 0]  # the first has left before the second acts
     world = world_of(state, coordination=2, rules=rules)
-    assert world.step([PICKUP, FORWARD]) == [0.5, 0.5]  # the other way round they are still two
+    assert world.step([PICKUP, FORWARD]) == [0.5, 0.5]  # in the reverse order both are on the cell
 
 
 @both_rules
@@ -314,7 +314,7 @@ def test_where_support_is_counted(row: str, paper: bool, released: bool, rules: 
     actions = [FORWARD if direction == EAST else TOGGLE for direction in world.dir]
     expected = {"paper": paper, "released": released}[rules]
     assert world.step(actions) == [0.5 * expected] * 2
-    # With a key in hand the released rules count KeyForTreasure the same way; the paper's want both on the cell.
+    # If the agent has a key, the released rules count KeyForTreasure the same way; the paper's need both on the cell.
     state["agent_has_key"][:] = True
     world = world_of(state, "KeyForTreasure", coordination=2, rules=rules)
     assert world.step(actions) == [0.5 * (rules == "released" and released)] * 2
@@ -323,7 +323,7 @@ def test_where_support_is_counted(row: str, paper: bool, released: bool, rules: 
 @pytest.mark.parametrize(
     ("helper", "radius", "supports"),
     [
-        ((5, 5), 2, True),  # the corner of the square counts: Chebyshev
+        ((5, 5), 2, True),  # the corner of the square counts (Chebyshev distance)
         ((5, 6), 2, False),
         ((1, 1), 2, True),
         ((3, 3), 0, True),
@@ -375,7 +375,7 @@ def test_key_for_treasure_together_on_the_cell(rules: str) -> None:
     world = world_of(state, "KeyForTreasure", coordination=2, rules=rules)
     assert world.step([FORWARD, FORWARD], [0, 1]) == [0.5, 0.5]
     world = world_of(state, "KeyForTreasure", coordination=2, rules=rules)
-    # Who carries the key comes first: alone on the cell (paper), but not alone around (released).
+    # The agent with the key comes first: alone on the cell (paper), but not alone nearby (released).
     assert world.step([FORWARD, FORWARD], [1, 0]) == [0.5 * (rules == "released")] * 2
 
 
@@ -420,7 +420,7 @@ def test_who_carries_no_key_drops_none() -> None:
 
 
 def seen_rows(world: ReferenceWorld, viewer: int = 0) -> list[str]:
-    """The mask as it would be drawn: '+' seen, '.' not, farthest row first."""
+    """Format the mask: '+' seen, '.' not, farthest row first."""
     return ["".join("+" if seen else "." for seen in row) for row in world.visible(viewer).T]
 
 
@@ -437,7 +437,7 @@ def test_boxed_in() -> None:
 
 
 def test_a_wall_ahead_hides_the_far_left_only() -> None:
-    """The scan is not symmetric: leftwards it stops at column 1, so column 0 lights nothing."""
+    """The scan is not symmetric: to the left it stops at column 1, so column 0 lights nothing."""
     world = world_of(level("...\n.#.\n.^."), view_size=3, view_offset=0)
     assert seen_rows(world) == [".++", "+++", "+++"]
 
@@ -451,7 +451,7 @@ def test_shadows_turn_with_the_viewer() -> None:
 
 
 def test_a_corridor() -> None:
-    """Two cells wide, the agent in its left half: the walls along it are seen, what is behind them is not."""
+    """Two cells wide, the agent in its left half: the walls along it are seen, cells behind them are not."""
     world = world_of(level(".....\n.####\n.#..#\n.#..#\n.#^.#"), view_size=5, view_offset=0)
     assert seen_rows(world) == [".....", ".++++", ".++++", ".++++", ".++++"]
 
@@ -504,7 +504,7 @@ def test_beyond_the_walls_is_dark() -> None:
 
 @pytest.mark.parametrize("facing", range(4))
 def test_key_turns_with_the_map(facing: int) -> None:
-    """Upright for who looks north, on its side for who looks east; n of 9 points yellow make 255 * n // 9."""
+    """Upright for an agent facing north, on its side for one facing east; n of 9 yellow points: 255 * n // 9."""
     upright = np.array([[0, 2, 5, 0], [0, 3, 7, 0], [0, 1, 6, 0], [0, 1, 4, 0]])
     on_its_side = np.array([[0, 0, 0, 0], [5, 7, 6, 4], [2, 3, 1, 1], [0, 0, 0, 0]])
     turned = {NORTH: upright, EAST: on_its_side, SOUTH: upright[::-1, ::-1], WEST: on_its_side[::-1, ::-1]}
@@ -568,10 +568,10 @@ def test_agent_on_a_collected_treasure() -> None:
 @pytest.mark.parametrize(("t", "grey"), [(10, 0), (11, 1), (12, 2), (30, 20), (40, 20)])
 @pytest.mark.parametrize("facing", range(4))
 def test_grid_lines_of_large_tiles_turn_with_the_map(t: int, grey: int, facing: int) -> None:
-    """The north and the east side of a cell on the map carry the line."""
+    """The north and the east side of a map cell have the line."""
     world = world_of(level("#####\n#...#\n#...#\n#...#\n#####", agents=[(2, 2, facing, False)]), view_tile_size=t)
     expected = np.zeros((t, t, 3), dtype=int)
-    # Who faces east sees the map's north on the left and its east on top; and so on.
+    # An agent that faces east sees the map's north on the left and its east at the top, and so on.
     row, column = {NORTH: (0, -1), EAST: (0, 0), SOUTH: (-1, 0), WEST: (-1, -1)}[facing]
     expected[row, :] = expected[:, column] = grey
     np.testing.assert_array_equal(tile_at(world, 0, ahead=1), expected)

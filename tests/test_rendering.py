@@ -1,4 +1,4 @@
-"""Pictures: what differs must look different, what is equal must look equal, and sizes and colours are known."""
+"""Rendered images: different things look different, equal things look equal, sizes and colours are known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def make_params(n_agents: int = 1, heterogeneity: int = 1, grid_size: int = SIDE
 
 
 def make_state(agents: list[tuple[int, int, int, bool]], side: int = SIDE) -> dict[str, npt.NDArray[Any]]:
-    """An empty room with agents (x, y, direction, has key)."""
+    """Create an empty room with agents (x, y, direction, has key)."""
     walls = np.ones((side, side), dtype=bool)
     walls[1:-1, 1:-1] = False
     return {
@@ -57,7 +57,7 @@ def make_scene(
 
 
 def draw(scene: Scene, tile: int = TILE) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Header, and the map as (x, y, pixel row, pixel column, channel)."""
+    """Draw the header, and the map as (x, y, pixel row, pixel column, channel)."""
     picture = render_scene(scene, tile)
     top = header_height(scene.task, scene.params, tile)
     side = scene.params.grid_size
@@ -146,7 +146,7 @@ def test_available_and_collected_treasures_and_floor_all_differ(tile: int) -> No
     available, collected, floor = cells[2, 2], cells[4, 2], cells[6, 2]
     assert np.abs(available - collected).mean() > 20
     assert np.abs(collected - floor).mean() > 3
-    # Only what can be had shines.
+    # Only treasures that can be collected are bright.
     assert np.ptp(available, axis=-1).max() > 100
     assert np.ptp(collected, axis=-1).max() < 40
 
@@ -170,7 +170,7 @@ def test_keys_are_golden() -> None:
 
 
 def test_agents_have_colours_of_their_own_and_numbers() -> None:
-    """Also the eighth, whose colour is that of the first."""
+    """Also the eighth agent, which has the first one's colour."""
     scene = make_scene([(1 + agent, 5, 0, False) for agent in range(8)], heterogeneity=3)
     cells = draw(scene)[1]
     for agent, colour in enumerate((*rendering.AGENT_PALETTE, rendering.AGENT_PALETTE[0])):
@@ -242,7 +242,7 @@ def test_views_are_outlined_and_change_nothing_else() -> None:
     seen = scene._replace(visible=visible)
     plain, drawn = draw(scene)[1].astype(int), draw(seen)[1].astype(int)
     np.testing.assert_array_equal((plain != drawn).any(axis=(2, 3, 4)), visible[0])
-    # A veil that is hardly there, and a line in the agent's colour along the border.
+    # A faint veil, and a line in the agent's colour along the border.
     assert 0 < (drawn - plain)[4, 5, 10, 10].max() < 16
     assert (drawn - plain)[3, 5, 10, 0, 0] > 60
     assert (drawn - plain)[4, 5, 10, 0, 0] < 16
@@ -283,7 +283,7 @@ def test_step_score_and_treasures_are_in_the_header() -> None:
 
 @pytest.mark.parametrize(("grid_size", "tile"), [(6, 8), (6, 24), (8, 12), (30, 24)])
 def test_words_stay_inside_the_header(grid_size: int, tile: int) -> None:
-    """Nothing is cut off on the right, lines do not overlap, and no number of a game needs more room."""
+    """Nothing is cut off on the right, lines do not overlap, and all numbers of a game have enough space."""
     params = HECOGridParams(
         n_agents=2, grid_size=grid_size, n_treasures=min(100, (grid_size - 2) ** 2), n_keys=0, max_cycles=500
     )
@@ -367,7 +367,7 @@ def test_closed_window_stays_closed(pygame: Any) -> None:
 
 def test_no_display_is_an_error_and_not_an_invisible_window(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SDL_VIDEODRIVER")
-    # On a machine without a screen SDL falls back to this driver without a word.
+    # On a machine without a display, SDL silently falls back to this driver.
     monkeypatch.setattr(pygame.display, "init", lambda: None)
     monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
     with pytest.raises(RuntimeError, match=r'no display\); draw pictures with render_mode="rgb_array"'):
@@ -384,7 +384,7 @@ def test_no_display_for_real(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.skipif(sys.platform != "linux", reason="displays of other systems are not servers")
 def test_a_display_that_hangs(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An X server that takes connections and never answers."""
+    """An X server that accepts connections and never answers."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         name = f"127.0.0.1:{server.getsockname()[1] - 6000}"
         monkeypatch.delenv("SDL_VIDEODRIVER")

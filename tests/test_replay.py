@@ -1,4 +1,4 @@
-"""The replay page: its numbers are those of the recording, its controls work, and bad input is refused."""
+"""The replay page: its numbers equal the recording's, its controls work, and invalid input is refused."""
 
 from __future__ import annotations
 

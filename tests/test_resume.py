@@ -1,4 +1,4 @@
-"""Runs that end early and go on: equal to the undisturbed run, bit for bit."""
+"""Interrupted and resumed runs equal the uninterrupted run, bit for bit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
-#: Rollouts of a run; two strikes of lightning fit into it.
+#: Rollouts of a run; two interruptions fit into it.
 ROLLOUTS = 6
 WHOLE = ROLLOUTS * ROLLOUT
 TASK: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 7, "n_treasures": 3, "coordination": 1, "max_cycles": 10}
@@ -54,7 +54,7 @@ def _close_what_was_made() -> Iterator[None]:
 
 
 class Lightning(BaseCallback):
-    """Ends the process's training in the middle of a rollout, as a crash would."""
+    """Ends training in the middle of a rollout, as a crash would."""
 
     def __init__(self, after_calls: int, error: type[BaseException] = RuntimeError) -> None:
         super().__init__()
@@ -76,7 +76,7 @@ def make(
     coordination: int = 1,
     **arguments: Any,
 ) -> Any:
-    """A model as a user's script makes it at every start."""
+    """Create a model as a user's script does at every start."""
     monitor_dir = None if folder is None else str(folder)
     env = sb3_saf.make_team_env(
         "TeamTogether", N_GAMES, seed=games_seed, monitor_dir=monitor_dir, **TASK | {"coordination": coordination}
@@ -109,7 +109,7 @@ def evaluation(folder: Path | None = None, seed: int = 50, **arguments: Any) -> 
 
 
 def struck(folder: Path, make_model: Callable[[], Any], after_calls: int, others: Any = ()) -> None:
-    """A run that ends in the middle of a rollout."""
+    """Run until it is interrupted in the middle of a rollout."""
     with pytest.raises(RuntimeError):
         resumable_learn(
             make_model(), WHOLE, folder, [*others, Lightning(after_calls)], every_game_steps=1, tb_log_name="run"
@@ -124,7 +124,7 @@ def go_on(folder: Path, model: Any, others: Any = (), rollouts: int = ROLLOUTS) 
 
 
 def qplex(policy: str, **parts: Any) -> Any:
-    """Its replay buffer holds a third of the run."""
+    """Create QPLEX, whose replay buffer holds a third of the run."""
     settings: dict[str, Any] = {
         "buffer_size": 48,
         "learning_starts": 12,
@@ -136,7 +136,7 @@ def qplex(policy: str, **parts: Any) -> Any:
 
 
 class Masking(TeamVecEnvWrapper):
-    """Forbids each row one action, another one at each step."""
+    """Forbids each row one action, a different one at each step."""
 
     def __init__(self, venv: VecEnv) -> None:
         own, mask = venv.observation_space, spaces.MultiBinary(7)
@@ -165,7 +165,7 @@ class Masking(TeamVecEnvWrapper):
 
 
 def masked_games() -> sb3_saf.CentralizedValueWrapper:
-    """Games that forbid some actions, which change from step to step."""
+    """Create games whose forbidden actions change from step to step."""
     native = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=3, **TASK).venv
     return sb3_saf.CentralizedValueWrapper(Masking(native))
 
@@ -251,7 +251,7 @@ def test_resume_alone(tmp_path: Path) -> None:
     checkpoints = TeamCheckpointCallback(tmp_path, every_game_steps=1)
     with pytest.raises(RuntimeError):
         make().learn(WHOLE, [checkpoints, Lightning(20)])
-    checkpoints.store.release()  # a process that ends does so
+    checkpoints.store.release()  # as at the end of a process
     model = make()
     path = resume(tmp_path, model)
     assert path.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"
@@ -286,7 +286,7 @@ DIFFERENCES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], str]]
 
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int | None], Path]:
-    """Folders of finished runs, by the model's seed."""
+    """Return folders of finished runs, by the model's seed."""
 
     @functools.cache
     def folder_of(seed: int | None) -> Path:
@@ -299,7 +299,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int | No
 
 @pytest.mark.parametrize("name", DIFFERENCES)
 def test_another_run_is_named_before_anything_is_touched(name: str, finished_run: Callable[[int | None], Path]) -> None:
-    folder = finished_run(None if name == "games' seeds" else 3)  # a model's seed is that of its games, too
+    folder = finished_run(None if name == "games' seeds" else 3)  # a model's seed also seeds its games
     before = fingerprint(folder)
     make_other, make_callback, message = DIFFERENCES[name]
     with pytest.raises(CheckpointError, match=message):
@@ -420,12 +420,12 @@ def test_a_clock_that_is_set_back_all_the_time_changes_nothing(tmp_path: Path, m
     monkeypatch.setattr("time.time_ns", lambda: next(seconds) * 10**9)
     struck(tmp_path / "run", make, after_calls=20)
     newest = max((tmp_path / "run").glob("*.ckpt"))
-    assert newest.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"  # not by the time of day
+    assert newest.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"  # not by time
     assert weights(go_on(tmp_path / "run", make())) == undisturbed
 
 
 def test_lines_of_a_monitor_file_are_kept(tmp_path: Path) -> None:
-    """By a run that is refused, by a reset before resuming, and by another run in the same folder."""
+    """Lines are kept by a refused run, by a reset before resuming, and by another run in the same folder."""
     resumable_learn(make(tmp_path), 4 * ROLLOUT, tmp_path / "ck", every_game_steps=1)
     before = (tmp_path / "monitor.csv").read_bytes()
     with pytest.raises(CheckpointError, match="of another run"):

@@ -1,4 +1,4 @@
-"""Teams with roles: agents that see the same and are paid for different actions."""
+"""Agents with roles: all see the same and are rewarded for different actions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEEN = np.ones(2, np.float32)
 
 
 class Buttons(ParallelEnv[str, np.ndarray, int]):
-    """Agent i is paid for pressing button i; all see the same."""
+    """Agent i is rewarded for pressing button i; all see the same."""
 
     metadata: dict[str, Any] = {"name": "buttons"}
 

@@ -1,4 +1,4 @@
-"""One real PPO update is the same whichever buffer holds the data and whether views are encoded once or every time."""
+"""A real PPO update is the same with both buffers, and with or without encoding equal views once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.test_policies import ACTIONS
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 
-#: SB3's buffer as the default, ours, and each with every row encoded.
+#: SB3's buffer (the default) and ours, each also with every row encoded.
 WAYS: list[tuple[type[DictRolloutBuffer] | None, bool]] = [
     (None, True),
     (TeamRolloutBuffer, True),
@@ -34,7 +34,7 @@ def updated(
     buffer_class: type[DictRolloutBuffer] | None,
     encode_once: bool,
 ) -> PPO:
-    """A model that collected one rollout of 120 rows and took one step on all of it."""
+    """Create a model with one rollout of 120 rows and one gradient step on all of it."""
     sizes: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}, "chunk_size": 7}
     if not encode_once:
         sizes |= {"encode_once": False, "chunk_size": None}
@@ -46,7 +46,7 @@ def updated(
         n_epochs=1,
         ent_coef=0.01,
         clip_range_vf=0.2,
-        max_grad_norm=1e6,  # gradients as they are
+        max_grad_norm=1e6,  # no clipping
         rollout_buffer_class=buffer_class,
         policy_kwargs=sizes | kwargs,
         seed=0,
@@ -59,7 +59,7 @@ def gradients(model: PPO) -> dict[str, th.Tensor]:
     return {name: p.grad for name, p in model.policy.named_parameters() if p.grad is not None}
 
 
-# Every way to set up a policy is tried with both encodings in test_policies.
+# test_policies compares both encodings for all options of a policy.
 @pytest.mark.parametrize(
     ("policy_class", "kwargs", "own", "action_space"),
     [
@@ -81,9 +81,9 @@ def test_buffers_and_encodings_give_the_same_loss_and_gradients(
     expected = gradients(reference)
     assert expected.keys() == dict(reference.policy.named_parameters()).keys()
     for model in others:
-        # The same rollout: rewards are made of views and actions. (SB3's buffer reorders the other arrays.)
+        # The same rollout: rewards depend on views and actions. (SB3's buffer reorders the other arrays.)
         rewards, same = model.rollout_buffer.rewards, reference.rollout_buffer.rewards
-        np.testing.assert_allclose(rewards, same, rtol=1e-5, atol=5e-6)  # of bootstrapped values, in float32
+        np.testing.assert_allclose(rewards, same, rtol=1e-5, atol=5e-6)  # bootstrapped values in float32
         for tag in ("train/loss", "train/value_loss", "train/policy_gradient_loss", "train/entropy_loss"):
             logged, right = (m.logger.name_to_value[tag] for m in (model, reference))
             assert logged == pytest.approx(right, rel=1e-5, abs=1e-6), tag

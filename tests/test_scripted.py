@@ -1,4 +1,4 @@
-"""Scripted teams on levels whose right answer is known."""
+"""Scripted teams on levels with a known answer."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def level(*rows: str, agents: list[tuple[int, int, Direction]]) -> StateMapping:
 
 
 def collected(name: str, task: str, state: StateMapping, max_cycles: int, **params: Any) -> int:
-    """What a team has collected after some steps."""
+    """Return what a team has collected after some steps."""
     size, n_agents = len(state["walls"]), len(state["agent_pos"])
     params |= {"n_agents": n_agents, "grid_size": size, "max_cycles": max_cycles}
     batch = GameBatch(task, HECOGridParams(n_treasures=0, n_keys=0, clutter_density=0.0, **params))
@@ -45,7 +45,7 @@ def collected(name: str, task: str, state: StateMapping, max_cycles: int, **para
 
 
 def first_return(name: str, task: str, state: StateMapping, **params: Any) -> int:
-    """Steps after which a team has the first treasure."""
+    """Return the steps after which a team has the first treasure."""
     return next(steps for steps in range(1, 50) if collected(name, task, state, steps, **params))
 
 
@@ -61,7 +61,7 @@ ALONE = level(
 
 
 def test_costs_count_turns_steps_and_the_target() -> None:
-    """Beside a wall: from (2, 3) facing west one turn, one step, one turn, two steps, one turn, one step."""
+    """Near a wall: from (2, 3) facing west one turn, one step, one turn, two steps, one turn, one step."""
     costs = np.full((6, 6), np.inf)
     costs[4, 3] = 0.5
     field = cost_to_go(~ALONE["walls"], costs)
@@ -73,12 +73,12 @@ def test_costs_count_turns_steps_and_the_target() -> None:
 
 @pytest.mark.parametrize("heterogeneity", [1, 3])
 def test_full_sight_takes_the_shortest_path(heterogeneity: int) -> None:
-    """Zones change what actions do, not how many are needed."""
+    """Zones change the meaning of actions, not their number."""
     assert first_return("full sight", "TeamSupport", ALONE, heterogeneity=heterogeneity) == 7
 
 
 def test_views_do_not_reach_behind_the_agent() -> None:
-    """Two cells behind, a treasure is not seen; two cells ahead it is, and reached at once."""
+    """A treasure two cells behind is not seen; one two cells ahead is, and is reached directly."""
     rows = ["#######", "#######", "#######", "#T   T#", "#######", "#######", "#######"]
     seen = level(*rows, agents=[(3, 3, EAST)])
     batch = GameBatch("TeamSupport", HECOGridParams(1, 7, n_treasures=0, clutter_density=0.0))
@@ -92,7 +92,7 @@ def test_views_do_not_reach_behind_the_agent() -> None:
 
 
 def beside_a_treasure(other: list[tuple[int, int, Direction]], key: str = " ") -> StateMapping:
-    """A level with an agent that faces a treasure, perhaps others, and perhaps a key behind it."""
+    """Return a level with an agent that faces a treasure, optionally others, and optionally a key behind it."""
     row, empty = f"#{key} T   #", "#      #"
     return level("########", empty, empty, row, empty, empty, empty, "########", agents=[(2, 3, EAST), *other])
 
@@ -111,7 +111,7 @@ def beside_a_treasure(other: list[tuple[int, int, Direction]], key: str = " ") -
 def test_agents_meet_at_a_treasure(
     name: str, task: str, coordination: int, others: list[tuple[int, int, Direction]], steps: int
 ) -> None:
-    """The one beside it waits for those who have further to go: onto it, or within two cells of it."""
+    """The nearest agent waits for those that are farther away: on the treasure, or within two cells of it."""
     state = beside_a_treasure(others)
     assert first_return(name, task, state, coordination=coordination, agent_order="index") == steps
 
@@ -139,7 +139,7 @@ def test_views_do_not_wait_for_ever() -> None:
 def test_the_command_writes_its_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Rows for every level and team, printed and in a file; who sees more collects more."""
+    """Rows for every level and team, printed and in a file; teams with full sight collect more."""
     path = tmp_path / "scale.csv"
     line = f"scripted --tasks TeamSupport --coordination 1 --games 4 --csv {path}"
     monkeypatch.setattr(sys, "argv", line.split())

@@ -1,4 +1,4 @@
-"""Snapshots of games: what is computed from them equals what play left, and states that no game reaches are refused."""
+"""Snapshots of games: derived values equal those of the game, and impossible states are refused."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_games_of_a_snapshot_are_those_that_were_played(task: str, rules: Rules)
     fresh.restore(batch.snapshot())
     assert batch._games.crowd.max() > 1
     for name, array in batch._games._asdict().items():
-        if not name.startswith("sight"):  # computed anew when it is asked for
+        if not name.startswith("sight"):  # computed again on demand
             np.testing.assert_array_equal(getattr(fresh._games, name), array, err_msg=name)
     rng = np.random.default_rng(1)
     for _ in range(40):
@@ -58,7 +58,7 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], object]:
 
 
 def _same_cell(snapshot: dict[str, Any]) -> None:
-    """Two agents arrive in one cell as its first."""
+    """Put two agents into one cell, both as first arrival."""
     for name in ("x", "y"):
         snapshot[name][0, :] = snapshot[name][0, 0]
     snapshot["rank"][0] = 0

@@ -1,4 +1,4 @@
-"""Suites of others' games: what they declare, how they are found, and the real games as rows of teams."""
+"""Third-party suites: their declarations, their lookup, and the real games as rows of teams."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tests.toy_envs import CounterEnv
 ROOT = Path(__file__).resolve().parents[1]
 
 
-#: Suites whose games have hundreds of agents: a test of their own makes them smaller.
+#: Suites whose games have hundreds of agents; a separate test makes them smaller.
 _MANY_AGENTS = ("magent",)
 
 
@@ -248,7 +248,7 @@ def _engines() -> list[Any]:
 
 @pytest.mark.parametrize("env_id", _engines())
 def test_one_game_of_an_engine_is_played_like_any_other(env_id: str) -> None:
-    """As ``enjoy`` and films play it: to the end of an episode, legal actions alone, whoever has ended left out."""
+    """As ``enjoy`` and films do: until the end of an episode, only legal actions, without ended agents."""
     game, rng = find_environment(env_id).make_game({}), np.random.default_rng(0)
     observations, infos = game.reset(seed=3)
     again, _ = game.reset(seed=3)
@@ -273,7 +273,7 @@ def test_one_game_of_an_engine_is_played_like_any_other(env_id: str) -> None:
 
 
 class PickUp(gym.Env[Any, Any]):
-    """Two agents, lists of observations, masks, an end that is a time limit unless both chose 1."""
+    """Two agents, lists of observations, masks; episodes are truncated unless both choose 1."""
 
     observation_space = spaces.Tuple([spaces.Box(0, 9, (2,))] * 2)
     action_space = spaces.Tuple([spaces.Discrete(3)] * 2)
@@ -350,7 +350,7 @@ def test_rewards_are_shared_and_returns_stay_in_the_unit_of_the_games() -> None:
 
 
 class PictureEnv(CounterEnv):
-    """Agents see a picture of their index, the step in two numbers, and nothing else."""
+    """Agents see an image of their index, and the step as two numbers."""
 
     def _make_observation_space(self) -> spaces.Space[Any]:
         return spaces.Dict(

@@ -1,4 +1,4 @@
-"""The SuperSuit route: what the stock stack does wrong, and that the bridge does it right."""
+"""The SuperSuit backend: errors of the original classes, and that ours is correct."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ one_and_two_cpus = pytest.mark.parametrize("n_cpus", [1, 2])
 
 
 def stock(env: ParallelEnv[Any, Any, Any], n_games: int, n_cpus: int = 1) -> Any:
-    """SuperSuit's route to Stable-Baselines3, as its documentation has it."""
+    """Convert a game to Stable-Baselines3 as SuperSuit's documentation does."""
     flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
     return supersuit.concat_vec_envs_v1(flat, n_games, num_cpus=n_cpus, base_class="stable_baselines3")
 
 
 def close_stock(venv: Any) -> None:
-    """End the workers by SuperSuit's internal word; its own close is not understood by them."""
+    """End the workers by SuperSuit's internal command; they do not understand its own close."""
     for pipe in getattr(venv.venv, "pipes", []):
         pipe.send("terminate")
     venv.venv.close()
@@ -66,7 +66,7 @@ def close_stock(venv: Any) -> None:
 
 @pytest.fixture
 def bridge() -> Iterator[Bridge]:
-    """Make bridges that are closed after the test."""
+    """Create vector environments that are closed after the test."""
     made: list[SuperSuitVecEnv] = []
 
     def make(*args: Any, **kwargs: Any) -> SuperSuitVecEnv:
@@ -85,7 +85,7 @@ def zeros(venv: Any) -> npt.NDArray[Any]:
 
 
 def draws(observations: Any) -> npt.NDArray[Any]:
-    """What the games' generators gave, per row."""
+    """Return the draws of the games' generators, per row."""
     return np.asarray(observations)[:, 2]
 
 
@@ -142,7 +142,7 @@ def test_two_runs_of_ppo_with_one_seed_end_equal(bridge: Bridge, n_cpus: int) ->
 @one_and_two_cpus
 @pytest.mark.parametrize("n_games", [1, 3, 5])
 def test_games_play_as_if_each_was_alone(bridge: Bridge, n_cpus: int, n_games: int) -> None:
-    """Game i is the ParallelEnv reset with game_seeds(seed, E)[i], and it goes on with its own stream."""
+    """Game i is the ParallelEnv reset with game_seeds(seed, E)[i], and continues with its own random stream."""
     venv = bridge(lambda: CounterEnv(2, max_cycles=3), n_games, seed=11, n_cpus=n_cpus)
     alone = [CounterEnv(2, max_cycles=3) for _ in range(n_games)]
     expected = [env.reset(seed=seed)[0] for env, seed in zip(alone, game_seeds(11, n_games), strict=True)]
@@ -242,7 +242,7 @@ def test_dtypes_of_a_step(bridge: Bridge, n_cpus: int) -> None:
 
 
 def discounted_return_variance(venv: Any, gamma: float, n_steps: int) -> float:
-    """What VecNormalize says of the variance of discounted returns."""
+    """Return VecNormalize's variance of discounted returns."""
     normalised = VecNormalize(venv, norm_obs=False, gamma=gamma)
     normalised.reset()
     for _ in range(n_steps):
@@ -284,7 +284,7 @@ def test_stock_hides_truncation() -> None:
     ids=["time limit", "both at once", "one terminated, one not", "true end"],
 )
 def test_truncation_is_told(bridge: Bridge, n_cpus: int, deaths: dict[int, int], truncated: list[bool]) -> None:
-    """In the second case the agents are terminated at the time limit: both flags are up, and termination counts."""
+    """In the second case the agents are terminated at the time limit: both flags are set, and termination counts."""
     venv = bridge(lambda: CounterEnv(2, max_cycles=3, deaths=deaths), n_games=2, n_cpus=n_cpus)
     venv.reset()
     for _ in range(3):
@@ -323,7 +323,7 @@ def test_last_step_keeps_its_infos(bridge: Bridge, n_cpus: int) -> None:
 
 @one_and_two_cpus
 def test_value_of_the_state_after_a_time_limit_counts(bridge: Bridge, n_cpus: int) -> None:
-    """SB3 adds gamma * V(terminal observation) to the reward of a truncated row; here it must do so."""
+    """SB3 adds gamma * V(terminal observation) to the reward of a truncated row; here too."""
     venv = bridge(lambda: CounterEnv(2, max_cycles=1), n_games=1, n_cpus=n_cpus)
     model = PPO("MlpPolicy", venv, n_steps=2, batch_size=4, n_epochs=1, gamma=0.5, seed=0, device="cpu")
     model.policy.value_net.weight.data.zero_()
@@ -335,7 +335,7 @@ def test_value_of_the_state_after_a_time_limit_counts(bridge: Bridge, n_cpus: in
 
 @one_and_two_cpus
 def test_games_may_reuse_their_arrays_and_infos(bridge: Bridge, n_cpus: int) -> None:
-    """Neither the terminal observation nor an older info changes afterwards, and no two rows share an info."""
+    """Terminal observations and earlier infos do not change afterwards, and no two rows share an info."""
     venv = bridge(lambda: ReusingEnv(max_cycles=2), n_games=2, n_cpus=n_cpus)
     first = np.copy(np.asarray(kept := venv.reset()))
     infos_of_step_1 = venv.step(zeros(venv))[3]
@@ -354,7 +354,7 @@ def test_games_may_reuse_their_arrays_and_infos(bridge: Bridge, n_cpus: int) -> 
 
 
 class SilentEnv(CounterEnv):
-    """Gives no infos."""
+    """Returns no infos."""
 
     def step(self, actions: dict[str, Any]) -> Any:
         return (*super().step(actions)[:4], {a: {} for a in self.possible_agents})
@@ -463,13 +463,13 @@ def test_wrappers_are_seen(bridge: Bridge, n_cpus: int) -> None:
     assert venv.env_is_wrapped(TracingEnv) == [False] * 4
     assert venv.get_attr("colour", 0) == ["red"]
     venv.set_attr("colour", "blue")
-    venv.set_attr("level", 5)  # belongs to the game: its own methods must see it
+    venv.set_attr("level", 5)  # an attribute of the game, which its own methods must see
     venv.set_attr("fresh", 6)
     assert venv.get_attr("colour", 0) == ["blue"]
     assert venv.env_method("apply", int, indices=0) == [5]
     assert venv.get_attr("fresh", 0) == [6]
     assert venv.get_attr("unwrapped", 0)[0].fresh == 6
-    assert venv.get_attr("_rng", 0) == [None]  # private, so PettingZoo's wrapper does not pass it on
+    assert venv.get_attr("_rng", 0) == [None]  # private, so PettingZoo's wrapper does not forward it
 
 
 @one_and_two_cpus
@@ -548,7 +548,7 @@ def test_stock_stops_at_an_agents_death() -> None:
 @pytest.mark.parametrize("kind", [CounterEnv, DictEnv])
 def test_death_of_an_agent(bridge: Bridge, n_cpus: int, kind: type[CounterEnv]) -> None:
     def numbers(observation: Any, row: int) -> list[float]:
-        """Step and agent in a row."""
+        """Return step and agent in a row."""
         if kind is DictEnv:
             return [float(observation["step"][row]), float(observation["numbers"][row, 0])]
         return [float(value) for value in observation[row, :2]]
@@ -585,7 +585,7 @@ def test_death_of_an_agent(bridge: Bridge, n_cpus: int, kind: type[CounterEnv]) 
 
 @one_and_two_cpus
 def test_an_agents_own_time_limit(bridge: Bridge, n_cpus: int) -> None:
-    """A row that was truncated long before the team is done must not be valued at the team's end."""
+    """A row that was truncated long before the team's end must not be bootstrapped at that end."""
     venv = bridge(lambda: CounterEnv(2, max_cycles=3, cuts={0: 1}), n_games=1, n_cpus=n_cpus)
     venv.reset()
     for _ in range(3):
@@ -614,7 +614,7 @@ def test_agent_that_joins_late(bridge: Bridge, n_cpus: int) -> None:
 
 @one_and_two_cpus
 def test_bare_game(bridge: Bridge, n_cpus: int) -> None:
-    """No metadata, no render_mode, no infos, agents that stay listed after their end: still a team episode."""
+    """No metadata, no render_mode, no infos, ended agents stay in ``agents``: still a team episode."""
     with pytest.raises(AttributeError):
         stock(BareEnv(), 1)
     venv = bridge(BareEnv, n_games=2, n_cpus=n_cpus)
@@ -634,7 +634,7 @@ def test_bare_game(bridge: Bridge, n_cpus: int) -> None:
 
 
 def rollout(venv: SuperSuitVecEnv, n_steps: int) -> list[Any]:
-    """Everything that comes out of a venv under fixed actions."""
+    """Return all results of a vector environment with fixed actions."""
     record: list[Any] = [venv.reset(), venv.reset_infos.copy()]
     venv.action_space.seed(0)
     for _ in range(n_steps):
@@ -644,7 +644,7 @@ def rollout(venv: SuperSuitVecEnv, n_steps: int) -> list[Any]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Equal down to types and bits."""
+    """Compare types and bits."""
     if type(one) is not type(other):
         return False
     if isinstance(one, dict):
@@ -664,7 +664,7 @@ def kaz() -> Any:
 
 
 def rps() -> Any:
-    """Rock, paper, scissors: an AEC game behind PettingZoo's converter."""
+    """Rock, paper, scissors: an AEC game in PettingZoo's converter."""
     from pettingzoo.classic.rps import rps as rock_paper_scissors
 
     return rock_paper_scissors.parallel_env(max_cycles=5)
@@ -699,7 +699,7 @@ def test_sb3_wrappers_on_top(bridge: Bridge, n_cpus: int) -> None:
     for _ in range(3):
         _, _, dones, infos = wrapped.step(zeros(wrapped))
     assert dones.all()
-    # VecMonitor counts rows: every agent is an episode to it, also the one that ended early.
+    # VecMonitor counts rows: every agent is an episode, including the one that ended early.
     assert [info["episode"]["r"] for info in infos] == [60, 32] * 2
     assert [info["episode"]["l"] for info in infos] == [3] * 4
 
@@ -741,7 +741,7 @@ def test_wrong_environment(bridge: Bridge, make: Any, message: str) -> None:
 
 
 def test_what_cannot_be_pickled_stays_in_this_process(bridge: Bridge) -> None:
-    """Caches on methods cannot be pickled, and neither can a class in a function that has one."""
+    """Caches on methods cannot be pickled, nor can a local class that has one."""
 
     class CachedEnv(CounterEnv):
         @functools.lru_cache  # noqa: B019 - as PettingZoo's own tutorial writes it
@@ -778,7 +778,7 @@ def test_equal_spaces_need_not_be_the_same_object(bridge: Bridge, n_cpus: int) -
 
 
 class OddSpacesEnv(CounterEnv):
-    """Spaces are given."""
+    """Has given spaces."""
 
     def __init__(self, observation_space: Any = None, action_space: Any = None):
         super().__init__()
@@ -903,7 +903,7 @@ def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
     ],
 )
 def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[BaseException], message: str) -> None:
-    """Its exception comes out, and a reset starts afresh."""
+    """Its exception is raised, and a reset starts again."""
     unlucky = game_seeds(0, 3)[1]
     venv = bridge(lambda: FaultyEnv(how, unlucky), n_games=3, seed=0, n_cpus=n_cpus)
     venv.reset()
@@ -969,7 +969,7 @@ def test_factory_that_breaks(bridge: Bridge, n_cpus: int) -> None:
 
 
 class LocalError(Exception):
-    """Cannot be made again from its args."""
+    """Cannot be recreated from its args."""
 
     def __init__(self, one: int, two: int):
         super().__init__(f"{one} {two}")
@@ -1148,7 +1148,7 @@ def test_the_users_own_environment_is_left_alone(bridge: Bridge) -> None:
 
 
 def test_every_game_that_was_made_is_closed(bridge: Bridge) -> None:
-    """SuperSuit makes spare copies and drops them; none of them may hold a game."""
+    """SuperSuit makes spare copies and drops them; none of them may keep a game open."""
     toy_envs.MADE.clear()
     bridge(toy_envs.recorded_env, n_games=3).close()
     assert [env.closed for env in toy_envs.MADE] == [True] * 4  # one was made for the spaces
@@ -1181,7 +1181,7 @@ if __name__ == "__main__":
     ids=["stock", "ours"],
 )
 def test_script_that_forgets_to_close(tmp_path: Path, module: str, function: str, ends: bool) -> None:
-    """The stock stack hangs at the interpreter's exit, waiting for workers that nobody told to end."""
+    """The original classes hang at the interpreter's exit, waiting for workers that were not told to end."""
     trace = tmp_path / "closed"
     root = str(Path(__file__).parents[1])
     (tmp_path / "script.py").write_text(SCRIPT.format(root=root, module=module, function=function, trace=str(trace)))

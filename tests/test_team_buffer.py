@@ -36,7 +36,7 @@ def make_env(name: str = "vector", lengths: tuple[int, ...] = (3, 2, 4, 7), **kw
 
 
 def fill(buffers: list[Any], env: CentralizedValueWrapper, seed: int = 0, n_steps: int = N_STEPS) -> None:
-    """Play, and put the same data with made-up values into all buffers."""
+    """Play, and put the same data with arbitrary values into all buffers."""
     rng = np.random.default_rng(seed)
     obs = env.reset()
     starts = np.ones(env.num_envs, dtype=bool)
@@ -67,7 +67,7 @@ def make_both(name: str) -> tuple[Any, Any]:
 
 
 def rows_of(samples: list[DictRolloutBufferSamples]) -> list[tuple[Any, ...]]:
-    """All rows, in an order of their own."""
+    """Return all rows, in a canonical order."""
     rows = []
     for sample in samples:
         parts = [*(sample.observations[key] for key in ("obs", "team", "agent")), *sample[1:]]
@@ -143,7 +143,7 @@ def test_minibatches_say_which_teams_they_hold() -> None:
 
 
 def test_sb3s_buffer_splits_teams() -> None:
-    """The failing baseline: of 20 team steps in minibatches of 12 rows, hardly one stays together."""
+    """In SB3's minibatches of 12 rows, hardly any of 20 team steps stays together."""
     _, stock = make_both("vector")
     np.random.seed(0)  # noqa: NPY002
     together = 0

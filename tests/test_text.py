@@ -1,4 +1,4 @@
-"""Text: golden pages, and what is printed can be read back."""
+"""Text output: golden pages, and output that can be read back."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_zones_beyond_nine_are_letters() -> None:
 def test_zones_and_things_have_colours_of_their_own() -> None:
     plain = render_text(make_state(), zones=[0] * 7, colour=True).splitlines()
     split = render_text(make_state(), zones=[0, 0, 0, 0, 1, 1, 1], colour=True).splitlines()
-    # The bottom wall is one run of one colour in one zone, two in two.
+    # The bottom wall is one run of one colour with one zone, two with two.
     assert plain[4].count("\x1b[38") == 1
     assert split[4].count("\x1b[38") == 2
     # Wall, treasure, collected, key, floor, carrier, wall: all differ from their neighbours.

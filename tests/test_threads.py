@@ -1,4 +1,4 @@
-"""Threads share the games of a batch: the same games, whoever plays them, also after a fork."""
+"""Threads share the games of a batch: games do not depend on the thread, also after a fork."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PARAMS = HECOGridParams(n_agents=5, grid_size=12, n_treasures=30, observation="t
 
 
 def batch_of(n_threads: int, n_games: int = 6) -> GameBatch:
-    """A batch of seeded games."""
+    """Create a batch of seeded games."""
     batch = GameBatch("TeamSupport", PARAMS, n_games, n_threads)
     batch.reset(seeds=game_seeds(0, n_games))
     return batch

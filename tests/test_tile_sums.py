@@ -1,4 +1,4 @@
-"""First layers over tile codes by looking up: equal to the layers over pixels, and so are all gradients."""
+"""First layers by tile lookup equal the layers over pixels, including all gradients."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _views(rows: int, columns: int, n_views: int = 5) -> th.Tensor:
 
 
 def _pixels(views: th.Tensor, tiles: th.Tensor, rows: int, columns: int) -> th.Tensor:
-    """(K, C, rows * t, columns * t) pictures of codes, put together tile by tile."""
+    """Draw (K, C, rows * t, columns * t) images of codes, tile by tile."""
     of_tiles = tiles[views].unflatten(1, (rows, columns))
     return th.cat([th.cat(list(row.unbind(1)), dim=3) for row in of_tiles.unbind(1)], dim=2)
 
@@ -67,7 +67,7 @@ def test_gradients_of_first_and_second_order(places: Places) -> None:
     bias = th.randn(2, dtype=th.float64, requires_grad=True)
 
     def square(table: th.Tensor, bias: th.Tensor) -> th.Tensor:
-        """What is linear has no second derivative of its own."""
+        """Square the output, because a linear function has no second derivative."""
         return rectified_sums(views, table, bias, places) ** 2
 
     assert (square(table, bias) == 0).any()

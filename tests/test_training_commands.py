@@ -42,7 +42,7 @@ ENV = "TeamTogether-v0"
 
 
 def train(folder: Path, *options: str, algo: str = "saf") -> Path:
-    """Train at smoke size with seed 3; returns the run's folder."""
+    """Train at smoke size with seed 3; return the run's folder."""
     before = {path.parent for path in folder.glob("*/*/monitor.csv")}
     given = ("--size", "smoke", "--seed", "3", "--eval-episodes", "4", "--env", ENV, "-f", str(folder))
     zoo_train.main(["--algo", algo, *given, *options])
@@ -76,7 +76,7 @@ def test_the_command_trains_what_settings_train(by_hand: dict[str, th.Tensor], t
 
 
 class Interrupt(BaseCallback):
-    """Raise an error after so many agents' steps."""
+    """Raise an error after a number of agent steps."""
 
     def __init__(self, after: int, error: type[BaseException]) -> None:
         super().__init__()
@@ -135,7 +135,7 @@ def test_no_look_into_the_policy(tmp_path: Path) -> None:
 
 
 def test_value_based_algorithms_are_evaluated_without_exploring(tmp_path: Path) -> None:
-    """QPLEX explores with every second action at this point; SAF's drawn actions are what it learns."""
+    """QPLEX still explores with every second action here; SAF is evaluated with sampled actions."""
     run = train(tmp_path, "--eval-freq", "40", "-n", "40", "-params", "exploration_final_eps:0.5", algo="qplex")
     games = load_settings("qplex", ENV, "smoke").make_env(3, evaluation=True, n_envs=4)
     expected = evaluate_team(QPLEX.load(run / "best_model.zip"), games, 4, deterministic=True)
@@ -207,7 +207,7 @@ def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
 
 def test_runs_are_numbered_and_never_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert train(tmp_path, "--eval-freq", "-1").name == f"{ENV}_1"
-    # As if another process had made its folder between our look and our own.
+    # As if another process had created the folder between check and use.
     found: list[Any] = [[], [(1, tmp_path)]]
     monkeypatch.setattr(folders, "runs_of", lambda *_: found.pop(0))
     assert folders.make_run_folder(tmp_path, "saf", ENV).name == f"{ENV}_2"
@@ -243,7 +243,7 @@ def test_the_progress_bar_counts_game_steps() -> None:
     bar = GameStepsProgressBar()
     settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=bar)
     assert (bar.pbar.n, bar.pbar.total) == (80, 80)
-    GameStepsProgressBar().close()  # of a training that never began
+    GameStepsProgressBar().close()  # of a training that never started
 
 
 def test_the_remaining_time_is_told_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,7 +251,7 @@ def test_the_remaining_time_is_told_once(capsys: pytest.CaptureFixture[str], mon
     clock = iter(range(0, 10_000, 10))
     monkeypatch.setattr("sb3_saf.training.callbacks.time.perf_counter", lambda: float(next(clock)))
     settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=RemainingTime())
-    # Rollouts of 40 game steps in 10 seconds each, measured from the end of the first to that of the third.
+    # Rollouts of 40 game steps take 10 seconds each, measured from the end of the first to that of the third.
     assert capsys.readouterr().out == "4 game steps per second: about 0:01:10 (h:mm:ss) to go\n"
 
 
@@ -264,7 +264,7 @@ COUNTER = "tests.toy_envs:CounterEnv"
 def test_any_environment_is_trained_watched_drawn_and_tuned(
     env_id: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In a folder whose name is a pattern of files, twice, since the second run has to find the first."""
+    """In a folder whose name is a glob pattern, twice, because the second run must find the first."""
     pytest.importorskip(env_id.partition(":")[0].partition(".")[0])
     logs = str(tmp_path / "runs [a]")
     short = ("--env", env_id, "--size", "smoke", "-n", "80", "-f", logs, "--eval-episodes", "2")
@@ -294,7 +294,7 @@ def test_environments_by_other_names(tmp_path: Path) -> None:
 
 
 def test_wrappers_of_rl_zoo3(tmp_path: Path) -> None:
-    """Each changes what the policy sees, and ``enjoy`` plays with all of them."""
+    """Each changes what the policy sees, and ``enjoy`` uses all of them."""
     Path(tmp_path / "own.yml").write_text("""
 default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRolloutBuffer}
 "tests.toy_envs:CounterEnv":
@@ -323,7 +323,7 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
     assert isinstance(model.observation_space, spaces.Dict)
     own = model.observation_space["obs"]
     assert own.shape == (6,) and own.dtype == np.float64  # two frames of three numbers, converted
-    assert model.num_timesteps < 400 * 2  # the callback has stopped it
+    assert model.num_timesteps < 400 * 2  # stopped by the callback
     with np.load(run / "vecnormalize.npz") as statistics:
         assert set(statistics) == {"obs", "returns"} and statistics["obs"].shape == (1 + 2 * 6,)
         assert statistics["obs"][0] > 10
@@ -367,7 +367,7 @@ def test_weights_and_biases_follow_the_tensorboard_logs(
 def failed(
     options: Sequence[str], capsys: pytest.CaptureFixture[str], main: Callable[[Sequence[str]], object] = zoo_train.main
 ) -> str:
-    """The one line on stderr with which a command ended."""
+    """Return the one line on stderr with which a command ended."""
     with pytest.raises(SystemExit) as exit_:
         main(options)
     assert exit_.value.code == 2
@@ -429,7 +429,7 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     line = failed(["--size", "smoke", *options], capsys)
     assert all(word in line for word in words), line
-    assert not list(Path("logs").rglob("*.yml"))  # it would pass for the latest run
+    assert not list(Path("logs").rglob("*.yml"))  # it would be mistaken for the latest run
 
 
 def test_help_tells_defaults_and_units() -> None:

@@ -1,4 +1,4 @@
-"""Statistics and figures of tidy tables, against numbers worked out otherwise."""
+"""Statistics and figures of tidy tables, compared with independently computed numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sb3_saf.training.statistics import (
 
 
 def runs(**scores: list[list[float]]) -> pd.DataFrame:
-    """One list per seed, measured after 100, 200, ... game steps."""
+    """Return one list per seed, measured after 100, 200, ... game steps."""
     rows = [
         {"method": method, "seed": seed, "game_steps": 100 * (step + 1), "score": score, "task": "t"}
         for method, seeds in scores.items()
@@ -105,7 +105,7 @@ def test_interquartile_mean_and_its_interval() -> None:
     estimate = interquartile_means({"saf": scores})["saf"]
     assert estimate.value == np.mean([2, 3, 4, 5])
     assert estimate.low < estimate.value < estimate.high
-    # Resampling a task's seeds can at the most give its extremes.
+    # Resampling a task's seeds can at most give its extremes.
     assert estimate.low >= 0.5 and estimate.high <= 6.5
     alone = interquartile_means({"saf": scores[:1]})["saf"]
     assert np.isnan([alone.low, alone.high]).all()
@@ -181,7 +181,7 @@ def long_names(count: int) -> dict[str, list[list[float]]]:
 
 @pytest.mark.parametrize("n_panels", [1, 2, 9])
 def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
-    """Constrained layout only warns where it does not fit, and warnings are errors here."""
+    """Constrained layout only warns if it does not fit; warnings are errors here."""
     table = pd.concat([runs(**long_names(12)).assign(task=f"task {index}") for index in range(n_panels)])
     for figure in (
         draw_curves(table, panel="task"),

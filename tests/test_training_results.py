@@ -1,4 +1,4 @@
-"""Trained teams watched and drawn: ``python -m sb3_saf.enjoy`` and ``python -m sb3_saf.plot``."""
+"""Watching and plotting trained teams: ``python -m sb3_saf.enjoy`` and ``python -m sb3_saf.plot``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ENV = "TeamTogether-v0"
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """SAF and MAPPO at two levels, SAF with two seeds, and a team with memory."""
+    """Create logs of SAF and MAPPO at two levels, SAF with two seeds, and a team with memory."""
     folder = tmp_path_factory.mktemp("logs")
 
     def train(algo: str, *options: str) -> None:
@@ -153,7 +153,7 @@ def test_mistakes_in_enjoy_are_one_line(
 
 
 def test_a_reader_may_leave(logs: Path) -> None:
-    """As ``| head -1`` does."""
+    """Like ``| head -1``."""
     words = ["-m", "sb3_saf.enjoy", "-f", str(logs), "--env", ENV, "--episodes", "2", "--text"]
     with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert command.stdout is not None and command.stderr is not None
@@ -210,7 +210,7 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
 
 
 def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None:
-    """A run's settings, as training writes them."""
+    """Write a run's settings, as training does."""
     settings = load_settings("saf", ENV, "smoke", overrides=overrides)
     config = folder / "saf" / f"{ENV}_{number}" / ENV / "config.yml"
     config.parent.mkdir(parents=True)

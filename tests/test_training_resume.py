@@ -1,4 +1,4 @@
-"""``python -m sb3_saf.train --resume``: runs that were ended end as if they had not been."""
+"""``python -m sb3_saf.train --resume``: interrupted runs end like uninterrupted ones."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def struck(monkeypatch: pytest.MonkeyPatch, error: type[BaseException], evaluati
 
 
 def left(run: Path) -> dict[str, Any]:
-    """What a run leaves."""
+    """Return the output of a run."""
     weights = read_weights(run / f"{ENV}.zip")
     with np.load(run / "evaluations.npz") as arrays:
         evaluations = {name: arrays[name].tobytes() for name in arrays.files}
@@ -104,7 +104,7 @@ def test_other_settings_begin_another_run(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = failed([*OPTIONS, "-f", str(tmp_path), "--hyperparams", "learning_rate:1.0e30"], capsys)
-    # Where it shows first depends on the seed.
+    # Where the difference first shows depends on the seed.
     assert "must be finite, got nan at game step" in line or "invalid values" in line
     assert "the last good checkpoint is" in line and "checkpoint-0" in line
 

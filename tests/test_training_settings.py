@@ -1,4 +1,4 @@
-"""Settings by name: the numbers of the paper, every entry built, and what is refused."""
+"""Settings by name: the paper's numbers, all entries constructed, and refused ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_every_entry_builds_and_smoke_learns_one_rollout(algo: str, env_id: str,
     assert type(model.policy) is ALGOS[algo].policy_class
     if size == "smoke":
         before = [parameter.clone() for parameter in model.policy.parameters()]
-        model.learn(1)  # as many steps as a rollout has
+        model.learn(1)  # as many steps as a rollout
         assert any(not old.equal(new) for old, new in zip(before, model.policy.parameters(), strict=True))
     env.close()
 
@@ -53,7 +53,7 @@ def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: floa
     assert (settings.n_envs, settings.game_steps, settings.total_timesteps) == (128, 10_000_000, 100_000_000)
     assert asdict(HECOGridParams(observation="tiles")) == settings.env_kwargs
     assert settings.time_limit == "terminal"
-    # Constructors of the model see exactly this; the rest is their default, which is the paper's.
+    # The model's constructors get exactly these; the rest are their defaults, which are the paper's.
     arguments = {**_defaults(PPO), **settings.hyperparams}
     table: dict[str, Any] = {
         "learning_rate": 7e-4,
@@ -62,7 +62,7 @@ def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: floa
         "batch_size": 128 * 50 * 10,
         "gamma": 0.99,
     }
-    # The paper clips values by the larger of two losses, SB3 by one of them, which ruins the critic.
+    # The paper clips values by the larger of two losses, SB3 by one of them, with which values diverge.
     table |= {"gae_lambda": gae_lambda, "clip_range": 0.2, "clip_range_vf": None, "normalize_advantage": True}
     table |= {"ent_coef": 0.01, "vf_coef": 0.25, "max_grad_norm": max_grad_norm, "target_kl": None}
     assert {key: arguments[key] for key in table} == table
@@ -112,7 +112,7 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
     settings = load_settings("saf", ENV, "small", {"coordination": 2, "n_agents": 4}, overrides)
     assert settings.n_envs == 8
     assert settings.hyperparams["n_epochs"] == 3
-    assert settings.hyperparams["batch_size"] == 8 * 4 * 50 // 2  # halves of a rollout, still
+    assert settings.hyperparams["batch_size"] == 8 * 4 * 50 // 2  # still halves of a rollout
     schedule = settings.hyperparams["learning_rate"]
     assert isinstance(schedule, LinearSchedule)
     assert schedule(0.5) == pytest.approx(3.5e-4)
@@ -131,7 +131,7 @@ def test_a_batch_size_replaces_the_number_of_minibatches() -> None:
 def test_minibatches_are_whole_teams() -> None:
     settings = load_settings("saf", ENV, "smoke", {"n_agents": 3}, {"n_envs": 3, "n_minibatches": 4})
     assert settings.hyperparams["batch_size"] == 8 * 3  # 30 teams in 4 parts
-    with pytest.warns(UserWarning, match="truncated mini-batch of size 18"):  # SB3 says so, and the buffer takes it
+    with pytest.warns(UserWarning, match="truncated mini-batch of size 18"):  # SB3 warns, and the buffer accepts it
         model = settings.make_model(settings.make_env(0), 0)
     model.learn(1)
 
@@ -164,7 +164,7 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"env_kwargs": {"coordination": 11}}, "coordination must be an integer from 1 to 10"),
         ({"env_kwargs": {"grid_size": 6}}, "n_treasures must be"),
         ({"overrides": {"learning_rat": 1}}, r"unknown setting .* \(did you mean 'learning_rate'\?\)"),
-        ({"overrides": {"seed": 1}}, "unknown setting 'seed'"),  # runs decide it
+        ({"overrides": {"seed": 1}}, "unknown setting 'seed'"),  # set per run
         ({"overrides": {"n_timesteps": 1, "game_steps": 1}}, "say the same thing"),
         ({"overrides": {"normalize": "yes"}}, "normalize must be true or false or a mapping"),
         ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),

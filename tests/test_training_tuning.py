@@ -1,4 +1,4 @@
-"""``-optimize``: what is searched, finite values, one storage for several processes, and trials trained again."""
+"""``-optimize``: search space, finite values, one storage for several processes, and retraining of trials."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMOKE = ("--algo", "saf", "--env", ENV, "--size", "smoke", "--seed", "3", "--eva
 
 
 def tune(folder: Path, *options: str) -> optuna.Study:
-    """Tune in a journal file; one trial of 80 game steps, unless told otherwise."""
+    """Tune in a journal file; by default one trial of 80 game steps."""
     zoo_train.main(given(folder, *options))
     return load_study(str(folder / "study.log"))
 
@@ -59,7 +59,7 @@ def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path:
     complete = study.get_trials(states=[TrialState.COMPLETE])
     assert len(study.trials) == 4
     assert complete and all(trial.value is not None and math.isfinite(trial.value) for trial in complete)
-    assert len({trial.params["learning_rate"] for trial in study.trials}) == 4  # equal seeds, other proposals
+    assert len({trial.params["learning_rate"] for trial in study.trials}) == 4  # equal seeds, different proposals
 
     trial_options = ["--storage", storage, "--study-name", "s", "--trial-id", str(study.best_trial.number)]
     zoo_train.main([*SMOKE, *trial_options, "-n", "80", "-f", str(tmp_path / "again")])
@@ -74,7 +74,7 @@ def test_trials_are_evaluated_n_times_in_game_steps(tmp_path: Path) -> None:
     assert trial.state is TrialState.COMPLETE
     assert sorted(trial.intermediate_values) == [1, 2, 3, 4]
     assert trial.value == trial.intermediate_values[4]
-    assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))  # no run is left behind
+    assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))  # no run folder is left
     assert list((tmp_path / "logs").glob("saf/report_*.csv"))
 
 

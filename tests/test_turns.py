@@ -1,4 +1,4 @@
-"""Turn-based games in parallel form: the same game, and nobody moves out of turn."""
+"""Turn-based games in parallel form: the same game, in which agents act only in their turn."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PILE = 7
 
 class Nim(AECEnv[str, Any, Any]):
     """
-    Two players take 1 to 3 stones from a pile in turn (action = stones - 1); who takes the last one wins.
+    Two players take 1 to 3 stones from a pile in turn (action = stones - 1); whoever takes the last stone wins.
 
-    :param masks: whether observations have masks (all zeros for who waits, as in PettingZoo's classics)
+    :param masks: whether observations have masks (all zeros for the waiting player, as in PettingZoo's classic games)
     :param dtype: of the masks
     """
 

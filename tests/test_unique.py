@@ -29,7 +29,7 @@ FINDERS = pytest.mark.parametrize("find", [on_cpu, on_device])
 
 
 def reference(x: th.Tensor) -> tuple[list[int], list[int]]:
-    """Unique rows by a dict of their bytes."""
+    """Find unique rows with a dict of their bytes."""
     seen: dict[bytes, int] = {}
     index: list[int] = []
     inverse: list[int] = []
@@ -121,7 +121,7 @@ def test_every_row_takes_each_row_for_a_unique_one() -> None:
 
 
 class Counter:
-    """An encoder that notes what it was asked to encode."""
+    """An encoder that records its inputs."""
 
     def __init__(self) -> None:
         self.calls: list[th.Tensor] = []
@@ -131,7 +131,7 @@ class Counter:
         return observations.float().flatten(1) * 2.0
 
 
-#: Three rows of two teams that see 1, 2 and 3, 1; and whose rows they are.
+#: Three rows of two teams that see 1, 2 and 3, 1; and the team of each row.
 JOINT, AGENT = th.tensor([[[1], [2]], [[1], [2]], [[3], [1]]]), th.tensor([0, 1, 0])
 
 

@@ -1,4 +1,4 @@
-"""Value normalisation inside stock PPO and A2C."""
+"""Value normalisation in SB3's PPO and A2C."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def normalizer_of(policy: Any) -> ValueNormalizer:
 
 
 class Returned(BaseCallback):
-    """Keeps the returns of all rollouts."""
+    """Records the returns of all rollouts."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -126,7 +126,7 @@ def gradients_of(policy: TeamActorCriticPolicy, loss: th.Tensor) -> dict[str, th
 @pytest.mark.parametrize("method", ["evaluate_actions", "predict_values"])
 def test_sb3s_loss_has_the_gradient_of_the_normalised_loss(policy_class: Any, method: str) -> None:
     policy, obs = make_policy(policy_class, normalize_values=True), team_rows(VECTOR)
-    policy.set_training_mode(False)  # in training, only minibatches that carry returns will do
+    policy.set_training_mode(False)  # training mode accepts only minibatches with returns
     plain = make_policy(policy_class)
     plain.load_state_dict(policy.state_dict(), strict=False)
     normalizer_of(policy).update(some_returns())
@@ -154,7 +154,7 @@ GAMMA, LAMBDA, LENGTH, STEPS, GAMES, OUTPUT = 0.9, 0.8, 4, 11, 3, 0.5
 
 
 def rollout_of_a_constant_critic(time_limit: TimeLimit, normalize: bool) -> Any:
-    """One rollout of 11 steps, episodes of 4: two whole ones and a part. The critic's output is 0.5 everywhere."""
+    """One rollout of 11 steps with episodes of 4, so two whole ones and a part. The critic always outputs 0.5."""
     env = make_team_env(DelayedReward, n_envs=GAMES, seed=1, time_limit=time_limit, length=LENGTH)
     model = make_model(
         "MAPPOPolicy", normalize, env=env, n_steps=STEPS, batch_size=66, gamma=GAMMA, gae_lambda=LAMBDA, n_epochs=1,
@@ -170,7 +170,7 @@ def rollout_of_a_constant_critic(time_limit: TimeLimit, normalize: bool) -> Any:
 
 
 def advantages_by_a_loop(own: npt.NDArray[Any], value: float, time_limit: TimeLimit) -> npt.NDArray[np.float64]:
-    """(T, B) from what agents see, for a critic that says ``value`` everywhere: the sum of discounted TD errors."""
+    """Compute (T, B) advantages for a critic with constant ``value``: discounted sums of TD errors."""
     advantages = np.zeros(own.shape[:2])
     for step in range(STEPS):
         for row in range(own.shape[1]):
@@ -205,8 +205,8 @@ def test_forgetting_to_denormalise_breaks_advantages(
     time_limit: TimeLimit, error: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """
-    The failing baseline: a rollout with the critic's plain outputs, 0.5 instead of about 7.5. The last step before a
-    true end is then off by 7.0, and every bootstrapped step by (1 - gamma) 7.0: 1.8 over an episode.
+    Without de-normalisation the rollout has the critic's plain outputs, 0.5 instead of about 7.5. The last step before
+    a termination is then off by 7.0, and every bootstrapped step by (1 - gamma) 7.0: 1.8 over an episode.
     """
     right = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages.copy()
     with monkeypatch.context() as patch:
@@ -221,7 +221,7 @@ def test_forgetting_to_denormalise_breaks_advantages(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_old_values_are_what_the_unchanged_critic_says(name: str) -> None:
-    """Otherwise ``clip_range_vf`` would start from a difference that the new statistics made."""
+    """Otherwise ``clip_range_vf`` would start from a difference caused by the new statistics."""
     model = make_model(name, learning_rate=0.0, n_epochs=1)
     normalizer_of(model.policy).update(some_returns(shape=(40,)))
     model.learn(120)
@@ -229,14 +229,14 @@ def test_old_values_are_what_the_unchanged_critic_says(name: str) -> None:
     for samples in model.rollout_buffer.get(30):
         values = model.policy.predict_values(samples.observations).flatten()
         th.testing.assert_close(samples.old_values, values, rtol=0, atol=1e-4)
-    # What the stored values are off by: the statistics moved from those of made-up returns to the rollout's.
+    # Error of the stored values: the statistics changed from those of arbitrary returns to the rollout's.
     assert abs(model.rollout_buffer.values.mean() - values.detach().mean().item()) > 1.0
 
 
 @pytest.mark.parametrize("load", [False, True])
 def test_a_buffer_that_never_updates_the_statistics_fails(load: bool, tmp_path: Path) -> None:
     model = make_model()
-    if load:  # saved statistics are no excuse
+    if load:  # saved statistics make no difference
         model.learn(120).save(tmp_path / "model")
         custom = {"rollout_buffer_class": DictRolloutBuffer}
         model = PPO.load(tmp_path / "model", env=ToyTeams(), device="cpu", custom_objects=custom)
@@ -250,7 +250,7 @@ def test_a_buffer_that_never_updates_the_statistics_fails(load: bool, tmp_path: 
 
 
 class Frozen(ValueNormalizer):
-    """Mean 0 and variance 1 for ever."""
+    """Mean 0 and variance 1, constant."""
 
     def update(self, returns: npt.NDArray[np.floating]) -> Rescaling:
         return Rescaling(1.0, 0.0)

@@ -1,4 +1,4 @@
-"""The wheel that ``pip wheel`` builds: what is inside, and that it runs where there is no checkout."""
+"""The wheel built by ``pip wheel``: its content, and that it runs without the checkout."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SOURCES = (*PACKAGES, "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
 
 
 def call(arguments: Sequence[str | Path], folder: Path, **environment: str) -> str:
-    """Run a command, which must succeed, and give its output."""
+    """Run a command, which must succeed, and return its output."""
     command = [sys.executable, *map(str, arguments)]
     done = subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -29,7 +29,7 @@ def call(arguments: Sequence[str | Path], folder: Path, **environment: str) -> s
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy, because building leaves folders beside the sources."""
+    """Build the wheel from a copy, because building leaves folders beside the sources."""
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in SOURCES:
         if (ROOT / name).is_dir():
@@ -82,7 +82,7 @@ def test_metadata_show_the_readme_and_the_version_of_the_changelog(metadata: Mes
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the wheel brings; what it depends on comes from this environment."""
+    """Return a folder with the wheel's content; its dependencies come from this environment."""
     folder = tmp_path_factory.mktemp("installed")
     options = ["--no-deps", "--no-index", "--quiet", "--disable-pip-version-check", "--no-warn-conflicts"]
     call(["-m", "pip", "install", *options, "--target", folder, wheel], folder)
@@ -91,7 +91,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def take_over_compiled_kernels(folder: Path) -> None:
-    """Spare compiling anew what the checkout has compiled; numba takes it where the source is the same."""
+    """Reuse kernels compiled in the checkout; numba accepts them if the source is the same."""
     for path in (path for package in PACKAGES for path in (ROOT / package).rglob("__pycache__/*")):
         if path.suffix in (".nbi", ".nbc"):
             copy = folder / path.relative_to(ROOT)
