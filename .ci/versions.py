@@ -71,8 +71,12 @@ def constraints() -> str:
     """Return the lines of constraints.txt, less those that the choice of releases decides."""
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     free = {*LIBRARIES, *FOLLOWING}
-    kept = [line for line in lines if line.partition("==")[0].strip().lower().replace("_", "-") not in free]
-    return "\n".join(kept) + "\n"
+    return "\n".join(line for line in lines if _normal(line) not in free) + "\n"
+
+
+def _normal(requirement: str) -> str:
+    """Return the name in a line ``name==version`` as package indexes compare it."""
+    return requirement.partition("==")[0].strip().lower().replace("_", "-")
 
 
 def install(end: str, folder: Path, interpreter: str) -> Path:
@@ -121,7 +125,7 @@ def main() -> None:
     listed = subprocess.run(listing, capture_output=True, text=True, check=True)
     names = {*LIBRARIES, *FOLLOWING}
     print(subprocess.run([python, "--version"], capture_output=True, text=True, check=True).stdout.strip())
-    print(*(line for line in listed.stdout.splitlines() if line.partition("==")[0].lower() in names), sep="\n")
+    print(*(line for line in listed.stdout.splitlines() if _normal(line) in names), sep="\n")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba")}
     tests: list[str | Path] = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope"]
     tests += [*(FAST if options.fast else ()), *pytest_arguments]
