@@ -49,7 +49,7 @@ def telling_env(n_envs: int = 2, **kwargs: Any) -> CentralizedValueWrapper:
     return make_team_env(TellingEnv, n_envs, seed=0, state=True, **{**LIVES, **kwargs})
 
 
-# --- what rows tell ---------------------------------------------------------------------------------------------------
+# --- content of rows --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("masks", "n_cpus"), [("observation", 1), ("info", 2)])

@@ -521,7 +521,7 @@ def test_without_the_critics_lstm_it_is_ppos_critic() -> None:
     assert th.equal(policy.predict_values(obs, no_memory(12), th.zeros(12)), plain.predict_values(obs))
 
 
-# --- naive encoding gives the same ------------------------------------------------------------------------------------
+# --- encoding every row gives the same --------------------------------------------------------------------------------
 
 
 def evaluate(policy: TeamPolicy, obs: dict[str, th.Tensor], actions: th.Tensor) -> tuple[Any, Any, Any]:

@@ -91,7 +91,7 @@ def resume_from(algorithm: str, tree: Any, monitor: bytes, folder: Path) -> None
         learn(algorithm, folder, 5)
 
 
-# --- the crafted ones that once did harm ------------------------------------------------------------------------------
+# --- crafted checkpoints that failed in the past ----------------------------------------------------------------------
 
 
 def _games(tree: Any) -> Any:
@@ -145,7 +145,7 @@ def test_harmful_checkpoints_are_refused_before_anything_is_touched(
     assert {path.name for path in tmp_path.iterdir()} == {"ck", "monitor.csv"}
 
 
-# --- drawn ones -------------------------------------------------------------------------------------------------------
+# --- random ones ------------------------------------------------------------------------------------------------------
 
 
 def places(tree: Any) -> Iterator[tuple[Any, Any]]:

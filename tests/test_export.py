@@ -300,7 +300,7 @@ def test_weights_saved_by_an_earlier_version_are_read() -> None:
     assert model.predict(samples(VECTOR, 6), deterministic=True)[0].tolist() == expected
 
 
-# --- who acts, and pixels for an actor of tile codes ------------------------------------------------------------------
+# --- agent's index, and pixels for an actor of tile codes -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("policy_class", [MAPPOPolicy, SAFPolicy])
@@ -339,7 +339,7 @@ def test_an_actor_of_tile_codes_takes_pixels(encoder: type[BaseFeaturesExtractor
         actor.act(pictures)
 
 
-# --- processes that see nothing but their own observation -------------------------------------------------------------
+# --- processes with only their own observation ------------------------------------------------------------------------
 
 
 class LoneAgent:
@@ -422,7 +422,7 @@ def test_absent_packages_are_absent() -> None:
         Absent({"some_package"}).find_spec("some_package.module", None)
 
 
-# --- what cannot be exported, and where not to ------------------------------------------------------------------------
+# --- what cannot be exported, invalid folders -------------------------------------------------------------------------
 
 
 def test_other_policies_are_refused(tmp_path: Path) -> None:
@@ -484,7 +484,7 @@ def test_an_interrupted_export_leaves_the_earlier_one(tmp_path: Path, monkeypatc
     assert [path.name for path in tmp_path.iterdir()] == ["actor"]
 
 
-# --- wrong use --------------------------------------------------------------------------------------------------------
+# --- errors -----------------------------------------------------------------------------------------------------------
 
 
 def test_agents_with_policies_of_their_own_must_be_named(tmp_path: Path) -> None:
@@ -523,7 +523,7 @@ def test_whole_numbers_may_come_as_lists(tmp_path: Path) -> None:
     assert actor.act(codes) == actor.act(codes.tolist()) == actor.act(codes.astype(float))
 
 
-# --- files from strangers ---------------------------------------------------------------------------------------------
+# --- untrusted files --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -214,7 +214,7 @@ def test_boxes_have_no_masks(tmp_path: Path) -> None:
         Actor.load(folder)
 
 
-# --- ONNX, and the script beside it -----------------------------------------------------------------------------------
+# --- ONNX, and its example script -------------------------------------------------------------------------------------
 
 
 def run_script(folder: Path, observations: np.ndarray, *options: str) -> list[Any]:
@@ -253,7 +253,7 @@ def test_onnx_with_masks(tmp_path: Path) -> None:
     assert run_script(folder, obs, "--action-mask", str(tmp_path / "masks.npy")) == expected.tolist()
 
 
-# --- processes that see nothing but their own -------------------------------------------------------------------------
+# --- processes with only their own observation ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_sizes_of_the_paper() -> None:
     assert n_weights(source) - read == 76_096
 
 
-# --- an independent account in NumPy, for one team --------------------------------------------------------------------
+# --- an independent implementation in NumPy, for one team -------------------------------------------------------------
 
 
 def normed(x: Array, norm: nn.LayerNorm) -> Array:

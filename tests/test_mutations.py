@@ -202,7 +202,7 @@ def test_mutated_levels_are_refused_in_our_own_words_or_can_be_played() -> None:
     assert count > COUNT / 4
 
 
-# --- names that would lead elsewhere ----------------------------------------------------------------------------------
+# --- names with paths -------------------------------------------------------------------------------------------------
 
 ELSEWHERE = ("../x", "/etc/passwd", "saf/../../x", "..", "", "saf\x00", "C:\\x", "a/b")
 

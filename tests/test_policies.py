@@ -280,7 +280,7 @@ def test_rows_do_not_depend_on_their_neighbours(
     th.testing.assert_close(policy.evaluate_actions(obs, th.zeros(12).long())[0], values, rtol=0, atol=1e-6)
 
 
-# --- what the algorithms are ------------------------------------------------------------------------------------------
+# --- definitions of the algorithms ------------------------------------------------------------------------------------
 
 
 def test_mappos_critic_reads_all_views_and_whose_value_is_asked() -> None:

@@ -298,7 +298,7 @@ def test_one_policy_is_sb3s_own_distribution(space: spaces.Space[Any]) -> None:
     assert th.equal(found.mode(), plain.mode())
 
 
-# --- who acts ---------------------------------------------------------------------------------------------------------
+# --- choice of the policy ---------------------------------------------------------------------------------------------
 
 
 def identified(kind: str, action_space: spaces.Space[Any]) -> ActorNetwork:

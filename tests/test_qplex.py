@@ -76,7 +76,7 @@ def same(one: list[th.Tensor], other: list[th.Tensor]) -> bool:
     return all(map(th.equal, one, other))
 
 
-# --- games with a known answer ----------------------------------------------------------------------------------------
+# --- games with known answers -----------------------------------------------------------------------------------------
 
 
 def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:

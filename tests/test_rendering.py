@@ -304,7 +304,7 @@ def test_time_bar_grows_with_the_steps(step: int, share: float) -> None:
     assert count(bar, rendering._DIM) == share * SIDE * TILE
 
 
-# --- what is not installed
+# --- missing packages
 
 
 def test_missing_libraries_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -269,7 +269,7 @@ def test_one_game_of_an_engine_is_played_like_any_other(env_id: str) -> None:
     game.close()
 
 
-# --- suites of their own kind -----------------------------------------------------------------------------------------
+# --- custom suites ----------------------------------------------------------------------------------------------------
 
 
 class PickUp(gym.Env[Any, Any]):

@@ -506,7 +506,7 @@ def test_maskable_ppo_runs(bridge: Bridge, n_cpus: int) -> None:
     assert actions[[1, 4], 0].tolist() == [1, 1]
 
 
-# ---- pictures
+# ---- images
 
 
 @one_and_two_cpus
@@ -883,7 +883,7 @@ def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
             closed_call()
 
 
-# ---- games that break
+# ---- games that fail
 
 
 @one_and_two_cpus
