@@ -57,7 +57,7 @@ def rows_of(env: Any) -> Contestant:
 
 
 def jax_engine(env: Any, n_games: int, actions: Any) -> Contestant:
-    """Step JaxMARL's own ``step``, which begins new episodes itself."""
+    """Step with JaxMARL's own ``step``, which begins new episodes itself."""
     import jax
 
     def one(key: Any, state: Any, chosen: Any) -> Any:
@@ -79,7 +79,7 @@ def jax_engine(env: Any, n_games: int, actions: Any) -> Contestant:
 
 
 def vmas_engine(env: Any, n_games: int, actions: Any) -> Contestant:
-    """Step VMAS's own step, with its ``reset_at`` for games that have ended."""
+    """Step with VMAS's own ``step``, and its ``reset_at`` for games that have ended."""
     import torch as th
 
     env.reset()

@@ -1,5 +1,5 @@
 """
-Processor time until a training reaches a return: what a user waits for.
+Measure the processor time until a training reaches a given team return.
 
 ``python -m benchmarks.time_to_return runs/experiments/small coordination --reach 15`` reads the learning curves of
 finished cells. For each method, task and level it prints the processor seconds and the game steps after which the mean
