@@ -1,5 +1,5 @@
 """
-HECOGrid: cooperative gridworlds with dials for coordination and heterogeneity (arXiv 2210.03022).
+HECOGrid: cooperative gridworlds with adjustable coordination and heterogeneity (arXiv 2210.03022).
 
 PettingZoo environments (:func:`parallel_env`, :func:`env`) and Stable-Baselines3 vector environments
 (:func:`make_vec_env`). Importing this package imports neither torch nor Stable-Baselines3.
@@ -49,7 +49,7 @@ register_with_pettingzoo()
 
 
 def __getattr__(name: str) -> Any:
-    # The vector environments need Stable-Baselines3, hence torch: imported when first asked for.
+    # The vector environments need Stable-Baselines3, hence torch: imported on first access.
     if name in ("NativeVecEnv", "make_vec_env"):
         from hecogrid_envs import vec_env
 

@@ -1,4 +1,4 @@
-"""The arrays of a batch at its start: what its games share, and games that have not begun."""
+"""Initial arrays of a batch: the data its games share, and games that have not begun."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from hecogrid_envs.tiles import FIRST_TERRAIN, turned_atlases
 #: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
 SLACK: Final = 64
 
-#: Views of so many columns are lit by a table.
+#: Visibility in views of at most this many columns is looked up in a table.
 _TABLED_COLUMNS: Final = 8
 
-#: Bytes that processors hand to each other at once.
+#: Size of a cache line in bytes.
 _CACHE_LINE: Final = 64
 
 
 def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) -> npt.NDArray[Any]:
     """
-    Make an array that shares no cache line with another.
+    Make an array that shares no cache line with another array.
 
-    Of games that divide evenly, no two threads then write to one line either, which would go to and fro between them.
+    If games divide evenly between threads, no two threads write to the same line (no false sharing).
 
     :param shape: of the array
     :param dtype: of the array
-    :param value: in all places
+    :param value: fill value
     """
     n_bytes = math.prod((shape,) if isinstance(shape, int) else shape) * np.dtype(dtype).itemsize
     memory = np.empty(n_bytes + 2 * _CACHE_LINE, dtype=np.uint8)
@@ -45,7 +45,7 @@ def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) 
 
 def world_of(task: TaskName, params: HECOGridParams) -> World:
     """
-    Return what all games of a batch share.
+    Return the data that all games of a batch share.
 
     :param task: of all games
     :param params: of all games
@@ -105,7 +105,7 @@ def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
 
 
 def _with_blank_map(world: World) -> World:
-    """Draw the outer wall once; resets copy it. Cells beyond the map count as empty."""
+    """Return the world with the planes of an empty map, which resets copy. Cells beyond the map count as empty."""
     planes = np.full((4, world.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
     bits = np.zeros((4, world.bits_bytes), dtype=np.uint8)
     outer = np.ones((world.width, world.width), dtype=bool)

@@ -29,14 +29,14 @@ from hecogrid_envs.tiles import INVISIBLE
 
 U8 = npt.NDArray[np.uint8]
 
-#: In place of views that are not wanted.
+#: Passed where no views are requested.
 _NO_VIEWS: Final[U8] = np.zeros(0, dtype=np.uint8)
 _SECONDS_WITHOUT_A_WORD: Final = 4.0
 
 
 class GameBatch:
     """
-    Games that share a task and parameters, but neither levels nor randomness.
+    Batch of games with the same task and parameters; levels and random streams differ.
 
     :param task: a name in :data:`hecogrid_envs.TASK_NAMES`, such as ``"TeamSupport"``
     :param params: parameters of all games
@@ -72,17 +72,17 @@ class GameBatch:
         self._kernel = self._compiled_kernel()
 
     def _compiled_kernel(self) -> Callable[..., None]:
-        # Needs all tasks, whose conditions are part of the kernels and whose games are made of batches.
+        # Circular import: the kernels contain the conditions of all tasks, and the tasks' games are made of batches.
         from hecogrid_envs.core.play import play
 
         arguments = (self._games, self._world, self._buffers, 0, _NO_VIEWS, _NO_VIEWS, 0, 0)
         with _announced_compilation():
-            # The code for these types, to be called without looking at the types of some 40 arrays each time.
+            # Compiled for these types and called directly: saves the type dispatch on some 40 arrays in each call.
             kernel: Callable[..., None] = play.compile(tuple(map(typeof, arguments)))
         return kernel
 
     def __getstate__(self) -> dict[str, Any]:
-        # Threads and compiled code stay with the process; a copy makes its own.
+        # Threads and compiled code cannot be pickled; a copy creates its own.
         return {name: value for name, value in self.__dict__.items() if name not in ("_pool", "_kernel")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -100,7 +100,7 @@ class GameBatch:
         self._kernel(self._games, self._world, self._buffers, task, own, last, first, end)
 
     def _play_all(self, task: int, views: U8 = _NO_VIEWS, last_views: U8 = _NO_VIEWS) -> None:
-        """Do one task for all games, each thread for a part of them; arguments as of :meth:`_play`."""
+        """Do one task for all games, split between the threads; arguments as in :meth:`_play`."""
         (first, end), *others = self._parts
         if not others:
             self._play(task, views, last_views, first, end)
@@ -138,7 +138,7 @@ class GameBatch:
 
     def step(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         """
-        Play one game step everywhere; games that are over play on until :meth:`reset`.
+        Play one game step in all games; games that are over continue until :meth:`reset`.
 
         :param actions: (E, N) integers from 0 to 6
         """
@@ -146,7 +146,7 @@ class GameBatch:
         self._play_all(STEP)
 
     def _step_checked(self, actions: npt.NDArray[np.uint8]) -> None:
-        """As :meth:`step`, for actions that were checked one by one: to check a single game's again takes a tenth."""
+        """As :meth:`step`, without checking the actions: a second check takes a tenth of a single game's step."""
         self._take(actions)
         self._play_all(STEP)
 
@@ -165,17 +165,17 @@ class GameBatch:
         self, actions: npt.NDArray[np.integer[Any]], out: U8 | None = None, last: U8 | None = None
     ) -> tuple[U8, npt.NDArray[np.bool_]]:
         """
-        Play one game step everywhere, give games that are over a new level, and observe: :meth:`step`,
-        ``reset(truncated)`` and :meth:`observe` in one compiled call, which threads share once.
+        Play one game step in all games, give games that are over a new level, and observe: :meth:`step`,
+        ``reset(truncated)`` and :meth:`observe` in one compiled call.
 
-        :attr:`rewards` are those of the step, also where a new episode has begun.
+        :attr:`rewards` are the rewards of the step, also for games that were reset.
 
         :param actions: (E, N) integers from 0 to 6
         :param out: contiguous array to write views to; a new one by default
-        :param last: contiguous array of the same shape, to which the last views of games that are over are written, at
-            their place; the rest of it stays as it is. By default they are not made
+        :param last: contiguous array of the same shape; the final views of games that are over are written to their
+            rows, other rows are unchanged. By default final views are not computed
         :return: views as of :meth:`observe`, and (E,) whether the step was the last of an episode
-        :raises ValueError: for actions or arrays that do not fit, or a game that has not begun
+        :raises ValueError: for invalid actions or arrays, or a game that has not begun
         """
         self._accept(actions)
         out = self._array_for_views("out", out)
@@ -184,7 +184,7 @@ class GameBatch:
         return out, self._buffers.fresh.astype(bool)
 
     def _accept(self, actions: npt.NDArray[np.integer[Any]]) -> None:
-        """Check and keep the actions of a step."""
+        """Check and store the actions of a step."""
         actions = np.asarray(actions)
         shape = (self.n_games, self.params.n_agents)
         if actions.shape != shape:
@@ -241,7 +241,7 @@ class GameBatch:
 
     @property
     def rewards(self) -> npt.NDArray[np.float64]:
-        """(E,) what each agent of a game received in the last step: treasures collected / N."""
+        """(E,) reward of each agent of a game in the last step: treasures collected / N."""
         return self._games.collected_now / self.params.n_agents
 
     @property
@@ -299,7 +299,7 @@ class GameBatch:
 
     def snapshot(self) -> dict[str, npt.NDArray[Any]]:
         """
-        Copy all that the games' future depends on, random generators included; see :meth:`restore`.
+        Copy the complete state of the games, random generators included; see :meth:`restore`.
 
         :return: arrays by name, with games along the first axis
         """
@@ -307,19 +307,20 @@ class GameBatch:
 
     def check_snapshot(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
         """
-        Check that the games could be in a state.
+        Check that a snapshot is a valid state of these games.
 
-        :param snapshot: what :meth:`snapshot` gave
-        :raises ValueError: naming the first array that does not fit, or the first value that no game reaches
+        :param snapshot: result of :meth:`snapshot`
+
+        :raises ValueError: naming the first array with a wrong shape or type, or the first value that no game reaches
         """
         check_snapshot(snapshot, self._games, self._seeded, self.params)
 
     def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
         """
-        Go on from a snapshot of a batch with the same task, parameters and number of games.
+        Restore a snapshot of a batch with the same task, parameters and number of games.
 
-        :param snapshot: what :meth:`snapshot` gave; copied
-        :raises ValueError: see :meth:`check_snapshot`; nothing is changed then
+        :param snapshot: result of :meth:`snapshot`; copied
+        :raises ValueError: see :meth:`check_snapshot`; the games are then unchanged
         """
         self.check_snapshot(snapshot)
         load_snapshot(self._games, self._world, snapshot)
@@ -349,11 +350,11 @@ def check_actions(actions: npt.NDArray[Any]) -> None:
     Check the actions of a step.
 
     :param actions: integers from 0 to 6, game-major, then agent
-    :raises ValueError: for another type, or naming the first row with a value out of range
+    :raises ValueError: if they are not integers, or naming the first row with a value out of range
     """
     if actions.dtype.kind not in "iu":
         raise ValueError(f"actions must be integers, got {actions.dtype}")
-    # Read without their sign, negative numbers are large ones.
+    # Negative numbers are large when read as unsigned.
     if actions.view(f"u{actions.itemsize}").max() >= N_ACTIONS:
         rows = actions.reshape(-1)
         row = int(np.flatnonzero((rows < 0) | (rows >= N_ACTIONS))[0])
@@ -368,7 +369,7 @@ def _positive(name: str, value: int) -> int:
 
 @contextmanager
 def _announced_compilation() -> Iterator[None]:
-    """Say on standard error that something is being compiled, if it takes time: numba keeps what it has compiled."""
+    """Print a message on standard error if compiling takes long, that is if numba's cache does not have the code."""
     text = "hecogrid_envs: loading the kernels; once on this machine they are compiled, about 10 seconds"
     timer = Timer(_SECONDS_WITHOUT_A_WORD, partial(print, text, file=sys.stderr, flush=True))
     timer.start()
@@ -382,9 +383,9 @@ def seen_cells(
     views: npt.NDArray[np.bool_], agent_pos: npt.NDArray[Any], agent_dir: npt.NDArray[Any], offset: int, width: int
 ) -> npt.NDArray[np.bool_]:
     """
-    Return which cells of the map the agents see, from their own views.
+    Return which cells of the map the agents see, given their own views.
 
-    :param views: (N, V, V) bool, what each agent sees in its view, row by row, the agent looking up
+    :param views: (N, V, V) bool, the cells each agent sees in its view, row by row, the agent facing up
     :param agent_pos: (N, 2) x, y
     :param agent_dir: (N,)
     :param offset: rows visible behind the agent

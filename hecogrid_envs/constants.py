@@ -73,7 +73,7 @@ BLACK: Final[Colour] = (0, 0, 0)
 EMERALD: Final[Colour] = (38, 222, 129)
 GOLD: Final[Colour] = (255, 205, 60)
 
-#: Colours that the colour-blind can tell apart (Okabe and Ito, 2008), for pictures that people look at.
+#: Colours distinguishable by colour-blind people (Okabe and Ito, 2008), for pictures for people.
 OKABE_ITO: Final[dict[str, Colour]] = {
     "blue": (0, 114, 178),
     "orange": (230, 159, 0),

@@ -1,4 +1,4 @@
-"""The part of a documentation page that all tasks share."""
+"""Documentation text shared by all tasks."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class StepResult(NamedTuple):
 
 class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
     """
-    What all tasks share; the classes in :mod:`hecogrid_envs.tasks` document the games.
+    Base class of all tasks; the classes in :mod:`hecogrid_envs.tasks` document the games.
 
     :param render_mode: ``"rgb_array"``, ``"human"`` (a window), ``"ansi"`` (text) or None
     :param params: the fields of :class:`~hecogrid_envs.params.HECOGridParams`
@@ -50,10 +50,10 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         "render_fps": 8,
         "is_parallelizable": True,
     }
-    #: What makes the task; a class with its own declares a task.
+    #: Declaration of the task; each class that sets it declares a new task.
     declaration: ClassVar[Task]
     task: ClassVar[TaskName]
-    #: What the team's return counts.
+    #: Unit of the team's return.
     return_unit: ClassVar[str] = "treasures"
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -62,7 +62,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
             return
         cls.task = cls.declaration.name
         DECLARED[cls.task] = cls.declaration
-        # Each task's docstring is its documentation page; what all tasks share is written once.
+        # Each task's docstring is its documentation page; the shared part is appended.
         cls.__doc__ = f"{cleandoc(cls.__doc__ or '')}\n\n{COMMON_PAGE}"
 
     def __init__(self, render_mode: RenderMode | None = None, **params: Any):
@@ -75,7 +75,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
 
     @classmethod
     def of_batch(cls, batch: GameBatch, game: int, render_mode: RenderMode | None = None) -> HECOGridEnv:
-        """View one game of a batch as an environment; both see every change."""
+        """Wrap one game of a batch as an environment; both share the state."""
         env = cls.__new__(cls)
         env._setup(batch, game, render_mode)
         return env
@@ -92,7 +92,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         self.agents: list[str] = []
         own_space = observation_space(self.task, self.params)
         size = self.params.grid_size
-        # One object per agent and call: seeding a space must be seen by the next call.
+        # The same object in every call: seeding a space must affect later calls.
         self.observation_spaces = dict.fromkeys(self.possible_agents, own_space)
         self.action_spaces = {agent: spaces.Discrete(N_ACTIONS) for agent in self.possible_agents}
         self.state_space = spaces.Box(0, 255, (size, size, len(STATE_PLANES)), np.uint8)
@@ -109,12 +109,12 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         """
         Start an episode.
 
-        :param seed: starts the game's randomness anew; None continues it
+        :param seed: seeds the game's random generator; None continues it
         :param options: ``{"state": mapping}`` starts from a given state instead of a random level
         :return: observations and empty infos, per agent
         :raises ValueError: for a negative seed or an inconsistent state
         """
-        # A refused state leaves the game as it was: checked before anything changes.
+        # Checked first: an invalid state leaves the game unchanged.
         state = state_option(options, self.params)
         which = np.zeros(self._batch.n_games, dtype=bool)
         which[self._game] = True
@@ -172,7 +172,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         return row
 
     def observations(self) -> Observations:
-        """Return the views of all agents at this moment, also after :meth:`set_state`."""
+        """Return the present views of all agents, also after :meth:`set_state`."""
         return dict(zip(self.possible_agents, self._batch.observe_game(self._game), strict=True))
 
     def state(self) -> npt.NDArray[np.uint8]:
@@ -194,7 +194,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
 
     @property
     def agent_zones(self) -> npt.NDArray[np.int64]:
-        """(N,) the zone that each agent stands in, which decides what its actions do."""
+        """(N,) the zone of each agent, which determines the effect of its actions."""
         return self.params.zone_of_column()[self._batch.columns[self._game]]
 
     @property
@@ -205,18 +205,18 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
 
     @property
     def action_names(self) -> list[str]:
-        """What each action integer does; integers alone where zones change it."""
+        """Name of each action integer; the integers themselves if zones permute the actions."""
         if self.params.heterogeneity > 1:
             return [str(action) for action in range(N_ACTIONS)]
         return [command.name.lower() for command in Command]
 
     def replica(self) -> HECOGridEnv:
-        """Return a game of its own with the same parameters: from the same seed it plays the same episode."""
+        """Return an independent game with the same parameters; the same seed gives the same episode."""
         return type(self)(**asdict(self.params))
 
     def grid_scene(self) -> dict[str, Any]:
         """
-        Return what a drawing of the game needs, as plain lists.
+        Return the data for drawing the game, as plain lists.
 
         :return: ``width``, ``height``, ``walls`` and ``keys`` [x, y], ``zones`` by column, ``treasures``
             [x, y, whether it is collected], ``agents`` [x, y, direction, whether it has a key]

@@ -1,4 +1,4 @@
-"""The parameters of a HECOGrid world, checked once, where they enter."""
+"""Parameters of a HECOGrid world, checked at construction."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class HECOGridParams:
         """
         Build from keyword arguments.
 
-        :raises ValueError: for a name that is no parameter, with the nearest one that is
+        :raises ValueError: for an unknown name, with the nearest known one
         """
         known = [field.name for field in fields(cls)]
         for name in params:
@@ -102,7 +102,7 @@ class HECOGridParams:
         self._check_integer("coordination", 1, self.n_agents, " (1 <= coordination <= n_agents)")
         self._check_integer("heterogeneity", 1, self.grid_size - 2, " (1 <= heterogeneity <= grid_size - 2)")
         self._check_integer("n_treasures", 0, self.n_interior_cells)
-        # Tasks without keys ignore their number, so whether they fit is for check_fits to say.
+        # Tasks without keys ignore the number, so check_fits checks whether they fit.
         self._check_integer("n_keys", 0, MAX_GRID_SIZE**2)
         self._check_integer("view_size", 1, MAX_VIEW_SIZE, " and odd")
         if self.view_size % 2 == 0:
@@ -134,7 +134,7 @@ class HECOGridParams:
         """
         Check that treasures, clutter, keys and agents fit on the map.
 
-        :raises ValueError: with the number of cells wanted and available
+        :raises ValueError: with the number of cells needed and available
         """
         n_keys = self.n_keys if DECLARED[task].has_keys else 0
         wanted = self.n_treasures + self.n_clutter + n_keys
@@ -183,7 +183,7 @@ class HECOGridParams:
         """
         Return what each action integer triggers in each zone.
 
-        Beyond the last permutation the table starts again; the paper's rules never get there.
+        Beyond the last permutation the table starts again; this does not occur under the paper's rules.
 
         :return: (n_zones, 7), the command that action integer ``a`` triggers in zone ``z``
         """

@@ -57,7 +57,7 @@ so that "up" walks everywhere; with --raw they are not: each sends the integer t
 what an agent has to learn. The number keys are never translated.
 """
 
-#: Parameters that decide what programs see, not people.
+#: Parameters that affect observations only, not the displayed game.
 _NOT_FOR_PEOPLE: Final = ("observation", "view_tile_size")
 _WINDOW_FPS: Final = 30
 
@@ -69,7 +69,7 @@ class Session:
     :param env: the game, with tile codes as observations
     :param seed: seed of the first game; later games continue its randomness
     :param raw: send each key's zone 0 integer instead of translating it for the agent's zone
-    :param others: what the agents do that are not selected
+    :param others: behaviour of the agents that are not selected
     """
 
     def __init__(self, env: HECOGridEnv, seed: int | None = None, raw: bool = False, others: Others = "wait") -> None:
@@ -94,7 +94,7 @@ class Session:
 
     def press(self, key: str) -> bool:
         """
-        Do what a key asks for.
+        Handle a key.
 
         :param key: a name such as ``"up"``, ``"p"``, ``"3"``
         :return: False if the person wants to leave
@@ -156,7 +156,7 @@ class Session:
 
     @property
     def status(self) -> str:
-        """The selected agent, and what happened last."""
+        """Return the selected agent and the outcome of the last action."""
         agent, state = self.selected, self.env.get_state()
         facing = Direction(int(state["agent_dir"][agent])).name.lower()
         key = ", has a key" if state["agent_has_key"][agent] else ""
@@ -194,7 +194,7 @@ def play_window(session: Session, tile_size: int | None = None, echo: Callable[[
 
     :param session: the game
     :param tile_size: pixels per cell; by default as many as fit the screen of a laptop
-    :param echo: told the status after every key
+    :param echo: called with the status after every key
     """
     tile = tile_size or fit_tile_size(session.env.params.grid_size, 840)
     echo(KEYS_HELP)
@@ -214,7 +214,7 @@ def play_window(session: Session, tile_size: int | None = None, echo: Callable[[
 
 def play_text(session: Session, stdin: TextIO, stdout: TextIO) -> None:
     """
-    Play in a terminal, key by key, or from lines of key names where the input is no terminal.
+    Play in a terminal, key by key, or from lines of key names if the input is no terminal.
 
     :param session: the game
     :param stdin: keys
@@ -254,7 +254,7 @@ def terminal_keys(descriptor: int) -> Iterator[str]:
         if not key:
             return
         if key == "\x1b":
-            # What belongs to the key follows at once.
+            # The rest of an escape sequence follows immediately.
             sequence = ""
             while len(sequence) < 2 and select.select([descriptor], [], [], 0.05)[0]:
                 sequence += os.read(descriptor, 1).decode(errors="replace")
@@ -265,7 +265,7 @@ def terminal_keys(descriptor: int) -> Iterator[str]:
 
 @contextmanager
 def _single_keys(stdin: TextIO) -> Iterator[None]:
-    """Let a terminal hand over keys one by one without printing them, and repair it at the end."""
+    """Put a terminal into single key mode without echo, and restore it at the end."""
     import termios
     import tty
 
@@ -281,7 +281,7 @@ def _single_keys(stdin: TextIO) -> Iterator[None]:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Make the options of the command line: one per parameter of the world, and the player's own."""
+    """Build the command line parser: one option per parameter of the world, and the player's options."""
     parser = argparse.ArgumentParser(
         prog="python -m hecogrid_envs.play",
         description="Play a HECOGrid game with the keyboard.",
@@ -307,7 +307,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_world_options(group: argparse._ArgumentGroup) -> None:
-    """Names, defaults and explanations come from :class:`HECOGridParams`."""
+    """Add options with the names, defaults and descriptions of :class:`HECOGridParams`."""
     entries = re.findall(r":param (\w+): (.+?)(?=\n\s*:|$)", HECOGridParams.__doc__ or "", re.DOTALL)
     notes = {name: " ".join(text.replace("`", "").split()) for name, text in entries}
     types = get_type_hints(HECOGridParams)
@@ -327,9 +327,9 @@ def _add_world_options(group: argparse._ArgumentGroup) -> None:
 
 def make_session(arguments: Sequence[str] | None = None) -> tuple[Session, argparse.Namespace]:
     """
-    Build the game that a command line asks for; mistakes end the program with a message.
+    Build the game of a command line; invalid arguments end the program with a message.
 
-    :param arguments: the command line, that of the program by default
+    :param arguments: command line arguments, ``sys.argv[1:]`` by default
     """
     parser = build_parser()
     options = parser.parse_args(arguments)
@@ -343,7 +343,7 @@ def make_session(arguments: Sequence[str] | None = None) -> tuple[Session, argpa
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the program."""
+    """Run the command line."""
     session, options = make_session(arguments)
     try:
         if options.text:

@@ -1,8 +1,8 @@
 """
-Pictures of a game for people: zones, walls, treasures, keys, agents with what they see, and a score bar.
+Pictures of a game for people: zones, walls, treasures, keys, agents with their fields of view, and a score bar.
 
-Everything here works on a plain state mapping, so that a level can be drawn without running it. Colours can be told
-apart by the colour-blind (Okabe and Ito, 2008); agents also carry their numbers. What agents themselves see is drawn by
+All functions take a plain state mapping, so that a level can be drawn without running it. Colours are distinguishable
+by colour-blind people (Okabe and Ito, 2008); agents also show their numbers. Observations are drawn by
 :mod:`hecogrid_envs.tiles`.
 """
 
@@ -26,10 +26,10 @@ State = Mapping[str, Any]
 
 MIN_TILE: Final = 4
 MAX_TILE: Final = 128
-#: Pixels per cell, and the largest side of a map, where nobody asks for a size.
+#: Default pixels per cell, and the largest map side drawn at this size.
 _USUAL_TILE: Final = 24
 _LARGEST_SIDE: Final = 60 * _USUAL_TILE
-#: A picture larger than this is a mistake: 64 million pixels are 192 MB.
+#: Largest allowed picture: 64 million pixels are 192 MB.
 MAX_PIXELS: Final = 2**26
 
 #: Colours of agents by index, repeating beyond the last; the gems' green is left out.
@@ -50,7 +50,7 @@ _VEIL: Final = 14
 _OUTLINE: Final = 110
 #: Shapes are drawn this many times larger and averaged down.
 _SUPERSAMPLING: Final = 8
-#: Sprites smaller than this carry no number.
+#: Sprites smaller than this show no number.
 _LEGIBLE: Final = 15
 
 
@@ -64,7 +64,7 @@ class Scene(NamedTuple):
     :param step: game steps so far in this episode
     :param collected: treasures collected so far in this episode, the team's return
     :param visible: (N, W, H) bool, the cells that each agent sees, see :func:`seen_cells`; None draws no views
-    :param selected: index of an agent to mark, the one a person plays
+    :param selected: index of the agent to mark as the one the person controls
     """
 
     task: TaskName
@@ -84,7 +84,7 @@ def render_scene(scene: Scene, tile_size: int | None = None, show_views: bool = 
     :param tile_size: pixels per cell, from 4 to 128; by default 24, and less for maps of more than 60 cells
     :param show_views: outline what each agent sees (needs ``scene.visible``)
     :return: (height, width, 3); the size depends on the task, the parameters and ``tile_size`` only
-    :raises ValueError: if the tile size is out of range or the picture would be enormous
+    :raises ValueError: if the tile size is out of range or the picture exceeds :data:`MAX_PIXELS`
     :raises ImportError: if Pillow is missing
     """
     if tile_size is None:
@@ -152,7 +152,7 @@ def _mix(colour: Colour, other: Colour, share: float) -> Colour:
 
 
 def _readable_on(colour: Colour) -> Colour:
-    """Return black or white, whichever stands out."""
+    """Return black or white, the one with more contrast."""
     red, green, blue = colour
     return _INK if 0.30 * red + 0.59 * green + 0.11 * blue > 105 else (255, 255, 255)
 
@@ -162,13 +162,13 @@ def _readable_on(colour: Colour) -> Colour:
 
 @lru_cache(maxsize=8)
 def _background(task: TaskName, params: HECOGridParams, tile: int, walls_bytes: bytes) -> Any:
-    """Draw what stays put in a game."""
+    """Draw the static part of a game."""
     side, top = params.grid_size, header_height(task, params, tile)
     walls = np.frombuffer(walls_bytes, dtype=np.bool_).reshape(side, side)
     image = _pillow()[0].new("RGB", (side * tile, top + side * tile), _INK)
     draw, zones = _brush(image), params.zone_of_column()
     for x, y in np.ndindex(side, side):
-        # A map with one zone stays neutral: there is nothing to tell apart.
+        # A map with one zone needs no tint.
         tint = _mix(_FLOOR, zone_colour(int(zones[x])), _ZONE_TINT if zones[-1] > 0 else 0.0)
         box = (x * tile, top + y * tile, (x + 1) * tile - 1, top + (y + 1) * tile - 1)
         draw.rectangle(box, fill=_WALL if walls[x, y] else tint, outline=None if walls[x, y] else _mix(tint, _INK, 0.2))
@@ -223,7 +223,7 @@ def _words(scene: Scene) -> list[tuple[str, str]]:
 
 @lru_cache(maxsize=64)
 def _header_layout(task: TaskName, params: HECOGridParams, tile: int) -> _Layout:
-    """Place the words, the widest that a game can show so that numbers do not jump: as many to a line as fit."""
+    """Place as many words to a line as fit, at their largest possible width so that they do not move."""
     width, wanted = params.grid_size * tile, int(np.clip(round(tile * 0.62), 11, 22))
     most = np.ones(params.n_treasures)
     words = _words(Scene(task, params, {"treasures": 2 * most}, params.max_cycles, len(most)))
@@ -264,7 +264,7 @@ def _draw_header(image: Any, scene: Scene, tile: int) -> None:
         draw.rectangle((0, top, round(image.width * share) - 1, bottom), fill=_DIM)
 
 
-# --- what agents see
+# --- fields of view
 
 
 def _draw_views(image: Any, scene: Scene, tile: int, top: int) -> None:
@@ -363,7 +363,7 @@ def _draw_objects(image: Any, scene: Scene, tile: int, top: int) -> None:
 
 @lru_cache(maxsize=64)
 def _treasure_sprite(size: int, colour: Colour, collected: bool) -> Any:
-    """Draw a cut gem; where it was collected only its empty setting and a tick remain."""
+    """Draw a cut gem, or an empty setting and a tick if it was collected."""
     canvas = _Canvas(size)
     girdle, table, tip = 0.40, 0.20, 0.86
     outline = [(0.30, table), (0.70, table), (0.90, girdle), (0.50, tip), (0.10, girdle)]
@@ -404,7 +404,7 @@ def _draw_key(canvas: _Canvas, x: float, y: float, scale: float, rim: float) -> 
 
 
 class _Look(NamedTuple):
-    """Everything that decides how one agent's sprite looks."""
+    """Properties that determine one agent's sprite."""
 
     size: int
     agent: int
@@ -413,7 +413,7 @@ class _Look(NamedTuple):
     selected: bool
 
 
-#: Where the members of a crowd stand in their cell (centres), and how large; more than nine share the last grid.
+#: Size and centres of the sprites of a crowd in its cell; more than nine agents use the last grid.
 _CROWDS: Final[dict[int, tuple[float, list[tuple[float, float]]]]] = {
     1: (1.0, [_MIDDLE]),
     2: (0.66, [(0.33, 0.33), (0.67, 0.67)]),
@@ -441,13 +441,13 @@ def _draw_agents(image: Any, scene: Scene, tile: int, top: int) -> None:
             look = _Look(size, agent, direction, bool(has_key), agent == scene.selected)
             _paste(image, _agent_sprite(look), x, y, tile, top, centre)
         if len(shown) < len(members):
-            # The last place shows how many are left.
+            # The last place shows the number of agents not drawn.
             _paste(image, _more_sprite(size, len(members) - len(shown)), x, y, tile, top, centres[-1])
 
 
 @lru_cache(maxsize=4096)
 def _agent_sprite(look: _Look) -> Any:
-    """Draw a triangle that points where the agent faces, its number inside, and a key if it carries one."""
+    """Draw a triangle in the agent's direction with its number, and a key if it carries one."""
     canvas, colour, label = _Canvas(look.size), _agent_colour(look.agent), f"{look.agent}"
     shape = _turned([(0.10, 0.06), (0.97, 0.50), (0.10, 0.94)], look.direction)
     if look.selected:

@@ -1,9 +1,9 @@
 """
-All that the future of games depends on, and games made of it again.
+Snapshots of the complete state of games, and games restored from them.
 
-A snapshot holds terrain, agents, their order of arrival, counters and random generators; what follows from these (who
-stands where, what every cell looks like) is computed when it is loaded. A snapshot may come from a file, so everything
-in it is checked first. Letters: E games, N agents, W columns and rows.
+A snapshot holds terrain, agents, their order of arrival, counters and random generators; derived data (agents by cell,
+tile codes) are computed on loading. A snapshot may come from a file, so all of it is checked first. Letters: E games, N
+agents, W columns and rows.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _NOBODY: Final = -1
 
 
 def take_snapshot(games: Games, seeded: npt.NDArray[np.bool_]) -> dict[str, npt.NDArray[Any]]:
-    """Copy E games: arrays by name; ``rank`` (E, N) counts who arrived in its cell before."""
+    """Copy E games: arrays by name; ``rank`` (E, N) counts the agents that arrived earlier in the same cell."""
     stored = {name: getattr(games, name).copy() for name in _STORED}
     return {"seeded": seeded.copy(), **stored, "rank": _ranks(games)}
 
 
 def _ranks(games: Games) -> npt.NDArray[np.int32]:
-    """(E, N) how many agents arrived before each agent in its cell."""
+    """Return how many agents arrived earlier in each agent's cell, (E, N)."""
     ranks = np.zeros(games.before.shape, dtype=np.int32)
     previous = games.before.astype(np.int64)
     while (previous != _NOBODY).any():
@@ -49,7 +49,7 @@ def _ranks(games: Games) -> npt.NDArray[np.int32]:
 
 
 def check_snapshot(snapshot: Snapshot, games: Games, seeded: npt.NDArray[np.bool_], params: HECOGridParams) -> None:
-    """Check what :func:`take_snapshot` gave against games of the same kind; see ``GameBatch.check_snapshot``."""
+    """Check a snapshot against games of the same kind; see ``GameBatch.check_snapshot``."""
     own = take_snapshot(games, seeded)
     if different := sorted(own.keys() ^ snapshot.keys()):
         raise ValueError(f"expected a snapshot with the arrays {sorted(own)}, they differ in {different[0]!r}")
@@ -74,7 +74,7 @@ def _check_values(snapshot: Snapshot, n_agents: int) -> None:
         "colour": (0, len(AGENT_PALETTE) - 1),
         "steps": (0, np.iinfo(np.int32).max - 1),
         "collected": (0, collected),
-        # Of the last step, which may have been in the episode before.
+        # Counts the last step, which may belong to the previous episode.
         "collected_now": (0, snapshot["terrain"].shape[1]),
     }
     for name, (low, high) in limits.items():
@@ -100,7 +100,7 @@ def _check_game(snapshot: Snapshot, game: int, params: HECOGridParams) -> None:
 
 
 def load_snapshot(games: Games, world: World, snapshot: Snapshot) -> None:
-    """Let games go on from a checked snapshot; their cells must be redrawn afterwards."""
+    """Restore games from a checked snapshot; their cells must be redrawn afterwards."""
     blank = empty_games(world, len(games.rng))
     for name, empty in blank._asdict().items():
         getattr(games, name)[...] = empty

@@ -1,4 +1,4 @@
-"""The state of one game as plain arrays: fixed, drawn, stored and replayed levels."""
+"""State of one game as plain arrays, for fixed, drawn, stored and replayed levels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Bools = npt.NDArray[np.bool_]
 
 class StateMapping(TypedDict):
     """
-    One game. W x H cells, N agents; planes are indexed ``[x, y]``.
+    State of one game. W x H cells, N agents; planes are indexed ``[x, y]``.
 
     ``walls`` bool (W, H), ``treasures`` uint8 (W, H) with 0 none, 1 available, 2 collected, ``keys`` bool (W, H),
     ``agent_pos`` int (N, 2) as x, y, ``agent_dir`` int (N,), ``agent_has_key`` bool (N,).
@@ -54,7 +54,7 @@ STATE_PLANES: Final = (
 
 def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
     """
-    Check a state mapping and bring its arrays to their types.
+    Check a state mapping and convert its arrays to their types.
 
     :param mapping: see :class:`StateMapping`
     :raises ValueError: naming the first fault
@@ -107,7 +107,7 @@ def state_of(
 
 
 def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> StateMapping | None:
-    """Return the state that the options of a reset ask for, if any, checked by :func:`check_state`."""
+    """Return the state in the options of a reset, checked by :func:`check_state`, or None."""
     if options is None or options.get("state") is None:
         return None
     return check_state(options["state"], params)
@@ -170,7 +170,7 @@ def _check_agents(state: StateMapping) -> None:
 
 def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
     """
-    Draw the whole game in planes, for a critic that may see everything.
+    Encode the whole game in planes, for a centralised critic.
 
     :param zone_of_column: (W,)
     :return: (W, H, 10) uint8, planes as in :data:`STATE_PLANES`; counts stop at 255

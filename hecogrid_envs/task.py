@@ -21,7 +21,7 @@ Condition = Callable[["Games", "World", int, int, int, int], bool]
 
 class Task(NamedTuple):
     """
-    Declaration of a task: all else is common to all tasks.
+    Declaration of a task: everything in which tasks differ.
 
     :param name: its name
     :param condition: decides whether an agent collects a treasure
@@ -46,13 +46,13 @@ DECLARED: Final[dict[TaskName, Task]] = {}
 
 
 def check_task(task: object) -> TaskName:
-    """Check a task's name; the ValueError has the nearest name that exists."""
+    """Check a task's name; the ValueError suggests the nearest known name."""
     if isinstance(task, str) and task in DECLARED:
         return task
     raise ValueError(f"unknown task {task!r}{did_you_mean(task, list(DECLARED))}; the tasks are {', '.join(DECLARED)}")
 
 
 def did_you_mean(value: object, known: list[str]) -> str:
-    """Return `` (did you mean 'name'?)`` with the nearest of the known names, or nothing if none is near."""
+    """Return `` (did you mean 'name'?)`` with the nearest known name, or an empty string if none is near."""
     close = get_close_matches(str(value), known, n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

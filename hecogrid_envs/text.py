@@ -1,8 +1,8 @@
 """
 Games as text, for terminals and tests, and levels from text.
 
-One character per cell, then the agents one by one, because a cell has no room for whose they are and what lies under
-them. Everything that a state mapping holds is on the page, so that a printed game can be read back::
+One character per cell, then a list of the agents with their index and ground, for which a cell has no room. The text
+holds the complete state mapping, so that a printed game can be read back::
 
     step 3  collected 1
     000000111111
@@ -147,7 +147,7 @@ def _agent_lines(state: Mapping[str, Any]) -> list[str]:
 
 
 def _painted(row: str, zones: list[int], ink: Callable[[str, int], _Ink]) -> str:
-    """Colour a line, one escape sequence for neighbours that look the same."""
+    """Colour a line, with one escape sequence per run of equal colours."""
     parts = []
     inks = (ink(character, zone) for character, zone in zip(row, zones, strict=True))
     for look, run in groupby(zip(inks, row, strict=True), key=lambda pair: pair[0]):
@@ -181,10 +181,10 @@ def parse_level(text: str) -> StateMapping:
     Read a level that was printed by :func:`render_text` or drawn by hand.
 
     The map is the block of lines that begin with ``#``. Without an ``agents`` line the agents are numbered in reading
-    order and stand on plain floor; with one, its numbers, grounds and directions count, and agents may be left out
+    order and stand on plain floor; with one, its numbers, grounds and directions apply, and agents may be left out
     of the map (``#.$.#`` with ``agents 0>2,1`` puts agent 0 on the treasure). Spaces are floor, too.
 
-    :param text: the level; colours, indentation, empty lines, step, zones and legend are passed over
+    :param text: the level; colours, indentation, empty lines, step, zones and legend are ignored
     :return: state mapping; whether it fits an environment is checked by the environment
     :raises ValueError: naming the first line or cell that cannot be read
     """
@@ -209,7 +209,7 @@ def parse_level(text: str) -> StateMapping:
 
 
 def _sort_lines(text: str) -> tuple[list[str], list[str]]:
-    """Return the rows of the map, and the words about agents."""
+    """Return the rows of the map, and the words of the ``agents`` lines."""
     rows: list[str] = []
     words: list[str] = []
     ended = False
@@ -228,13 +228,13 @@ def _sort_lines(text: str) -> tuple[list[str], list[str]]:
 
 
 def _is_remark(line: str, after_map: bool) -> bool:
-    """Step, score and zones come above the map, the legend anywhere."""
+    """Return whether a line is a remark: step, score and zones above the map, the legend anywhere."""
     heading = not after_map and re.fullmatch(r"(step|collected) \d+.*|[0-9a-z]+", line) is not None
     return heading or line.startswith("legend")
 
 
 def _read_map(rows: list[str]) -> tuple[_Planes, list[_Agent], list[tuple[int, int]]]:
-    """Planes, the agents drawn alone in their cells, and the cells of crowds, both in reading order."""
+    """Return planes, agents drawn alone in their cells, and cells of crowds, both in reading order."""
     shape = (len(rows[0]), len(rows))
     walls, treasures, keys = np.zeros(shape, np.bool_), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     drawn: list[_Agent] = []
@@ -259,7 +259,7 @@ def _read_map(rows: list[str]) -> tuple[_Planes, list[_Agent], list[tuple[int, i
 
 
 def _place_agents(words: list[str], planes: _Planes, occupied: set[tuple[int, int]]) -> list[_Agent]:
-    """Read the ``agents`` line and lay treasures under those who stand on them."""
+    """Read the ``agents`` line and place treasures under agents that stand on them."""
     walls, treasures, _ = planes
     agents: dict[int, _Agent] = {}
     for word in words:

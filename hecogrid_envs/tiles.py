@@ -1,7 +1,7 @@
 """
-Tile codes: what a cell of a view can look like, and the atlas that turns a code into pixels.
+Tile codes for the possible appearances of a cell in a view, and the atlas that maps codes to pixels.
 
-A view is made of few distinct tiles. Everything that computes views works on codes; pixels are looked up last.
+A view consists of few distinct tiles. Views are computed in codes; pixels are looked up last.
 Shapes are drawn at three times the size and averaged down, as MiniGrid does.
 """
 
@@ -138,7 +138,7 @@ def _drawn(shape: Shape, colour: Colour, size: int) -> Image:
 
 
 def _agent_shape(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Return where the triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81) is: an agent that faces east."""
+    """Return the mask of the triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81): an agent that faces east."""
     slope = (0.50 - 0.19) / (0.87 - 0.12)
     return (x >= 0.12) & (y >= 0.19 + slope * (x - 0.12)) & (y <= 0.81 - slope * (x - 0.12))
 
@@ -173,7 +173,7 @@ def _in_rectangle(
 
 
 def _blend(ground: Image, agent: Image) -> Image:
-    """Lay an agent over its ground, the brighter the more opaque: (ground * (A - a) + agent * a) / A."""
+    """Blend an agent over its ground; brighter pixels are more opaque: (ground * (A - a) + agent * a) / A."""
     alpha = agent.sum(axis=2, keepdims=True, dtype=np.int64)
     top = alpha.max()
     if top == 0:
@@ -193,7 +193,7 @@ def _with_grid_lines(tiles: Image, turns: int) -> Image:
 
 class TileSpace(spaces.Box):
     """
-    Views as tile codes: ``Box(0, n_codes - 1, (view_size, view_size), uint8)`` that knows what its codes look like.
+    Space of views as tile codes: ``Box(0, n_codes - 1, (view_size, view_size), uint8)`` with the pixels of each code.
 
     :param view_size: side of a view in cells
     :param atlas: (n_codes, t, t, 3) uint8, pixels of every code

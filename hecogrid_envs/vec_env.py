@@ -31,12 +31,12 @@ Value = TypeVar("Value")
 
 def chosen_indices(indices: int | Iterable[int] | None, n: int, kind: str = "row") -> list[int]:
     """
-    Return which of n rows (or games) are meant.
+    Return the selected indices out of n rows (or games).
 
     :param indices: one, several, or None for all; negative ones count from the end
-    :param n: how many there are
-    :param kind: what they are, for the message
-    :raises ValueError: for one that is not there
+    :param n: number of rows or games
+    :param kind: ``"row"`` or ``"game"``, for the message
+    :raises ValueError: for an index out of range
     """
     listed = range(n) if indices is None else [indices] if isinstance(indices, Integral) else indices
     chosen = [int(index) for index in cast(Iterable[int], listed)]
@@ -48,7 +48,7 @@ def chosen_indices(indices: int | Iterable[int] | None, n: int, kind: str = "row
 
 class TeamVecEnv(VecEnv):
     """
-    Base of games of a team as rows: E games of N agents, row ``e * N + i`` is agent ``i`` of game ``e``.
+    Base of vector environments with one row per agent: row ``e * N + i`` is agent ``i`` of game ``e``.
 
     :param n_games: E
     :param n_agents: N
@@ -71,20 +71,20 @@ class TeamVecEnv(VecEnv):
         self.seed(seed)
 
     def per_row(self, of_games: Iterable[Value]) -> list[Value]:
-        """Repeat what is one per game for each of its rows."""
+        """Repeat one value per game for each row of the game."""
         return [value for value in of_games for _ in range(self.n_agents)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
-        Choose the seeds of the games, for the next reset; later episodes go on with each game's own random stream.
+        Set the seeds of the games for the next reset; later episodes continue each game's random stream.
 
         :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None for fresh entropy
         :return: (B,) the seed of each row's game
         """
         chosen = game_seeds(fresh_seed() if seed is None else seed, self.n_games)
-        #: Seeds of the games as they were last chosen, by which evaluation is told from training; None for fresh ones.
+        #: Last seeds of the games, which distinguish evaluation from training; None if drawn at random.
         self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
-        #: For the next reset; None goes on with the games' own random streams.
+        #: Seeds for the next reset; None continues the games' random streams.
         self._next_seeds: list[int] | None = chosen
         return self.per_row(chosen)
 
@@ -92,7 +92,7 @@ class TeamVecEnv(VecEnv):
         """
         Set the options of the next reset.
 
-        :param options: for all games, or a list with those for each row, where a game takes those of its first row
+        :param options: one dict for all games, or a list with one per row, of which a game takes that of its first row
         """
         if isinstance(options, (list, tuple)) and len(options) != self.num_envs:
             raise ValueError(
@@ -105,7 +105,7 @@ class TeamVecEnv(VecEnv):
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
         """
-        Call a method of games, once each.
+        Call a method once per game.
 
         :param method_name: of the game
         :param args: positional arguments
@@ -116,7 +116,7 @@ class TeamVecEnv(VecEnv):
         raise NotImplementedError
 
     def get_images(self) -> Sequence[npt.NDArray[Any] | None]:
-        """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
+        """Return one picture per row, None unless the render mode is ``"rgb_array"``; rows of a game share one."""
         return self.per_row(self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games)
 
     def render(self, mode: str | None = None) -> npt.NDArray[Any] | None:
@@ -127,7 +127,7 @@ class TeamVecEnv(VecEnv):
         :return: one picture of all games for ``"rgb_array"``, else None
         """
         if self.render_mode is None or mode not in (None, self.render_mode):
-            return super().render(mode)  # which explains what is wrong
+            return super().render(mode)  # raises an explaining error
         pictures = self.game_method("render")
         return tile_images(pictures) if self.render_mode == "rgb_array" else None
 
@@ -152,12 +152,12 @@ class NativeVecEnv(TeamVecEnv):
         self._actions: U8 | None = None
         self._running = False
         own_space = observation_space(batch.task, batch.params)
-        #: Where the batch leaves the last views of episodes, (E, N, *observation shape).
+        #: Final views of episodes, written by the batch, (E, N, *observation shape).
         self._last: U8 = np.empty((batch.n_games, batch.params.n_agents, *own_space.shape), dtype=np.uint8)
         super().__init__(batch.n_games, batch.params.n_agents, own_space, spaces.Discrete(N_ACTIONS), seed)
 
     def reset(self) -> U8:
-        """Start new episodes everywhere: views (B, *observation shape)."""
+        """Start new episodes in all games and return views, (B, *observation shape)."""
         options = enumerate(self._options[:: self.n_agents])
         states = {game: state_option(given, self.params) for game, given in options if given}
         self.batch.reset(seeds=self._next_seeds)
@@ -177,7 +177,7 @@ class NativeVecEnv(TeamVecEnv):
 
     def step_async(self, actions: npt.NDArray[np.integer[Any]]) -> None:
         """
-        Take the actions of the next step.
+        Store the actions of the next step.
 
         :param actions: (B,) integers from 0 to 6
         :raises ValueError: for a wrong shape, type or value, or a step without a reset
@@ -214,7 +214,7 @@ class NativeVecEnv(TeamVecEnv):
         return self._rows(views), rewards, dones, infos
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """All that the future depends on, as plain data."""
+        """Return the complete state as plain data."""
         return {
             "task": self.batch.task,
             "params": {name: _plain(value) for name, value in asdict(self.params).items()},
@@ -225,7 +225,7 @@ class NativeVecEnv(TeamVecEnv):
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that these games could be in a state."""
+        """Check that a checkpoint is a valid state of these games."""
         own = self.checkpoint_state()
         if different := sorted(own.keys() ^ state.keys()):
             raise ValueError(f"expected the state of games with {', '.join(own)}, they differ in {different[0]!r}")
@@ -244,7 +244,7 @@ class NativeVecEnv(TeamVecEnv):
             raise ValueError("expected running games to have begun, got a state in which one has not")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from there; observations of the present are those of before."""
+        """Restore a state of :meth:`checkpoint_state`; the observations are those of that state."""
         self.check_checkpoint_state(state)
         self.batch.restore(state["games"])
         self._running = state["running"]
@@ -262,7 +262,7 @@ class NativeVecEnv(TeamVecEnv):
         return [self.games[row // self.n_agents] for row in chosen_indices(indices, self.num_envs)]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Attribute of each row's game."""
+        """Return an attribute of each row's game."""
         return [getattr(env, attr_name) for env in self._games_of(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -279,17 +279,17 @@ class NativeVecEnv(TeamVecEnv):
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
-        """Call a method of games, once each (see the base class)."""
+        """Call a method once per game (see the base class)."""
         chosen = chosen_indices(games, self.n_games, "game")
         return [getattr(self.games[game], method_name)(*args, **kwargs) for game in chosen]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """No row is wrapped in a Gymnasium wrapper."""
+        """Return False for each row: none is wrapped in a Gymnasium wrapper."""
         return [False for _ in chosen_indices(indices, self.num_envs)]
 
 
 def _check_seeds(seeds: Any, n_games: int, n_agents: int) -> None:
-    """The seeds of the next reset, one for each row."""
+    """Check the seeds of the next reset, one for each row."""
     is_seed = [seed is None or (isinstance(seed, int) and 0 <= seed < 2**128) for seed in seeds] if seeds else []
     if not isinstance(seeds, list) or len(seeds) != n_games * n_agents or not all(is_seed):
         raise ValueError(
@@ -298,7 +298,7 @@ def _check_seeds(seeds: Any, n_games: int, n_agents: int) -> None:
 
 
 def _plain(value: object) -> object:
-    """A parameter as JSON gives it back."""
+    """Convert a parameter to what JSON gives back."""
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
@@ -334,7 +334,7 @@ def make_vec_env(
     batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
     if backend == "native":
         return NativeVecEnv(batch, seed, render_mode)
-    # Games do not need the package that learns; this route through SuperSuit is the only one that does.
+    # Only this backend needs sb3_saf.
     from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 
     return SuperSuitVecEnv(partial(TASKS[batch.task], render_mode=render_mode, **params), n_envs, seed, n_cpus)

@@ -1,4 +1,4 @@
-"""A window on the screen, for watching and playing."""
+"""Window on the screen, for watching and playing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 Picture = npt.NDArray[np.uint8]
 
-#: How long a display may take to answer.
+#: Time limit for a display to answer.
 _DISPLAY_SECONDS: Final = 15.0
 _OTHER_WAYS: Final = (
     'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
@@ -23,12 +23,11 @@ _OTHER_WAYS: Final = (
 
 class HumanWindow:
     """
-    A window that shows pictures and collects keys; it opens with the first picture.
-
-    Once the person has closed it, pictures are dropped silently, so that a program that draws goes on running.
+    Window that shows pictures and collects keys; it opens with the first picture. After the person has closed it,
+    pictures are dropped silently, so that the program continues.
 
     :param title: text of the title bar
-    :param fps: most pictures per second, :meth:`show` waits if need be; None never waits
+    :param fps: maximum pictures per second, :meth:`show` waits if necessary; None never waits
     """
 
     def __init__(self, title: str = "HECOGrid", fps: float | None = None) -> None:
@@ -51,7 +50,7 @@ class HumanWindow:
 
         :param picture: (height, width, 3)
         :raises ImportError: if pygame is missing
-        :raises RuntimeError: if there is no display, or none that answers
+        :raises RuntimeError: if there is no display, or it does not answer
         """
         if self.closed_by_user:
             return
@@ -102,14 +101,14 @@ class HumanWindow:
                 self.close()
                 return
             if event.type == pygame.KEYDOWN:
-                # Keys of the number pad are called "[4]".
+                # Keys of the number pad have names such as "[4]".
                 self._keys.append(pygame.key.name(event.key).strip("[]"))
 
 
 def _import_pygame() -> ModuleType:
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
-        # Some versions of pygame warn about setuptools when imported; that is not the user's business.
+        # Some versions of pygame warn about setuptools when imported; users cannot act on that.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import pygame
@@ -120,9 +119,8 @@ def _import_pygame() -> ModuleType:
 
 def _start_display(pygame: ModuleType) -> None:
     """
-    Start the display, and refuse to draw for nobody.
-
-    Where there is no screen, SDL quietly takes a driver that shows nothing; only who asked for it shall get it.
+    Start the display, or raise RuntimeError without one. Without a screen, SDL silently selects a driver that shows
+    nothing; it is accepted only if requested explicitly.
     """
     _wait_for_display()
     try:
@@ -137,15 +135,15 @@ def _start_display(pygame: ModuleType) -> None:
 
 def _wait_for_display() -> None:
     """
-    Let another process open the display first: one that hangs, as behind a connection that broke, would hang this
-    process where not even Ctrl-C reaches it.
+    Open the display in another process first: a display that hangs, for example after a broken connection, would block
+    this process, even for Ctrl-C.
     """
     name = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY")
     if not name or not sys.platform.startswith("linux") or "SDL_VIDEODRIVER" in os.environ:
         return
     program = "import pygame; pygame.display.init()"
     try:
-        # What else may be wrong shows in this process, with its own message.
+        # Other errors occur again in this process, with their own message.
         subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=_DISPLAY_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
         raise RuntimeError(

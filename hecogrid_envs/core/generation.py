@@ -1,4 +1,4 @@
-"""A new level: treasures, clutter and keys on distinct cells, then the agents."""
+"""Generation of a new level: treasures, clutter and keys on distinct cells, then the agents."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def new_level(games: Games, world: World, e: int) -> None:
 
 @kernel
 def begin(games: Games, world: World, e: int) -> None:
-    """Begin an episode with the terrain, positions, directions and keys of game ``e``: all else follows from them."""
+    """Begin an episode with the present terrain, positions, directions and keys of game ``e``; derive the rest."""
     games.steps[e] = 0
     games.collected[e] = 0
     games.collected_now[e] = 0
@@ -47,7 +47,7 @@ def begin(games: Games, world: World, e: int) -> None:
 
 @kernel
 def _clear(games: Games, world: World, e: int) -> None:
-    """Empty map inside the outer wall, no keys in hands."""
+    """Empty the map inside the outer wall and take all keys from the agents."""
     width = world.width
     for cell in range(width * width):
         games.terrain[e, cell] = _EMPTY
@@ -93,7 +93,7 @@ def _place_agent(games: Games, world: World, e: int, agent: int) -> None:
 
 @hot
 def redraw(games: Games, world: World, e: int) -> None:
-    """Derive everything that views need from terrain and agents."""
+    """Derive the data that views need from terrain and agents."""
     bits = e * 4 * world.bits_bytes
     for i in range(4 * world.bits_bytes):
         games.wall_bits[np.uint64(bits + i)] = world.blank_bits[np.uint64(i)]
@@ -113,16 +113,16 @@ def redraw(games: Games, world: World, e: int) -> None:
 @inlined
 def _draw_terrain(games: Games, world: World, e: int) -> None:
     """
-    Write every cell inside the outer wall into the four planes, as if it looked the same from everywhere.
+    Write every cell inside the outer wall into the four planes, as if it looked the same from all directions.
 
-    The same as :func:`redraw_cell` for each, without a question per cell, whose answers no processor can guess.
+    Equivalent to :func:`redraw_cell` for each cell, without its unpredictable branch per cell.
     """
     stride = world.stride
     end = stride * stride - 1
     plane = e * 4 * world.plane_bytes
     for y in range(1, world.width - 1):
         cell = y * world.width + 1
-        # As in plane_offset: towards larger x, by ones in one orientation, by whole rows in the other.
+        # As in plane_offset: towards larger x, by one byte in one orientation, by whole rows in the other.
         along, across = plane_offset(world, 3, 1, y), plane_offset(world, 2, 1, y)
         for _ in range(world.width - 2):
             code = FIRST_TERRAIN + games.terrain[np.uint64(e), np.uint64(cell)]

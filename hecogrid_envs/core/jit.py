@@ -1,9 +1,9 @@
 """
-How kernels are compiled, and what NumPy's typed views cannot express: unaligned loads, stores and copies of words.
+Compiler decorators for kernels, and unaligned loads, stores and copies of words, which NumPy's typed views lack.
 
-Kernels are parts of one function, :func:`hecogrid_envs.core.play.play`, which numba keeps on disk.
-Parts have no wrappers for Python, since only kernels call them: that halves the time to compile. They are plain Python
-functions where Python calls them.
+Kernels are parts of one function, :func:`hecogrid_envs.core.play.play`, which numba caches on disk. Parts have no
+wrappers for Python, since only kernels call them: this halves the compile time. Called from Python, they are plain
+Python functions.
 """
 
 from __future__ import annotations
@@ -27,15 +27,14 @@ _NO_WRAPPERS: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def kernel(function: Function) -> Function:
-    """Compile a part that may slice and allocate: what happens once per episode."""
+    """Compile a part that runs once per episode; it may slice and allocate."""
     return _part(function)
 
 
 def hot(function: Function) -> Function:
     """
-    Compile an outer loop of every step.
-
-    It cannot slice or allocate: without reference counts, whose atomic increments cost more than the rules do.
+    Compile an outer loop that runs in every step. It cannot slice or allocate: reference counts are off, since their
+    atomic increments would cost more than the rules.
     """
     return _part(function, _nrt=False)
 
@@ -52,10 +51,10 @@ def _part(function: Function, **options: bool) -> Function:
 
 def source_key() -> int:
     """
-    Return a number that changes with every file that kernels are compiled from.
+    Return a hash of all files that kernels are compiled from.
 
-    Numba takes compiled code for fresh as long as the file of its function is unchanged and the function's closure
-    holds the same values, so the compiled function has this number in its closure.
+    Numba reuses cached code while the function's file and closure are unchanged, so the compiled function has this
+    number in its closure.
     """
     digest = hashlib.sha256()
     sources = [
@@ -113,7 +112,7 @@ def _copy(_typing: Any, to: Any, to_offset: Any, source: Any, source_offset: Any
     return types.boolean(to, types.int64, source, types.int64), codegen
 
 
-#: Functions for kernels: an intrinsic is called without the typing context that it is written with.
+#: Typed for callers in kernels, which do not pass the typing context.
 load_word: Callable[[npt.NDArray[np.uint8], int], np.uint64] = intrinsic(_load)  # type: ignore[assignment]
 store_word: Callable[[npt.NDArray[np.uint8], int, np.uint64], bool] = intrinsic(_store)  # type: ignore[assignment]
 copy_16: Callable[[npt.NDArray[np.uint8], int, npt.NDArray[np.uint8], int], bool] = intrinsic(_copy)  # type: ignore[assignment]

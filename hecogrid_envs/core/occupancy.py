@@ -1,4 +1,4 @@
-"""Agents by cell, in order of arrival, and the looks of every cell from the four directions."""
+"""Agents by cell, in order of arrival, and the tile codes of every cell for the four directions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KEY = int(Terrain.KEY)
 
 @inlined
 def arrive(games: Games, e: int, agent: int, cell: int) -> None:
-    """Put an agent last in the order of arrival of a cell."""
+    """Append an agent to the order of arrival of a cell."""
     last = games.tail[e, cell]
     games.before[e, agent] = last
     games.after[e, agent] = -1
@@ -29,7 +29,7 @@ def arrive(games: Games, e: int, agent: int, cell: int) -> None:
 
 @inlined
 def leave(games: Games, e: int, agent: int, cell: int) -> None:
-    """Take an agent out of its cell; if it was first, the next becomes first."""
+    """Remove an agent from its cell; if it was first, the next becomes first."""
     previous, following = games.before[e, agent], games.after[e, agent]
     if previous < 0:
         games.head[e, cell] = following
@@ -69,8 +69,7 @@ def count_near(games: Games, world: World, e: int, agent: int, old_x: int, old_y
     """
     Count the agents within ``support_radius`` of an agent, itself included.
 
-    The released rules count around the cell where its action began, (old_x, old_y), at that moment: the others have not
-    moved since.
+    The released rules count around the cell where its action began, (old_x, old_y); no other agent has moved since.
     """
     x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
     if not world.released:
@@ -94,7 +93,7 @@ def agent_code(ground: int, colour: int, direction: int) -> int:
 @inlined
 def plane_offset(world: World, facing: int, x: int, y: int) -> int:
     """
-    Return where a cell lies in the plane that is turned for a viewer facing ``facing``.
+    Return the offset of a cell in the plane that is turned for a viewer facing ``facing``.
 
     In each plane the viewer looks towards smaller rows and its right is towards larger columns, so opposite directions
     read the same plane from opposite ends.
@@ -110,7 +109,7 @@ def redraw_cell(games: Games, world: World, e: int, x: int, y: int) -> None:
     cell = y * world.width + x
     ground = games.terrain[e, cell]
     first = games.head[e, cell]
-    # Code of the cell as seen facing north, and by how much it turns for the other directions: a quarter each.
+    # Code of the cell as seen facing north; the other directions turn it by a quarter each.
     low = FIRST_TERRAIN + ground
     turn, step = 0, 0
     if first >= 0:

@@ -15,7 +15,7 @@ from hecogrid_envs.core.view import draw_pictures, observe_tiles
 
 
 def _compiled_play(sources: int) -> Any:
-    """Compile :func:`play` of :func:`~hecogrid_envs.core.jit.source_key`."""
+    """Compile :func:`play` for a source key (:func:`~hecogrid_envs.core.jit.source_key`)."""
 
     @njit(cache=True, nogil=True)
     def play(
@@ -25,10 +25,11 @@ def _compiled_play(sources: int) -> Any:
         Do one task for games ``first`` to ``end - 1``, n games.
 
         :param task: a sum of ``STEP``, ``RESTART`` (a new level for games that are over) or ``RESET`` (for those that
-            ``buffers.fresh`` marks), ``BEGIN`` (an episode from terrain, positions, directions and keys as they are),
-            ``REDRAW`` (what views are made of, from all else), and ``TILES`` or ``PICTURES``
+            ``buffers.fresh`` marks), ``BEGIN`` (an episode from the present terrain, positions, directions and keys),
+            ``REDRAW`` (derive the data of views), and ``TILES`` or ``PICTURES``
         :param views: (n * N * V * V,) codes or (n * N * V t * V t * 3,) pixels to write; empty if the task has no views
-        :param last_views: as ``views``, for the last views of games that are over, written nowhere else; empty for none
+        :param last_views: as ``views``; only rows of games that are over are written, with their final views; empty for
+            none
         """
         _key = sources  # read, so that it is part of the closure
         if task & STEP:
@@ -58,7 +59,7 @@ play: Final[Any] = _compiled_play(source_key())
 
 @kernel
 def _renew(games: Games, world: World, buffers: Buffers, task: int, last_views: U8, e: int) -> None:
-    """Give game ``e`` a new level, after writing its last views if they are wanted."""
+    """Write the final views of game ``e`` if requested, then give it a new level."""
     if len(last_views):
         _observe(games, world, buffers, task, last_views, e, e + 1)
     collected = games.collected_now[e]

@@ -1,8 +1,7 @@
 """
 Random numbers of games: their seeds, and the small generator that kernels draw from (SplitMix64, Steele et al. 2014).
 
-The generator's whole state is one word per game, so a game's future depends on its own past only, whoever its
-neighbours are.
+The generator's whole state is one word per game, so a game does not depend on the other games of its batch.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
 
-#: Game seeds stay within a signed 64-bit integer, so that every stack between here and a game carries them.
+#: Game seeds fit into a signed 64-bit integer, which all wrappers accept.
 _SEED_BITS = 63
 
 
@@ -28,14 +27,14 @@ def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
     """
     Return the seeds of the games of a vector environment.
 
-    Game ``i`` gets the same seed whatever the number of games, and the seeds of neighbouring runs
-    (``seed`` and ``seed + 1``) have nothing in common.
+    Game ``i`` gets the same seed for any number of games; seeds of neighbouring runs (``seed``, ``seed + 1``) are
+    unrelated.
 
     :param seed: the run's seed, 0 or larger
     :param n_games: E, number of games
     :param first: index of the first game
     :return: E integers below 2**63
-    :raises ValueError: for a seed that is none
+    :raises ValueError: for an invalid seed
     """
     check_seed(seed)
     return [_game_seed(seed, index) for index in range(first, first + n_games)]
@@ -47,7 +46,7 @@ def _game_seed(seed: int, index: int) -> int:
 
 
 def check_seed(seed: object) -> None:
-    """Raise ValueError unless a value is a seed: None or an integer of at least 0."""
+    """Raise ValueError unless a value is a valid seed: None or an integer of at least 0."""
     if seed is not None and (isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0):
         raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
 
@@ -65,7 +64,7 @@ def generator_word(seed: int) -> np.uint64:
 
 
 def fresh_seed() -> int:
-    """Draw a seed from the operating system, for games that nobody seeded; no global generator is touched."""
+    """Draw a seed from the operating system, for unseeded games; no global generator is used."""
     return secrets.randbits(_SEED_BITS)
 
 
@@ -81,7 +80,7 @@ def next_word(rng: npt.NDArray[np.uint64], game: int) -> np.uint64:
 
 @inlined
 def below(rng: npt.NDArray[np.uint64], game: int, n: int) -> int:
-    """Draw an integer from 0 to n - 1, every one equally likely (Lemire 2019); n < 2**32."""
+    """Draw an integer uniformly from 0 to n - 1 (Lemire 2019); n < 2**32."""
     bound = np.uint64(n)
     product = (next_word(rng, game) >> np.uint64(32)) * bound
     low = product & _LOW_32

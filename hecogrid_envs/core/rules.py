@@ -1,4 +1,4 @@
-"""One agent's action: movement, keys, collecting. Reads as the rule book does."""
+"""One agent's action: movement, keys, collecting; in the order of the rule book."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def _choice_of(conditions: Sequence[Condition]) -> NumberedCondition:
     return choice
 
 
-#: Of the tasks that are declared when this module is imported: when the first game is made.
+#: Covers the tasks declared before this module is imported, which happens when the first game is made.
 _condition = _choice_of([task.condition for task in DECLARED.values()])
 
 
 @inlined
 def act(games: Games, world: World, e: int, agent: int, action: int) -> None:
-    """Let one agent act; it sees the effects of those who acted before it."""
+    """Perform one agent's action; effects of agents that acted before it are visible to it."""
     command = world.command_of[world.zone_of_column[games.x[e, agent]], action]
     if world.released:
         # Others see the agent as it was when it acted, before its action.

@@ -15,11 +15,11 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 U64 = npt.NDArray[np.uint64]
 
-#: Any whole number as the integer of kernels' loops; each other type of an argument would compile the kernel once more.
+#: Converts to the integer type of kernels' loops; any other argument type would compile the kernel again.
 whole: Callable[[Any], int] = np.int64  # type: ignore[assignment]
 
 
-#: What :func:`hecogrid_envs.core.play.play` does: any sum of these, done in this order.
+#: Tasks of :func:`hecogrid_envs.core.play.play`: any sum of these, done in this order.
 STEP: Final = 1
 RESTART: Final = 2
 RESET: Final = 4
@@ -31,7 +31,7 @@ PICTURES: Final = 64
 
 class World(NamedTuple):
     """
-    What all games of a batch share. W = grid size, N = agents, V = view size, t = tile size, Z = zones.
+    Data that all games of a batch share. W = grid size, N = agents, V = view size, t = tile size, Z = zones.
 
     :param condition: number of the task's condition for collecting, in the order of the registered tasks
     :param released: whether the released rules hold
@@ -45,11 +45,12 @@ class World(NamedTuple):
     :param zone_colour: (Z,) palette index of an agent
     :param key_colour: palette index of an agent with a key
     :param first_colour: palette index of all agents after a reset, or -1 for their present colour
-    :param blank_planes: (4 * plane_bytes,) the planes of a map with its outer wall and nothing else
+    :param blank_planes: (4 * plane_bytes,) the planes of a map with only its outer wall
     :param blank_bits: (4 * bits_bytes,) its wall bits
     :param spread: (256,) word whose byte i is 0xFF where bit i of the index is set
-    :param swept: (4 ** V,) what light does in one row of a view of at most eight columns: the index is the row's clear
-        cells times 2 ** V plus its lit cells before, the entry its lit cells after and, 8 bits higher, the next row's
+    :param swept: (4 ** V,) visibility table for one row of a view of at most eight columns: the index is the row's
+        clear cells times 2 ** V plus its lit cells before the sweep, the entry its lit cells after it and, 8 bits
+        higher, those of the next row
     :param tile: t
     :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction, and slack for whole chunks
     :param turn_bytes: bytes from one direction's tiles to the next; 0 if all directions may share the first
@@ -101,7 +102,7 @@ class Games(NamedTuple):
     :param y: (E, N) row of each agent
     :param direction: (E, N)
     :param has_key: (E, N) 0 or 1
-    :param colour: (E, N) palette index in which others see the agent
+    :param colour: (E, N) palette index of the agent in views of other agents
     :param order: (E, N) order in which agents acted in the last step
     :param sight: (E * N * V,) bit i of word j: whether the agent sees column i of row j of its view
     :param sight_known: (E, N) 0 where ``sight`` must be computed anew
@@ -136,11 +137,11 @@ class Games(NamedTuple):
 
 class Buffers(NamedTuple):
     """
-    What a batch keeps beside its games. E games, N agents, V = view size.
+    Working memory of a batch. E games, N agents, V = view size.
 
     :param actions: (E * N,) what agents do in the next step, 0 to 6
-    :param fresh: (E,) 1 for games that ``RESET`` is to give a new level, or to which ``RESTART`` gave one, 0 for others
-    :param codes: (E * N * V * V,) where views in tile codes are kept on the way to pixels
+    :param fresh: (E,) 1 for games that ``RESET`` will reset or that ``RESTART`` has reset, 0 for others
+    :param codes: (E * N * V * V,) views in tile codes before they become pixels
     """
 
     actions: U8

@@ -49,7 +49,7 @@ def _spread_left(seen: np.uint64, clear: np.uint64, size: int) -> np.uint64:
 @inlined
 def look(games: Games, world: World, e: int, agent: int) -> None:
     """
-    Compute which cells of its view an agent sees and keep it in ``games.sight``.
+    Compute which cells of its view an agent sees, and store them in ``games.sight``.
 
     Rows are words, bit i is column i. The sweeps of the rule book go from the agent's column to the last column,
     then from one beyond the agent's column down to column 1; a cell that is lit and clear lights its neighbour in the
@@ -66,8 +66,8 @@ def look(games: Games, world: World, e: int, agent: int) -> None:
     for row in range(size):
         games.sight[np.uint64(words + row)] = 0
     games.sight[np.uint64(words + own_row)] = _ONE << np.uint64(own_column)
-    # Upwards from the agent's row, then downwards from it. Row 0 hands on to no row and is not swept;
-    # the rows behind the agent are dark until the second pass.
+    # Upwards from the agent's row, then downwards from it. Row 0 is not swept, since it has no next row; the rows
+    # behind the agent are dark until the second pass.
     for sweep in range(2):
         row = own_row
         while (sweep == 0 and row >= 1) or (sweep == 1 and row < size):
@@ -113,7 +113,7 @@ def observe_tiles(games: Games, world: World, out: U8, first: int, last: int) ->
                     codes = load_word(games.planes, source + row * world.stride + _WORD_BYTES * k) & mask
                     to = start + row * size + _WORD_BYTES * k
                     if to + _WORD_BYTES <= end:
-                        # Writes past the row's end; the next row or view, written later, repairs it.
+                        # Writes past the row's end; the next row or view, written later, overwrites that.
                         store_word(out, to, codes)
                     else:
                         for i in range(min(end - to, size - _WORD_BYTES * k)):
@@ -130,7 +130,7 @@ def draw_pictures(
     """
     Turn the views of games ``first`` to ``last - 1`` into pixels.
 
-    The arguments are few, and not all of a batch, so that the innermost loops find them in registers.
+    It takes only the arrays it needs, so that the innermost loops keep them in registers.
 
     :param codes: (n * N * V * V,) their tile codes, n = last - first
     :param directions: (E, N) that agents face
@@ -142,7 +142,8 @@ def draw_pictures(
     """
     n_agents = directions.shape[1]
     line, tile_bytes = 3 * tile, 3 * tile * tile
-    # As many views as a chunk may reach into are drawn line by line: nothing repairs what lies beyond the last.
+    # The last views, as many as a chunk may reach into, are drawn line by line: nothing overwrites the excess after
+    # them.
     repairing = 1 + (_CHUNK_BYTES - 1) // (size * size * tile_bytes)
     n_quick = (last - first) * n_agents - repairing if line <= _CHUNK_BYTES else 0
     view = 0
@@ -155,9 +156,9 @@ def draw_pictures(
                 for pixel_row in range(tile):
                     source = turned + pixel_row * line
                     if view < n_quick:
-                        # Each copy takes more than a tile's line; what comes next, written later, repairs it.
+                        # Each copy writes more than a tile's line; later copies overwrite the excess.
                         for column in range(size):
-                            # An unsigned index spares the check for counting from the end.
+                            # An unsigned index avoids the check for negative indices.
                             copy_16(out, to, atlas, source + whole(codes[np.uint64(cell + column)]) * tile_bytes)
                             to += line
                     else:
@@ -169,7 +170,7 @@ def draw_pictures(
 
 @inlined
 def _copy_line(out: U8, to: int, atlas: U8, source: int, line: int) -> None:
-    """Copy one line of a tile and nothing beyond it."""
+    """Copy exactly one line of a tile."""
     if line < _WORD_BYTES:
         for k in range(line):
             out[to + k] = atlas[source + k]

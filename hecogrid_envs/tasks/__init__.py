@@ -37,7 +37,7 @@ def env(task: str, render_mode: RenderMode | None = None, **params: Any) -> Any:
     """
     Make one game in PettingZoo's turn-based (AEC) form.
 
-    Agents choose in index order; the game step happens when the last has chosen.
+    Agents act in index order; the game step is played when the last has chosen its action.
     """
     return TASKS[check_task(task)].turn_based(render_mode=render_mode, **params)
 
