@@ -1,1 +1,1 @@
-"""From environments to the rows that policies read: vector environments, the joint observation, the monitor."""
+"""Environments as rows for policies: vector environments, the joint observation, the monitor."""

@@ -1,4 +1,4 @@
-"""Train on one level of a game after another: games of the next stage take the place of those of the last one."""
+"""Curriculum: train on the games of several stages, one stage after the other."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from sb3_saf.envs.teams import TeamVecEnvWrapper, check_count
 
 class Stage(NamedTuple):
     """
-    A level to train on for a while.
+    One stage of a curriculum.
 
-    :param game_steps: how long, in game steps summed over all parallel games
-    :param params: parameters of the game that differ from those that it has at last, ``{"coordination": 1}``
+    :param game_steps: length of the stage in game steps summed over all parallel games
+    :param params: parameters of the game that differ from those of the final stage, such as ``{"coordination": 1}``
     """
 
     game_steps: int
@@ -29,11 +29,11 @@ class Stage(NamedTuple):
 
 class Curriculum(TeamVecEnvWrapper):
     """
-    Games of several stages, one stage after the other; the last stage goes on to the end.
+    Vector environment that plays the games of several stages in turn; the last stage has no end.
 
-    Where a stage ends, episodes that are not over are truncated as by a time limit, with ``TimeLimit.truncated`` and
-    ``terminal_observation`` in their infos; so a rollout may begin in one stage and end in the next. Attributes,
-    methods and seeds are those of the games of the present stage.
+    At the end of a stage, running episodes are truncated as by a time limit, with ``TimeLimit.truncated`` and
+    ``terminal_observation`` in their infos; a rollout may therefore span two stages. Attributes, methods and seeds are
+    those of the games of the present stage.
 
     :param stages: vector environments with equal spaces and rows; closed with this one
     :param game_steps: of every stage but the last, in game steps summed over all parallel games
@@ -65,7 +65,7 @@ class Curriculum(TeamVecEnvWrapper):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
-        Choose the seeds of the games of all stages; each stage has its own, the first one those of ``seed``.
+        Set the seeds of the games of all stages; each stage has different seeds, the first one those of ``seed``.
 
         :return: (B,) the seed of each row's game in the present stage
         """
@@ -90,11 +90,11 @@ class Curriculum(TeamVecEnvWrapper):
         self.venv = self.stages[stage]
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """How far the curriculum is; the state of the games is theirs to give."""
+        """Return the position in the curriculum, without the state of the games."""
         return {"ends": list(self.ends), "game_steps": self.game_steps}
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that this curriculum could be there."""
+        """Check that a state is valid for this curriculum."""
         if state["ends"] != list(self.ends):
             raise ValueError(f"expected stages that end at game steps {list(self.ends)}, got {state['ends']!r:.80}")
         check_whole(state["game_steps"], "the game steps of a curriculum")
@@ -102,7 +102,7 @@ class Curriculum(TeamVecEnvWrapper):
             raise ValueError(f"expected game_steps to be a multiple of {self.n_games}, got {state['game_steps']}")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state of :meth:`checkpoint_state`."""
         self.game_steps = state["game_steps"]
         self._enter(self._present_stage())
 
@@ -117,14 +117,14 @@ class Curriculum(TeamVecEnvWrapper):
 
 
 def _seed_of_stage(seed: int | None, number: int) -> int | None:
-    """Return a seed for each stage, so that a stage does not begin on the levels of the one before."""
+    """Return the seed of a stage; stages differ, so that they do not repeat each other's levels."""
     if seed is None or number == 0:
         return seed
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0])
 
 
 def _truncated(obs: VecEnvObs, dones: npt.NDArray[np.bool_], infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return infos in which every episode ends, those that were not over by truncation."""
+    """Return infos in which every episode ends; running episodes are truncated."""
     ended = []
     for row, (done, info) in enumerate(zip(dones, infos, strict=True)):
         if done:

@@ -1,8 +1,8 @@
 """
-Copies of games in progress: how a game gives its state, and whether a copy plays on as the game itself does.
+Copies of games in progress: how a game's state is copied, and whether the copy continues like the original.
 
-A game with ``get_state()`` and ``set_state(state)`` gives plain data. Any other one is pickled. Unpickling runs code
-from the file, so pickled games are signed with a key that only the user has, and others are refused.
+A game with ``get_state()`` and ``set_state(state)`` gives plain data; any other game is pickled. Unpickling runs code
+from the file, so pickled games are signed with the user's private key; unsigned ones are refused.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from sb3_saf.errors import CheckpointError
 if TYPE_CHECKING:
     from sb3_saf.envs.supersuit_game import TeamMarkovVectorEnv
 
-#: How a game gives its state: by its own methods, or by being pickled.
+#: How a game is copied: by its own methods, or by pickling.
 Way = Literal["get_state", "pickle"]
 
-#: Steps that a game plays before it is copied, and game and copy after that.
+#: Steps that a game plays before it is copied, and that game and copy play afterwards.
 TRIAL_STEPS: Final = 30
-#: Seconds after which a slow game stops playing, each time.
+#: Time limit in seconds for each of the two.
 TRIAL_SECONDS: Final = 2.0
 
 _KEY_BYTES: Final = 32
 
 
 class ForeignGamesError(CheckpointError):
-    """Pickled games that this user has not written."""
+    """Raised for pickled games without this user's signature."""
 
 
 # --- pickled games ----------------------------------------------------------------------------------------------------
@@ -64,10 +64,10 @@ class _Place(NamedTuple):
 
 class _Pickler(cloudpickle.Pickler):
     """
-    A pickler that also takes the state of :class:`gymnasium.utils.EzPickle`, which keeps constructor arguments.
+    Pickler that also stores the state of :class:`gymnasium.utils.EzPickle`, which stores constructor arguments only.
 
     :param file: to write to
-    :param left_out: objects that the game into which the state is loaded has of its own, by their ids
+    :param left_out: objects, by id, that are taken from the game into which the state is loaded
     """
 
     def __init__(self, file: BytesIO, left_out: Mapping[int, _Place]) -> None:
@@ -80,7 +80,7 @@ class _Pickler(cloudpickle.Pickler):
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
-            # Attributes are set one by one, past the class's own __setstate__.
+            # Attributes are set one by one, without the class's own __setstate__.
             return copyreg.__newobj__, (type(obj),), dict(vars(obj)), None, None, _set_attributes  # type: ignore[attr-defined]
         return super().reducer_override(obj)
 
@@ -91,10 +91,10 @@ def _set_attributes(obj: object, attributes: dict[str, Any]) -> None:
 
 class _Unpickler(pickle.Unpickler):
     """
-    Reads what :class:`_Pickler` wrote.
+    Unpickler for the output of :class:`_Pickler`.
 
-    :param data: what it wrote
-    :param game: has the objects that were left out
+    :param data: output of the pickler
+    :param game: provides the objects that were left out
     """
 
     def __init__(self, data: bytes, game: Any) -> None:
@@ -107,10 +107,10 @@ class _Unpickler(pickle.Unpickler):
 
 def pickled(game: Any) -> npt.NDArray[np.uint8]:
     """
-    Pickle a game, and the global generators of this process, from which it may draw.
+    Pickle a game and the global random generators of this process, which the game may use.
 
-    Attributes that cannot be pickled (fonts, surfaces, windows) are left out: a new game has its own. Whether a game is
-    itself without them is shown by :func:`find_way`.
+    Attributes that cannot be pickled (fonts, surfaces, windows) are left out and taken from a new game;
+    :func:`find_way` tests that the game behaves equally.
     """
     try:
         data = _dump((game, _global_generators()), {})
@@ -121,9 +121,9 @@ def pickled(game: Any) -> npt.NDArray[np.uint8]:
 
 def unpickled(data: npt.NDArray[np.uint8], game: Any) -> Any:
     """
-    Unpickle a game, and let the global generators go on from where they were; only for what is signed.
+    Unpickle a game and restore the global random generators; only for signed data.
 
-    :param data: what :func:`pickled` gave
+    :param data: result of :func:`pickled`
     :param game: made in the same way
     """
     found, generators = _Unpickler(data.tobytes(), game).load()
@@ -173,14 +173,14 @@ def _kept_generators() -> Iterator[None]:
 
 
 def key_file() -> Path:
-    """Return where the user's key is kept, made at its first use."""
+    """Return the path of the user's key, which is created at first use."""
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(home) / "sb3_saf" / "key"
 
 
 @cache
 def _key(path: Path) -> bytes:
-    """Return the user's key; one for this process alone if none can be kept."""
+    """Return the user's key, or a key for this process only if it cannot be stored."""
     new = secrets.token_bytes(_KEY_BYTES)
     temporary = path.with_name(f".key-{os.getpid()}-{secrets.token_hex(4)}")
     with suppress(OSError):
@@ -189,7 +189,7 @@ def _key(path: Path) -> bytes:
             with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
                 file.write(new)
             try:
-                os.link(temporary, path)  # whole, and only if another process has not been faster
+                os.link(temporary, path)  # atomic; fails if another process was faster
             finally:
                 temporary.unlink()
     with suppress(OSError):
@@ -205,7 +205,7 @@ def signature(data: npt.NDArray[np.uint8]) -> str:
 
 
 def check_signature(data: npt.NDArray[np.uint8], signed: object) -> None:
-    """Raise ForeignGamesError, with what to do, unless this user has signed a pickled game."""
+    """Raise ForeignGamesError unless this user has signed a pickled game."""
     if not isinstance(signed, str) or not hmac.compare_digest(signature(data), signed):
         raise ForeignGamesError(
             "its games are pickled and were not signed with this user's key, and unpickling a stranger's file runs "
@@ -226,7 +226,7 @@ def pickled_games(tree: Any) -> Iterator[dict[str, Any]]:
 
 
 def sign_games(tree: Any) -> None:
-    """Sign all pickled games of a checkpoint: the user trusts who wrote it."""
+    """Sign all pickled games of a checkpoint whose source the user trusts."""
     for game in pickled_games(tree):
         game["signature"] = signature(game["pickled"])
 
@@ -236,12 +236,12 @@ def sign_games(tree: Any) -> None:
 
 def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
     """
-    Find out how games give a state from which a copy plays on in the same way.
+    Return a way of copying after which the copy continues like the original.
 
-    A new game plays some steps and is copied; then both play the same actions, and begin another episode.
+    A new game plays some steps and is copied; both then play the same actions and begin another episode.
 
-    :param make_game: makes a game to try it with
-    :raises CheckpointError: if there is no such way, saying what is different
+    :param make_game: makes a game for the trial
+    :raises CheckpointError: if there is no such way, with the difference found
     """
     reasons = []
     with _kept_generators():
@@ -258,7 +258,7 @@ def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
 
 
 def _trial(make_game: Callable[[], TeamMarkovVectorEnv], way: Way) -> str | None:
-    """Return why a way does not do."""
+    """Return why a way fails, or None."""
     original, copy = make_game(), make_game()
     try:
         reason = _difference(original, copy, way)
@@ -274,13 +274,13 @@ def _trial(make_game: Callable[[], TeamMarkovVectorEnv], way: Way) -> str | None
 
 
 def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: Way) -> str | None:
-    """Return in what a game and its copy differ."""
+    """Return the first difference between a game and its copy, or None."""
     rows, _ = _play(original, original.reset(seed=0)[0], TRIAL_STEPS)
     copy.restore(decode(encode(original.snapshot(way), "trial")))
     began = _global_generators()
     _, seen = _play(original, rows, TRIAL_STEPS)
     seen.append(_bytes_of(original.reset()[0]))
-    if way == "pickle":  # which takes the generators along
+    if way == "pickle":  # includes the global generators
         _set_global_generators(began)
     _, seen_by_copy = _play(copy, rows, len(seen) - 1, math.inf)
     seen_by_copy.append(_bytes_of(copy.reset()[0]))
@@ -296,10 +296,10 @@ def _play(
     """
     Play random legal actions, the same in each call.
 
-    :param rows: observations that actions are for
+    :param rows: present observations
     :param n_steps: steps to play
-    :param seconds: after which fewer will do
-    :return: the last observations, and what was seen in each step
+    :param seconds: time limit, after which playing stops early
+    :return: the last observations, and the serialised result of each step
     """
     space = deepcopy(game.action_space)
     space.seed(0)

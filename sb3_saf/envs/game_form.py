@@ -1,4 +1,4 @@
-"""What is known of a PettingZoo game before it is played: agents, spaces, and which signals it gives beside rewards."""
+"""Static description of a PettingZoo game: agents, spaces, and the signals it gives besides rewards."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from sb3_saf.envs.teams import ACTION_MASK_KEY, FIXED_SHAPE
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
 
-#: Where a game tells legal actions: in observations of the form {"observation", "action_mask"}, or in infos.
+#: Where a game gives action masks: in observations of the form {"observation", "action_mask"}, or in infos.
 MaskSource = Literal["observation", "info"]
-#: Whether to look for action masks: where there are any, always, never.
+#: Whether to use action masks: if there are any, always (required), never.
 AskMasks: TypeAlias = Literal["auto"] | bool
 
-#: Where an agent's own observation is in observations of PettingZoo's form for masks.
+#: Key of the agent's own observation in PettingZoo's form for masks.
 OBSERVATION: Final = "observation"
 
 
 class Signals(NamedTuple):
     """
-    What rows shall show beside own observations; see :class:`~sb3_saf.envs.supersuit_vec_env.SuperSuitVecEnv`.
+    Signals requested besides own observations; see :class:`~sb3_saf.envs.supersuit_vec_env.SuperSuitVecEnv`.
 
     :param active: whether agents take part
-    :param action_masks: ``"auto"`` for masks where there are any, True to insist on them, False for none; None for
-        observations as they are
+    :param action_masks: ``"auto"`` for masks if there are any, True to require them, False for none; None leaves
+        observations unchanged
     :param state: the game's state
     """
 
@@ -49,15 +49,15 @@ class Signals(NamedTuple):
 
 class GameForm(NamedTuple):
     """
-    What all copies of a game share.
+    Properties that all copies of a game share.
 
     :param agents: N names, in the order of the rows
-    :param own: space of an agent's own observation as the game gives it, without masks
+    :param own: the game's space of an agent's own observation, without masks
     :param action_space: of every agent
     :param rows: parts of a row's observation
-    :param has_masks_inside: whether observations have the form {"observation", "action_mask"}, to be taken apart
-    :param masks: where masks come from, None for no masks
-    :param state: space of ``state()`` as the game gives it, None where rows have no state
+    :param has_masks_inside: whether observations have the form {"observation", "action_mask"} and must be split
+    :param masks: source of the masks, None for no masks
+    :param state: the game's space of ``state()``, None if rows have no state
     :param is_flattened: whether a Dict or Tuple becomes a vector
     """
 
@@ -71,18 +71,18 @@ class GameForm(NamedTuple):
     is_flattened: bool = False
 
     def own_reader(self, notes: list[str]) -> SpaceReader:
-        """Return what checks own observations."""
+        """Return the reader that checks own observations."""
         return (FlatReader if self.is_flattened else SpaceReader)(self.own, notes)
 
 
 def game_form(example: Any, first_infos: Callable[[], Mapping[Any, Any]], signals: Signals) -> GameForm:
     """
-    Find out the form of a game.
+    Determine the form of a game.
 
     :param example: the game
-    :param first_infos: returns the infos of a reset of a copy; called if it may tell of masks
-    :param signals: asked for
-    :raises ValueError: if agents differ in their spaces, a space cannot be in rows, or a signal is not there
+    :param first_infos: returns the infos of a reset of a copy; called only if these may hold masks
+    :param signals: requested signals
+    :raises ValueError: if agents differ in their spaces, a space cannot be in rows, or a signal is missing
     """
     active, action_masks, state = signals
     agents = tuple(example.possible_agents)
@@ -106,11 +106,11 @@ def game_form(example: Any, first_infos: Callable[[], Mapping[Any, Any]], signal
 
 def check_is_parallel(env: Any, is_factory: bool) -> None:
     """
-    Check that something is a ParallelEnv with named agents.
+    Check that an object is a ParallelEnv with named agents.
 
-    :param env: what was given, or what a factory returned
+    :param env: the argument of the user, or what a factory returned
     :param is_factory: whether a factory returned it
-    :raises ValueError: with what to do
+    :raises ValueError: if it is not, with a fix
     """
     origin = "a function that returned " if is_factory else ""
     if isinstance(env, AECEnv):
@@ -136,7 +136,7 @@ def check_is_parallel(env: Any, is_factory: bool) -> None:
 
 
 def _common_space(kind: str, agents: Sequence[Any], space_of: Callable[[Any], spaces.Space[Any]]) -> spaces.Space[Any]:
-    """Return the one space of all agents."""
+    """Return the space of all agents; raise ValueError if they differ."""
     if not callable(space_of):
         raise ValueError(
             f"expected {kind}_space(agent) to be a method that gives an agent's space, got {type(space_of).__name__}; "
@@ -213,7 +213,7 @@ def _state_space(example: Any) -> spaces.Space[Any]:
 
 
 def first_infos_of(build: Callable[[], Any]) -> Mapping[Any, Any]:
-    """Return the infos of a reset, of a copy that ``build`` makes and that is closed again."""
+    """Return the infos of a reset of a temporary copy made by ``build``."""
     env = build()
     try:
         return parallel_calls.reset(env, seed=0, options=None)[1]

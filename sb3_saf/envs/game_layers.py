@@ -1,4 +1,4 @@
-"""What can be asked of a PettingZoo game and of the wrappers around it: attributes, methods, action masks."""
+"""Access to attributes, methods and action masks of a PettingZoo game and of its wrappers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _MISSING = object()
 
 
 def layers_of(env: Any) -> list[Any]:
-    """Return the environment, what it wraps, and so on to the bare game."""
+    """Return the environment and all that it wraps, down to the bare game."""
     layers: list[Any] = [env]
     while True:
-        # Not getattr: PettingZoo's wrappers pass unknown names on to what they wrap.
+        # Not getattr: PettingZoo's wrappers forward unknown names to the environment they wrap.
         own = getattr(layers[-1], "__dict__", {})
         inner = own.get("env", own.get("aec_env"))
         if inner is None:
@@ -44,7 +44,7 @@ def call_method(env: Any, name: str, args: Sequence[Any], kwargs: Mapping[str, A
 
 
 def set_attribute(env: Any, name: str, value: Any) -> None:
-    """Set an attribute on the outermost layer that has it of its own, else on the bare game."""
+    """Set an attribute on the outermost layer that has it itself, else on the bare game."""
     layers = layers_of(env)
     owners = (layer for layer in layers if name in getattr(layer, "__dict__", {}) or hasattr(type(layer), name))
     setattr(next(owners, layers[-1]), name, value)
@@ -52,13 +52,13 @@ def set_attribute(env: Any, name: str, value: Any) -> None:
 
 def is_wrapped(env: Any, module: str, qualname: str) -> bool:
     """
-    Return whether a wrapper of a class, or of a class derived from it, is around the game.
+    Return whether the game is wrapped in a class or in a subclass of it.
 
-    Classes are compared by name, because a class that was sent to another process may be a copy.
+    Classes are compared by name, since pickling may have copied the class in another process.
 
     :param env: the outermost layer
-    :param module: of the class
-    :param qualname: of the class
+    :param module: module of the class
+    :param qualname: qualified name of the class
     """
     classes = {kind for layer in layers_of(env) for kind in type(layer).__mro__}
     return any((kind.__module__, kind.__qualname__) == (module, qualname) for kind in classes)
@@ -66,11 +66,11 @@ def is_wrapped(env: Any, module: str, qualname: str) -> bool:
 
 def action_masks(env: Any, agents: Sequence[Any]) -> list[Any]:
     """
-    Ask a game for the masks of its agents with its method ``action_masks``.
+    Return the masks of the game's method ``action_masks``.
 
     :param env: the outermost layer
     :param agents: N names
-    :return: N masks. Of agents that a dict of masks leaves out, because they have ended, any action is legal
+    :return: N masks. For ended agents, which a dict of masks leaves out, any action is legal
     """
     masks = get_attribute(env, "action_masks")()
     if not isinstance(masks, Mapping):

@@ -16,16 +16,16 @@ IS_SUCCESS = "is_success"
 
 class GymnasiumTeam(ParallelEnv[str, Any, Any]):
     """
-    A Gymnasium environment of several agents (``spaces.Tuple`` of observations and of actions, one reward per agent),
-    as level-based foraging and the multi-robot warehouse are, as a PettingZoo ParallelEnv.
+    PettingZoo ParallelEnv around a Gymnasium environment of several agents (``spaces.Tuple`` of observations and of
+    actions, one reward per agent), such as level-based foraging and the multi-robot warehouse.
 
     Agents are ``"agent_0"``, ``"agent_1"``, ... and end together. Each gets a copy of the environment's info, where a
     list of N masks in ``info["action_mask"]`` becomes the agent's own mask.
 
-    :param env: the environment; ``make_team_env`` wraps such environments by itself
-    :param is_ended: tells of an environment that reports its time limit as an end whether the episode has truly ended;
-        None believes what it reports
-    :param is_success: tells at the end of an episode whether the team has won; None if there is no such thing
+    :param env: the environment; ``make_team_env`` wraps such environments automatically
+    :param is_ended: for an environment that reports its time limit as termination: returns whether the episode has
+        truly terminated; None uses what the environment reports
+    :param is_success: returns at the end of an episode whether the team has won; None if success is not defined
     :raises ValueError: if its spaces are not Tuples of one entry per agent
     """
 
@@ -86,7 +86,7 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         )
 
     def render(self) -> Any:
-        """Return what the environment draws."""
+        """Return the environment's rendering."""
         return self.env.render()
 
     def close(self) -> None:
@@ -110,7 +110,7 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
 
 
 def is_gymnasium_team(env: object) -> bool:
-    """Return whether something is a Gymnasium environment with one action per agent."""
+    """Return whether an object is a Gymnasium environment with one action per agent."""
     return isinstance(env, gym.Env) and isinstance(getattr(env, "action_space", None), spaces.Tuple)
 
 
@@ -130,5 +130,5 @@ def check_is_team(env: gym.Env[Any, Any]) -> None:
 
 
 def make_gymnasium(env_id: str, render_mode: str | None, params: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    """Make an environment of Gymnasium's registry without checks and wrappers that are meant for one agent."""
+    """Make an environment of Gymnasium's registry without the checks and wrappers for a single agent."""
     return gym.make(env_id, render_mode=render_mode, disable_env_checker=True, **params)

@@ -1,4 +1,4 @@
-"""The joint observation: each row carries what a centralised critic needs beside the agent's own observation."""
+"""Joint observation: each row holds the agent's own observation and the inputs of a centralised critic."""
 
 from __future__ import annotations
 
@@ -37,46 +37,46 @@ TIME_LIMITS: Final[tuple[TimeLimit, ...]] = get_args(TimeLimit)
 
 TERMINAL_OBSERVATION: Final = "terminal_observation"
 TRUNCATED: Final = "TimeLimit.truncated"
-#: The method that sb3-contrib calls.
+#: Name of the method that sb3-contrib calls.
 _ACTION_MASKS: Final = "action_masks"
 
 
 class CentralizedValueWrapper(TeamVecEnvWrapper):
     """
-    Turn the rows of flattened teams into rows that a centralised critic can evaluate one by one.
+    Extend rows of flattened teams so that a centralised critic can evaluate each row by itself.
 
     The observation of a row becomes a Dict:
 
     ========= ================ ======================================================================
     key       shape of a row   content
     ========= ================ ======================================================================
-    ``obs``   ``(*shape)``     the agent's own observation, all that its policy may read
+    ``obs``   ``(*shape)``     the agent's own observation, the only input of its policy
     ``team``  ``(N, *shape)``  own observations of all agents of its team, in index order (always a Box)
     ``agent`` ``()``           index of the agent in its team, Discrete(N)
     ========= ================ ======================================================================
 
-    Environments that give signals get more keys (:class:`RowSpaces` says how a VecEnv gives them; ``make_team_env``
+    Environments with signals have more keys (:class:`RowSpaces` defines how a VecEnv provides them; ``make_team_env``
     does so for any PettingZoo environment):
 
     =============== ============== ================================================================================
     key             shape of a row content
     =============== ============== ================================================================================
     ``active``      ``(N,)``       1 for the agents of its team that take part, in index order (MultiBinary)
-    ``action_mask`` ``(A,)``       1 for its legal actions (MultiBinary); an agent that takes no part has action 0
+    ``action_mask`` ``(A,)``       1 for its legal actions (MultiBinary); an inactive agent has action 0
     ``state``       ``(*state)``   the state of its game, the same in all rows of the game
     =============== ============== ================================================================================
 
-    Shuffled minibatches, ``predict_values`` on a single row and SB3's own buffers are therefore all correct.
+    Shuffled minibatches, ``predict_values`` on a single row and SB3's own buffers are therefore correct.
 
-    Images (3-D, uint8, 0 to 255) with channels last are transposed here, once, to channels first, and SB3 adds no
-    transposition of its own. A space with an attribute ``atlas`` holds codes, not pixels: it is passed on as it is.
-    The arrays of one step are never written to by a later one.
+    Channel-last images (3-D, uint8, 0 to 255) are transposed to channels first here, once; SB3 adds no
+    VecTransposeImage. A space with an attribute ``atlas`` holds codes, not pixels, and is left unchanged. Returned
+    arrays are not modified by later steps.
 
     :param venv: rows of flattened teams, game-major, then agent
-    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
-    :param time_limit: ``"terminal"`` treats a time limit as a true end (as in the paper's experiments);
-        ``"bootstrap"`` lets the algorithm add the value of the last observation where the env sets
-        ``"TimeLimit.truncated"``
+    :param n_agents: N; None uses the attribute ``n_agents`` of ``venv``
+
+    :param time_limit: ``"terminal"`` treats a time limit as a true end (as in the paper's experiments); ``"bootstrap"``
+        lets the algorithm add the value of the last observation where the env sets ``"TimeLimit.truncated"``
     :raises ValueError: if N is unknown or does not divide the rows, the observation space is a Tuple or a Dict of
         other keys, or ``time_limit`` is neither of the two
     """
@@ -111,12 +111,12 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """
-        Call a method of the rows' games; ``action_masks``, which MaskablePPO asks for, also where observations have
-        ``action_mask`` and the games have no such method.
+        Call a method of the rows' games; ``action_masks``, which MaskablePPO calls, is answered from the observations
+        if these have ``action_mask`` and the games have no such method.
 
-        :param method_name: of the game
+        :param method_name: name of the method
         :param method_args: positional arguments
-        :param indices: rows
+        :param indices: rows, None for all
         :param method_kwargs: keyword arguments
         :return: one result per row
         """
@@ -130,11 +130,11 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return method_name == _ACTION_MASKS and self.team_spaces.action_mask is not None
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Steps so far, and the action masks of the present."""
+        """Return the step count and the present action masks."""
         return {"n_steps": self._n_steps, "masks_shown": self._masks_shown}
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that the wrapper could be in a state."""
+        """Check that a state is valid for this wrapper."""
         check_whole(state["n_steps"], "the steps of CentralizedValueWrapper")
         if (masks := state["masks_shown"]) is not None:
             shape = (self.num_envs, self._raw.n_masked_actions or 0)
@@ -146,7 +146,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._n_steps, self._masks_shown = state["n_steps"], state["masks_shown"]
 
     def reset(self) -> dict[str, Array]:
-        """Start new episodes in all games: the Dict observation of all rows."""
+        """Start new episodes in all games and return the Dict observation of all rows."""
         return self._joint_observation(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -155,7 +155,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
         :return: Dict observation, rewards (B,), dones (B,) bool, infos; ``terminal_observation`` is the complete Dict
             observation of its row
-        :raises ValueError: for NaN or infinity, dones that differ inside a team, agents without any legal action, and
+        :raises ValueError: for NaN or infinity, dones that differ within a team, agents without a legal action, and
             missing terminal observations
         """
         if self._n_steps == 0:
@@ -173,7 +173,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         )
 
     def _warn_of_unused_masks(self) -> None:
-        """Say that games have masks which neither rows show nor anybody has asked for."""
+        """Warn if games have action masks that are neither in the rows nor queried."""
         if self.team_spaces.action_mask is None and not self._has_asked_for_masks and self.has_attr(_ACTION_MASKS):
             warnings.warn(
                 "the games have action_masks(), which nobody has asked for: illegal actions may be taken. Train with "
@@ -196,7 +196,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """
         Check and copy the parts of the rows of all games, or of one.
 
-        :return: own observations (B, *shape); where told, active agents (E, N), action masks (B, A), states (B, *state)
+        :return: own observations (B, *shape); if present, active agents (E, N), action masks (B, A), states (B, *state)
         """
         raw, team = self._raw, self.team_spaces
         entries = raw.entries(obs, what)
@@ -213,7 +213,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     def _rows(
         self, obs: object, raw: spaces.Space[Any], stored: spaces.Space[Any], what: str, game: int | None = None
     ) -> Array:
-        """Check and copy an entry of the rows of all games or one, channels first: (B, *raw shape) -> (B, *shape)."""
+        """Check and copy one entry of rows, channels first: (B, *raw shape) -> (B, *shape)."""
         rows = np.asarray(obs)
         expected = (self.num_envs if game is None else self.n_agents, *(raw.shape or ()))
         if rows.shape != expected or not np.can_cast(rows.dtype, raw.dtype or rows.dtype, "same_kind"):
@@ -227,7 +227,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return np.array(rows, dtype=raw.dtype, order="C")
 
     def _masks(self, masks: object, active: Array | None, game: int | None) -> Array:
-        """Check and copy action masks. Rows that do not act, and last observations without masks, get action 0."""
+        """Check and copy action masks. Inactive rows, and last observations without masks, get action 0."""
         rows = np.array(masks, dtype=np.int8)
         idle = np.zeros(len(rows), dtype=bool) if active is None else active.reshape(-1) == 0
         stuck = ~idle & ~rows.any(axis=1)
@@ -289,7 +289,7 @@ def _stacked(observations: list[Any], game: int) -> Array:
 
 class DictRows(TeamVecEnvWrapper):
     """
-    Turn rows that are their own observation into Dicts with the key ``"obs"``, as rows with signals have it.
+    Wrap plain own observations into Dicts with the key ``"obs"``, as in rows with signals.
 
     :param venv: rows of flattened teams
     :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
@@ -322,7 +322,7 @@ class DictRows(TeamVecEnvWrapper):
 
 
 def _protected_from_transposition(venv: VecEnv, n_agents: int | None) -> VecEnv:
-    """Keep SB3 from transposing what only looks like images: it leaves a VecEnv with a VecTransposeImage alone."""
+    """Prevent SB3 from transposing spaces that only resemble images, by a VecTransposeImage that skips all keys."""
     if not isinstance(venv.observation_space, spaces.Dict):  # VecTransposeImage takes Dicts and images
         venv = DictRows(venv, n_agents)
     return VecTransposeImage(venv, skip=True)
@@ -330,7 +330,7 @@ def _protected_from_transposition(venv: VecEnv, n_agents: int | None) -> VecEnv:
 
 def _sb3_would_transpose(team: TeamSpaces) -> bool:
     """
-    Return whether SB3 would take a part for channel-last images and transpose it.
+    Return whether SB3 would mistake a part for channel-last images and transpose it.
 
     The N own observations of a team in bytes, (N, width, height), look like an image.
     """

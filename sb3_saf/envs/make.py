@@ -1,4 +1,4 @@
-"""From a task, an environment or a factory to the vector environment that the policies of this package train on."""
+"""``make_team_env``: vector environments for the policies of this package from a task, environment or factory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sb3_saf.suites.registry import SuiteTask, find_task
 
 Backend = Literal["native", "supersuit"]
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
-#: What the names of modules and functions have, and those of tasks have not.
+#: Characters that occur in names of modules and functions, but not of tasks.
 _NAMES_OF_CODE: Final = frozenset(".:")
 
 EnvFactory: TypeAlias = "Callable[..., AnyParallelEnv]"
@@ -31,12 +31,13 @@ EnvFactory: TypeAlias = "Callable[..., AnyParallelEnv]"
 
 class Request(NamedTuple):
     """
-    How games are asked for.
+    Requested properties of the games.
 
     :param n_envs: E
-    :param backend: None for the usual one
-    :param n_cpus: processes
-    :param signals: beside own observations
+    :param backend: None for the default
+
+    :param n_cpus: number of processes
+    :param signals: signals besides own observations
     """
 
     n_envs: int
@@ -62,18 +63,18 @@ def make_team_env(
     **params: Any,
 ) -> CentralizedValueWrapper:
     """
-    Make E parallel games, ready for ``PPO("SAFPolicy", ...)``.
+    Make E parallel games for ``PPO("SAFPolicy", ...)``.
 
     The chain is: games flattened to rows, :class:`TeamMonitor`, :class:`CentralizedValueWrapper`.
 
-    HECOGrid tasks give ``observation="tiles"`` here unless told otherwise: the same views as one code per cell, from
-    which the encoder makes the same pixels, in 48 times less memory than ``observation="rgb"``.
+    HECOGrid tasks use ``observation="tiles"`` by default: the same views as one code per cell, which the encoder
+    expands to the same pixels, in 48 times less memory than ``observation="rgb"``.
 
-    Environments of others may have agents that die or join, action masks, and a state:
+    Other environments may have agents that die or join, action masks, and a state:
 
-    - An agent that has ended, or not joined yet, keeps its row, which shows zeros; ``"active"`` tells the critics, and
-      ``TeamRolloutBuffer`` keeps such rows out of the loss.
-    - Masks come from observations of the form {"observation", "action_mask"}, which are taken apart, or from
+    - An agent that has ended, or not joined yet, keeps its row, filled with zeros; ``"active"`` marks it for the
+      critics, and ``TeamRolloutBuffer`` excludes such rows from the loss.
+    - Masks come from observations of the form {"observation", "action_mask"}, which are split, or from
       ``infos[agent]["action_mask"]``. Policies of this package take legal actions only.
     - The environment's ``state()`` can be the input of MAPPO's critic, ``policy_kwargs={"critic_input": "state"}``.
 
@@ -81,27 +82,28 @@ def make_team_env(
         ("lbf/Foraging-8x8-2p-3f-v3", see :mod:`sb3_saf.suites`); a module with ``parallel_env``
         ("mpe2.simple_spread_v3") or a function ("my_package.my_module:make_env"); a PettingZoo ParallelEnv, a Gymnasium
         environment of several agents (:class:`GymnasiumTeam`), or a factory that returns one
-        (``simple_spread_v3.parallel_env``). Of an environment, copies are used. Agents that differ in their spaces get
-        equal ones (:class:`EqualSpaces`)
+        (``simple_spread_v3.parallel_env``). An environment is copied. Agents with different spaces get equal ones
+        (:class:`EqualSpaces`)
     :param n_envs: E, parallel games
-    :param seed: the run's seed, from which each game gets its own; None for fresh ones. An algorithm that is given a
-        ``seed`` replaces it with its own
+    :param seed: the run's seed, from which the games' seeds are derived; None for random ones. The ``seed`` of an
+        algorithm overrides it
     :param backend: ``"native"`` steps all games at once in compiled code, for HECOGrid only and its default;
-        ``"supersuit"`` goes through SuperSuit, the default for all else. Both give HECOGrid's same numbers
-    :param time_limit: ``"terminal"`` treats a time limit as a true end, ``"bootstrap"`` adds the value of what follows
+        ``"supersuit"`` goes through SuperSuit, the default for other games. Both give identical results for HECOGrid
+    :param time_limit: ``"terminal"`` treats a time limit as a true end, ``"bootstrap"`` adds the value of the last
+        observation
     :param monitor_dir: folder for a ``monitor.csv`` with one line per team episode; None for none
-    :param n_cpus: processes among which ``"supersuit"`` divides the games
-    :param active: whether observations tell which agents take part; None for "yes" but for HECOGrid, whose agents
-        always do
-    :param action_masks: ``"auto"`` for masks where the environment gives any (for infos, those of its first reset
-        decide), True to insist on them, False for none
+    :param n_cpus: number of processes for the games of ``"supersuit"``
+    :param active: whether observations have the signal ``"active"``; None for True, except for HECOGrid, whose agents
+        always take part
+    :param action_masks: ``"auto"`` for masks if the environment gives any (in observations, or in the infos of its
+        first reset), True to require them, False for none
     :param state: whether observations have the environment's ``state()``
-    :param team_reward: what agents learn from: ``"given"`` is each agent's own reward, ``"sum"`` and ``"mean"`` are
-        over the agents of its team; None for the suite's own way, ``"given"`` without a suite. Logs and evaluation go
-        on to count what the games give, in the suite's unit
-    :param curriculum: levels to train on first, see :class:`~sb3_saf.Curriculum`; then come games with ``params``
-    :param params: of the task or the factory, for instance ``n_agents=5``
-    :raises ValueError: if the arguments do not fit together, with what to do
+    :param team_reward: reward for learning: ``"given"`` is each agent's own reward, ``"sum"`` and ``"mean"`` are over
+        the agents of its team; None for the suite's default, ``"given"`` without a suite. Logs and evaluation always
+        report the games' rewards, in the suite's unit
+    :param curriculum: stages before the games with ``params``, see :class:`~sb3_saf.Curriculum`
+    :param params: parameters of the task or the factory, such as ``n_agents=5``
+    :raises ValueError: if the arguments do not fit together, with a fix
     """
     check_count("n_envs", n_envs)
     check_count("n_cpus", n_cpus)
@@ -134,8 +136,8 @@ def make_team_env(
 
 
 def _imported(name: str) -> EnvFactory:
-    """Return the function of a module that makes games, by its name."""
-    from sb3_saf.training.environments import find_environment  # which knows settings, too
+    """Import a function that makes games by its name."""
+    from sb3_saf.training.environments import find_environment  # imports the settings, too
 
     make = find_environment(name).make
     assert make is not None, "only HECOGrid's environments have none, whose names have no dots"
@@ -159,7 +161,7 @@ def _in_stages(
     params: dict[str, Any],
     curriculum: Sequence[Stage],
 ) -> Curriculum:
-    """Make the games of all stages and put them one after the other."""
+    """Make the games of all stages and join them to a curriculum."""
     games: list[VecEnv] = []
     try:
         for of_stage in [*(stage.params for stage in curriculum), {}]:
@@ -174,7 +176,7 @@ def _in_stages(
 
 
 def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
-    """The only code here that knows HECOGrid: everything else takes any ParallelEnv with equal spaces."""
+    """Make the games of a HECOGrid task."""
     from hecogrid_envs.task import check_task
     from hecogrid_envs.vec_env import make_vec_env
 
@@ -197,7 +199,7 @@ def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, A
 
 
 def _suite(one: SuiteTask, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
-    """A task of a suite: its own engine, or games through SuperSuit."""
+    """Make the games of a suite's task, with its own engine or through SuperSuit."""
     suite = one.suite
     if suite.vec_env is None:
         assert suite.game is not None
@@ -226,7 +228,7 @@ def _check_signals(name: str, rows: RowSpaces, signals: Signals) -> None:
 
 
 class _Named:
-    """A factory with a name for messages."""
+    """Factory with a name for messages."""
 
     def __init__(self, name: str, make: Callable[..., Any]) -> None:
         self.__qualname__ = name
@@ -240,7 +242,7 @@ class _Named:
 
 
 def _foreign(env: AnyParallelEnv | EnvFactory, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
-    """Any ParallelEnv, through SuperSuit."""
+    """Make the games of any ParallelEnv through SuperSuit."""
     from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 
     if request.backend == "native":
@@ -252,7 +254,7 @@ def _foreign(env: AnyParallelEnv | EnvFactory, request: Request, seed: int | Non
 
 
 def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:
-    """A factory with its parameters, or the environment itself."""
+    """Return a factory with its parameters bound, or the environment itself."""
     if isinstance(env, VecEnv):
         raise ValueError(
             f"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv {_name(env)}; wrap it "

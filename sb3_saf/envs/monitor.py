@@ -1,4 +1,4 @@
-"""Team episodes and team returns, where SB3's monitors would count every agent as an episode of its own."""
+"""Monitor of team episodes and team returns; SB3's monitors would count every agent as a separate episode."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sb3_saf.checkpoints.checks import check_array, check_real, check_whole
 from sb3_saf.envs.teams import Array, TeamVecEnvWrapper, check_finite, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
-#: Game steps after which rewards are judged.
+#: Game steps after which the rewards are tested.
 _N_STEPS: Final = 2000
 #: Correlation of the rewards of two agents below which they oppose each other.
 _OPPOSED: Final = -0.5
@@ -28,26 +28,25 @@ class TeamMonitor(TeamVecEnvWrapper):
     """
     Count team episodes.
 
-    When the episode of a game ends, the info of its **agent 0 alone** gets
-    ``info["episode"] = {"r": team return, "l": game steps, "t": seconds since the start}``, where the team return is
-    the sum of the rewards of all agents over all steps (``team_return="mean"``: their mean over agents). SB3 logs the
-    mean of what it finds under that key, so ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode
-    once.
+    When the episode of a game ends, only the info of its **agent 0** gets ``info["episode"] = {"r": team return, "l":
+    game steps, "t": seconds since the start}``, where the team return is the sum of the rewards of all agents over all
+    steps (``team_return="mean"``: their mean over agents). SB3 logs the mean of these entries, so
+    ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
 
-    It is no VecMonitor: SB3's own ``evaluate_policy`` would wait for an ``"episode"`` entry in every row and never
-    return. With a TeamMonitor it does return, but takes every agent for an episode, with a warning; use
+    It is not a subclass of VecMonitor, because SB3's ``evaluate_policy`` would wait for an ``"episode"`` entry in every
+    row and never return. With a TeamMonitor it counts every agent as an episode and warns; use
     ``sb3_saf.evaluate_policy``, which counts teams.
 
-    Agents whose rewards oppose each other (one gains what another loses) are no team: a warning says so.
+    A warning is issued if the rewards of two agents oppose each other (see :class:`OppositionDetector`).
 
     :param venv: rows of flattened teams, game-major, then agent
     :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none. It
-        begins with the first step. The file of another run is kept as ``monitor.csv.1``, ``monitor.csv.2`` ...
+        is created at the first step. An existing file is kept as ``monitor.csv.1``, ``monitor.csv.2`` ...
     :param info_keywords: entries of agent 0's last info to add to the episode's
     :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
-    :param team_return: how the rewards of a team's agents become the team's: their sum, or their mean where every agent
-        is given the whole reward of its team
-    :raises ValueError: if N is unknown or does not divide the rows, or a keyword is that of a column of the file
+    :param team_return: team return as the sum of the agents' rewards, or as their mean if every agent is given the
+        whole reward of its team
+    :raises ValueError: if N is unknown or does not divide the rows, or a keyword equals a column of the file
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         team_return: Literal["sum", "mean"] = "sum",
     ) -> None:
         super().__init__(venv, n_agents)
-        #: The part of the sum of a team's rewards that counts.
+        #: Factor of the sum of a team's rewards.
         self._share = 1.0 if team_return == "sum" else 1.0 / self.n_agents
         columns = sorted(_COLUMNS.intersection(info_keywords))
         if columns:
@@ -87,8 +86,8 @@ class TeamMonitor(TeamVecEnvWrapper):
         """
         Wait for the step of all games.
 
-        :return: what ``venv`` gives, with the episode entries in a copy of the infos
-        :raises ValueError: for NaN or infinity in the rewards, or dones that differ inside a team
+        :return: results of ``venv``, with the episode entries in a copy of the infos
+        :raises ValueError: for NaN or infinity in the rewards, or dones that differ within a team
         """
         obs, rewards, dones, infos = self.venv.step_wait()
         if self._writer is None:
@@ -96,7 +95,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._n_steps += 1
         check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
-        # Sums of many float32 rewards drift; sums of float64 do not.
+        # float64, because sums of many float32 rewards are inexact.
         by_game = rewards.reshape(self.n_games, self.n_agents)
         self._returns += by_game.sum(axis=1, dtype=np.float64) * self._share
         self._opposition.see(by_game)
@@ -129,7 +128,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         return episode
 
     def _begin_file(self) -> ResultsWriter | None:
-        """Begin a file at the first step, so that a run that is refused before it touches none."""
+        """Create the file at the first step, so that a run that fails earlier touches no file."""
         path = self._path()
         if path is None:
             return None
@@ -138,7 +137,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         return self._open(override_existing=True)
 
     def _path(self) -> str | None:
-        """Return where SB3's ResultsWriter puts the file."""
+        """Return the path that SB3's ResultsWriter uses."""
         if self._filename is None or self._filename.endswith(Monitor.EXT):
             return self._filename
         if os.path.isdir(self._filename):
@@ -150,11 +149,11 @@ class TeamMonitor(TeamVecEnvWrapper):
             return None
         header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(getattr(self.venv, "spec", None))}
         writer = ResultsWriter(self._filename, header, self.info_keywords, override_existing)
-        weakref.finalize(self, writer.close)  # where a run ends by an exception, nobody closes the environment
+        weakref.finalize(self, writer.close)  # for runs that end by an exception without closing the environment
         return writer
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Counters, unfinished episodes, and how long the file is."""
+        """Return counters, unfinished episodes, and the size of the file."""
         return {
             "returns": self._returns.copy(),
             "lengths": self._lengths.copy(),
@@ -165,7 +164,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that the monitor could be in a state."""
+        """Check that a state is valid for this monitor."""
         for name, own in (("returns", self._returns), ("lengths", self._lengths)):
             check_array(state[name], own.shape, own.dtype, f"{name!r} of the monitor")
         for name in ("episode_count", "n_steps", "file_size"):
@@ -174,7 +173,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._check_file(state["file_size"], state["episode_count"])
 
     def _check_file(self, size: int, episode_count: int) -> None:
-        """Check that the lines that are kept are those of the run's episodes."""
+        """Check that the first ``size`` bytes of the file hold the run's episodes."""
         path = self._path()
         if not size or path is None or not os.path.isfile(path) or os.path.getsize(path) < size:
             return
@@ -187,14 +186,14 @@ class TeamMonitor(TeamVecEnvWrapper):
             )
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from there: lines that were written to the file later are cut off, for they will come again."""
+        """Restore a state; lines written to the file after it are cut off, since their episodes are played again."""
         self._returns[:] = state["returns"]
         self._lengths[:] = state["lengths"]
         self.episode_count = state["episode_count"]
         self.t_start = state["t_start"]
         self._n_steps = state["n_steps"]
         if self._filename is None or not state["file_size"]:
-            return  # the file begins with the next step
+            return  # the file is created at the next step
         if self._writer is not None:
             self._writer.close()
         self._writer = self._open(override_existing=False)
@@ -209,7 +208,7 @@ class TeamMonitor(TeamVecEnvWrapper):
 
 
 def _set_aside(path: str) -> None:
-    """Rename the file of another run, whose lines are kept: monitor.csv.1, monitor.csv.2 ..."""
+    """Rename the file of another run to monitor.csv.1, monitor.csv.2 ..."""
     number = 1
     while os.path.exists(f"{path}.{number}"):
         number += 1
@@ -217,7 +216,7 @@ def _set_aside(path: str) -> None:
 
 
 def _synced_size(file: IO[Any]) -> int:
-    """Bytes of a file that are surely on the disk."""
+    """Write a file to disk and return its size in bytes."""
     file.flush()
     os.fsync(file.fileno())
     return os.fstat(file.fileno()).st_size
@@ -240,8 +239,8 @@ class OppositionDetector:
     """
     Warn once if two agents' rewards oppose each other: their correlation over the first game steps is below -0.5.
 
-    Agents share parameters, and QPLEX maximises the sum of their rewards: what was made for one team. Self-play is the
-    use that opponents may have of it.
+    The algorithms are made for one team: agents share parameters, and QPLEX maximises the sum of their rewards.
+    Opponents can be trained by self-play only.
 
     :param n_agents: N
     """
@@ -252,7 +251,7 @@ class OppositionDetector:
         self._n_steps = 0
 
     def see(self, rewards: Array) -> None:
-        """Take the rewards of a step, (E, N)."""
+        """Record the rewards of a step, (E, N)."""
         if self._n_steps >= _N_STEPS:
             return
         rewards = rewards.astype(np.float64)

@@ -1,7 +1,8 @@
 """
-Calls of a game's ``reset`` and ``step``, with a clear error where the results are not PettingZoo's.
+Calls of a game's ``reset`` and ``step`` with checked results.
 
-What a game gives is by agent; ``place`` is game and step, for messages. Everything here raises ValueError.
+Results are dicts by agent; ``place`` is game and step, for messages. All functions raise ValueError if a result
+violates PettingZoo's API.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ _SINCE: Final = "as PettingZoo 1.24 and later do"
 
 class Step(NamedTuple):
     """
-    What a step returns, each a dict by agent.
+    Results of a step, each a dict by agent.
 
-    :param observations: what each agent sees
-    :param rewards: of each agent
+    :param observations: observation of each agent
+    :param rewards: reward of each agent
     :param terminations: whether the game ended for an agent
     :param truncations: whether an agent was stopped
-    :param infos: of each agent
+    :param infos: info of each agent
     """
 
     observations: Mapping[Any, Any]
@@ -36,7 +37,7 @@ class Step(NamedTuple):
 
 
 def reset(env: Any, seed: int | None, options: dict[str, Any] | None) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
-    """Reset a game: observations and infos by agent."""
+    """Reset a game; return observations and infos by agent."""
     try:
         result = env.reset(seed=seed, options=options)
     except TypeError as error:
@@ -103,7 +104,7 @@ def number(rewards: Mapping[Any, Any], agent: Any, place: str) -> float:
 
 
 def flag(name: str, flags: Mapping[Any, Any], agent: Any, place: str) -> bool:
-    """Return whether an agent was terminated or truncated (``name``); one that is not mentioned was not."""
+    """Return whether an agent was terminated or truncated (``name``); False for an agent without an entry."""
     value = flags.get(agent, False)
     if value is True or value is False:
         return value
@@ -124,7 +125,7 @@ def info(infos: Mapping[Any, Any], agent: Any, place: str) -> Mapping[str, Any]:
 
 
 def _single(value: Any, kinds: str) -> Any:
-    """Return the one number of a scalar or an array of one entry, None for anything else."""
+    """Return the number of a scalar or an array of one entry, None for any other value."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -137,7 +138,7 @@ def _takes(function: Any, *names: str) -> bool:
         inspect.signature(function).bind(**dict.fromkeys(names))
     except TypeError:
         return False
-    except ValueError:  # functions that have no signature to look at
+    except ValueError:  # functions without a signature
         return True
     return True
 

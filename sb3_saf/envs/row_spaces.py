@@ -1,4 +1,4 @@
-"""What a vector environment of flattened teams tells of each row, before ``CentralizedValueWrapper`` joins teams."""
+"""Parts of the rows of a vector environment of flattened teams, before ``CentralizedValueWrapper`` joins teams."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class RowSpaces(NamedTuple):
     """
     The parts of a row's observation.
 
-    A VecEnv of flattened teams gives rows their own observations alone, or Dicts with the keys ``"obs"`` and any of
+    Rows of a VecEnv of flattened teams are own observations, or Dicts with the key ``"obs"`` and any of
 
     - ``"active"``, Discrete(2): 1 while the row's agent takes part;
     - ``"action_mask"``, MultiBinary(A): 1 for legal actions, where actions are Discrete(A);
     - ``"state"``: the state of the row's game, equal in all its rows.
 
     :param own: space of the row's own observation
-    :param active: whether rows tell if their agent takes part
+    :param active: whether rows have ``"active"``
     :param n_masked_actions: A if rows have masks, else None
     :param state: space of the game's state if rows have it
     :param is_dict: whether rows are Dicts
@@ -49,11 +49,11 @@ class RowSpaces(NamedTuple):
     @classmethod
     def of(cls, space: spaces.Space[Any], action_space: spaces.Space[Any]) -> RowSpaces:
         """
-        Take the observation space of rows apart.
+        Split the observation space of rows into its parts.
 
         :param space: observation space of the VecEnv
         :param action_space: its action space
-        :raises ValueError: if the space has rows of teams already, or an optional key is of another form
+        :raises ValueError: if the space has rows of teams already, or an optional key has another form
         """
         if not isinstance(space, spaces.Dict):
             return cls(space)
@@ -64,7 +64,7 @@ class RowSpaces(NamedTuple):
                 "CentralizedValueWrapper; wrap it once (sb3_saf.make_team_env has done so)"
             )
         if OBS_KEY not in keys or not keys <= _ROW_KEYS:
-            return cls(space)  # an own observation of an unknown form, which TeamSpaces refuses with what to do
+            return cls(space)  # an own observation of an unknown form, which TeamSpaces refuses
         active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
         if active is not None and active != spaces.Discrete(2):
             raise ValueError(f"expected {ACTIVE_KEY!r} of a row to be Discrete(2), got {active}")
@@ -87,10 +87,10 @@ class RowSpaces(NamedTuple):
 
     def entries(self, obs: Any, what: str) -> Mapping[str, Any]:
         """
-        The parts of rows.
+        Return the parts of rows.
 
         :param obs: own observations, or Dicts where the space is a Dict
-        :param what: what they are, for the message
+        :param what: name of the rows, for the message
         :raises ValueError: if keys are missing
         """
         if not self.is_dict:
@@ -109,7 +109,7 @@ class RowSpaces(NamedTuple):
 
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """
-    The same space, or a new one with channels first if it is of channel-last images.
+    Return a space with channels first for channel-last images, else the same object.
 
     :param space: of own observations or states; with an attribute ``atlas`` it holds codes, not pixels
     """

@@ -1,4 +1,4 @@
-"""Observations of a game, checked against their space and brought into the form that rows have."""
+"""Readers that check a game's observations against their space and convert them to the form of rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def parts_of(space: spaces.Space[Any]) -> dict[Any, spaces.Space[Any]]:
 
 
 def leaves_of(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
-    """Return the spaces that a space is built of, without Dicts and Tuples."""
+    """Return the innermost spaces of nested Dicts and Tuples."""
     if not isinstance(space, (spaces.Dict, spaces.Tuple)):
         return [space]
     return [leaf for part in parts_of(space).values() for leaf in leaves_of(part)]
@@ -31,7 +31,7 @@ def leaves_of(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
 
 def counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """
-    Return the space with every ``start`` at 0, the same object if it is so already.
+    Return the space with every ``start`` at 0; the same object if it has that already.
 
     Stable-Baselines3 encodes and samples Discrete and MultiDiscrete from 0, whatever their start.
     """
@@ -44,7 +44,7 @@ def counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
     if all(shifted[key] is part for key, part in parts.items()):
         return space
     if isinstance(space, spaces.Dict):
-        return spaces.Dict(list(shifted.items()))  # of a dict the keys would be sorted
+        return spaces.Dict(list(shifted.items()))  # a dict would be sorted by key
     return spaces.Tuple(tuple(shifted.values()))
 
 
@@ -55,18 +55,18 @@ def first_value(space: spaces.Space[Any]) -> Any:
 
 class SpaceReader:
     """
-    Read what a game gives for one space.
+    Check and convert a game's values for one space.
 
     Shape and kind of the numbers must be those of the space. Integers outside the bounds are refused; floats outside
-    them are noted once in ``notes``, for the caller to warn of.
+    them are noted once in ``notes``, so that the caller can warn.
 
-    :param space: as the game declares it: of fixed shape, or a Dict or Tuple of such spaces
+    :param space: the game's space: of fixed shape, or a Dict or Tuple of such spaces
     :param notes: gets the first note
     """
 
     def __init__(self, space: spaces.Space[Any], notes: list[str]) -> None:
         self.space = space
-        #: Space of what :meth:`read` returns.
+        #: Space of the results of :meth:`read`.
         self.rows: spaces.Space[Any] = counted_from_zero(space)
         self._notes = notes
         self._parts = {key: SpaceReader(part, notes) for key, part in parts_of(space).items()}
@@ -78,7 +78,7 @@ class SpaceReader:
             self._low, self._high = self._bounds()
 
     def _bounds(self) -> tuple[Any, Any]:
-        """Return the bounds, None where the dtype allows nothing else."""
+        """Return the bounds, None where the dtype implies them."""
         low, high = bounds_of(self.space)
         limits = (-np.inf, np.inf) if self._is_float else _limits(self._dtype)
         return _unless_always(low, limits[0]), _unless_always(high, limits[1])
@@ -89,10 +89,10 @@ class SpaceReader:
 
     def read(self, value: Any, owner: str) -> Any:
         """
-        Check a value and bring it into shape and dtype, counted from 0.
+        Check a value and convert it to the space's shape and dtype, counted from 0.
 
-        :param value: as the game gave it
-        :param owner: whose it is, for the message
+        :param value: value from the game
+        :param owner: owner of the value, for the message
         :raises ValueError: if it does not lie in the space
         """
         if not self._parts:
@@ -125,7 +125,7 @@ class SpaceReader:
         return array.astype(self._dtype, copy=False)
 
     def _report(self, array: Array, outside: Any, owner: str) -> None:
-        """Refuse integers, and note floats, outside the bounds."""
+        """Raise ValueError for integers outside the bounds, note floats."""
         low, high = bounds_of(self.space)
         message = (
             f"observation of {owner}: expected values from {np.min(low)} to {np.max(high)} as in {self.space}, got "
@@ -139,11 +139,11 @@ class SpaceReader:
 
 class Part(NamedTuple):
     """
-    Entries of a vector that belong together.
+    Slice of a vector that holds one observation part.
 
     :param start: first entry
     :param stop: one after the last
-    :param picture: shape of the picture that they are, None for scalars and vectors
+    :param picture: shape of the picture, None for scalars and vectors
     """
 
     start: int
@@ -153,11 +153,11 @@ class Part(NamedTuple):
 
 class PartsSpace(spaces.Box):
     """
-    Pictures, scalars and vectors one after the other in one float32 vector. Encoders take it apart by ``parts``;
-    pixels are 0 to 255.
+    Pictures, scalars and vectors concatenated to one float32 vector. Encoders split it by ``parts``; pixels are 0 to
+    255.
 
     :param flat: the vector, from ``gymnasium.spaces.flatten_space``
-    :param parts: what its entries are
+    :param parts: the slices of the vector
     """
 
     def __init__(self, flat: spaces.Box, parts: tuple[Part, ...]) -> None:
@@ -168,7 +168,7 @@ class PartsSpace(spaces.Box):
         """Return whether bounds and parts are equal."""
         return isinstance(other, PartsSpace) and super().__eq__(other) and self.parts == other.parts
 
-    __hash__ = None  # type: ignore[assignment]  # as of every space with arrays
+    __hash__ = None  # type: ignore[assignment]  # as in every space with arrays
 
 
 class FlatReader(SpaceReader):
@@ -188,7 +188,7 @@ class FlatReader(SpaceReader):
         if any(_is_picture(leaf) for leaf in leaves):
             flat = PartsSpace(flat, _parts_of_vector(leaves))
         elif flat.dtype == np.float64 and all(leaf.dtype != np.float64 for leaf in leaves):
-            # What integers and float32 become beside each other takes twice the memory for nothing.
+            # Mixed integers and float32 would give float64, which takes twice the memory.
             flat = spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
         self.rows = flat
 
@@ -219,9 +219,9 @@ def can_be_flattened(space: spaces.Space[Any]) -> bool:
 
 def checked_actions(space: spaces.Space[Any], agents: Sequence[Any], n_rows: int, actions: npt.ArrayLike) -> Array:
     """
-    Bring the actions of all rows into the dtype of their space.
+    Check the actions of all rows and convert them to the dtype of their space.
 
-    :param space: of the actions of a row
+    :param space: action space of a row
     :param agents: N names, for messages
     :param n_rows: B
     :param actions: (B, ...)
@@ -250,11 +250,11 @@ def checked_actions(space: spaces.Space[Any], agents: Sequence[Any], n_rows: int
         row = int(outside[0, 0])
         game, agent = divmod(row, len(agents))
         raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
-    return np.array(array, dtype=dtype)  # a copy: the caller may go on to use its array
+    return np.array(array, dtype=dtype)  # a copy: the caller may reuse its array
 
 
 def _kinds_of_actions(space: spaces.Space[Any]) -> str:
-    """Return which kinds of numbers may be actions; SB3's policies give floats for MultiBinary and for every Box."""
+    """Return the allowed dtype kinds of actions; SB3's policies give floats for MultiBinary and for every Box."""
     if isinstance(space, spaces.MultiBinary):
         return "biuf"
     return "fiu" if isinstance(space, spaces.Box) else "iu"
@@ -280,7 +280,7 @@ def _unless_always(bound: Any, limit: float) -> Any:
 
 
 def _any_above(array: Array, high: Any) -> bool:
-    # One pass over the array where one number bounds all entries: codes of tiles are checked at every step.
+    # One pass over the array if one number bounds all entries: tile codes are checked at every step.
     return bool((array.max() > high) if np.ndim(high) == 0 else (array > high).any())
 
 

@@ -1,4 +1,4 @@
-"""One PettingZoo game as rows: SuperSuit's ``MarkovVectorEnv`` with its faults repaired."""
+"""One PettingZoo game as rows: SuperSuit's ``MarkovVectorEnv`` with fixes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
 Info: TypeAlias = "dict[str, Any]"
 Infos: TypeAlias = "list[Info]"
 
-#: Keys of infos that have a meaning for Stable-Baselines3 or here. A game's own entries of these names are renamed.
+#: Keys of infos that Stable-Baselines3 or this package uses. A game's own entries with these names are renamed.
 RESERVED_KEYS: Final = frozenset({TERMINAL_OBSERVATION, TRUNCATED, ACTIVE_KEY, "episode"})
 
 _UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
@@ -32,17 +32,16 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     """
     The agents of one game as rows that end together.
 
-    Repairs of :class:`supersuit.vector.MarkovVectorEnv`:
+    Changes to :class:`supersuit.vector.MarkovVectorEnv`:
 
-    - an agent that has ended or not joined yet keeps its row, which shows zeros and gets no reward;
-    - the last step's infos are its own: those of the next episode's reset are in ``reset_infos``;
+    - an agent that has ended or not joined yet keeps its row, with zeros and no reward; - the last step's infos are
+      kept: those of the next episode's reset are in ``reset_infos``;
     - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
-    - on request rows show signals: who is active, action masks, the game's state;
-    - whatever the game returns is checked, and errors name agent, game and step.
+    - rows have signals on request: active agents, action masks, the game's state; - all results of the game are
+      checked, and errors name agent, game and step.
 
     :param env: the game
-    :param form: its form
-    :param index: of the game, for messages
+    :param form: its form :param index: index of the game, for messages
     :param notes: gets a note if observations leave their bounds
     """
 
@@ -68,7 +67,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
     def _count_step(self, number: int) -> None:
         self._n_steps = number
-        #: Where an error is, for messages.
+        #: Game and step, for messages.
         self._place = f"game {self.index} at step {number}"
 
     # ---- episodes
@@ -77,10 +76,9 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         """
         Begin an episode.
 
-        :param seed: of the game, None to go on with its random stream
-        :param options: for the game
+        :param seed: seed of the game, None to continue its random stream :param options: options for the game
         :return: observations and infos of the N rows
-        :raises ValueError: if the game breaks PettingZoo's rules
+        :raises ValueError: if the game violates PettingZoo's API
         """
         observations, infos = parallel_calls.reset(self.par_env, seed, options)
         self._count_step(0)
@@ -95,7 +93,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         return self._rows(observations, infos, self._playing), self.reset_infos
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Any, Any, Any, Any, Infos]:
-        """Step the game with the actions of the N rows (see PettingZoo); the next episode begins by itself."""
+        """Step the game with the actions of the N rows (see PettingZoo); the next episode begins automatically."""
         acted = self._playing
         chosen = dict(zip(self.agents, iterate(self.action_space, actions), strict=True))
         self._count_step(self._n_steps + 1)
@@ -142,7 +140,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
             super().close()
 
     def _find_playing(self) -> dict[Any, None]:
-        """Return the agents that take part; one that ended does not come back."""
+        """Return the agents that take part; an agent that has ended does not return."""
         present = parallel_calls.playing_agents(self.par_env, self.agents, self._place)
         return {agent: None for agent in self.agents if agent in present and agent not in self._ended}
 
@@ -156,7 +154,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     # ---- copies
 
     def snapshot(self, way: Way) -> dict[str, Any]:
-        """Return all that the future of the game depends on, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
+        """Return the complete state of the game, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
         if way == "pickle":
             content = {"pickled": pickled(self.par_env)}
         else:
@@ -164,7 +162,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         return {"n_steps": self._n_steps, "ended": [agent in self._ended for agent in self.agents], **content}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on from a snapshot; the infos of the last reset are gone."""
+        """Restore a snapshot; the infos of the last reset are not part of it."""
         if "pickled" in snapshot:
             self.par_env = unpickled(snapshot["pickled"], self.par_env)
         else:
@@ -188,9 +186,9 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         """
         Stack the observations of the N rows.
 
-        :param shown: agents whose observations are shown, the others' rows are zeros
+        :param shown: agents whose observations are shown, the rows of others are zeros
         :param active: agents that take part, and must have an observation; None for those shown
-        :param over: whether these are the last observations of the episode, on which nobody acts
+        :param over: whether these are the last observations of the episode, on which no agent acts
         """
         active = shown if active is None else active
         rows = {
@@ -233,7 +231,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     def _signals(
         self, agent: Any, observations: Mapping[Any, Any], infos: Mapping[Any, Any], active: bool, over: bool
     ) -> Info:
-        """Return what an agent's row shows beside its own observation and the state."""
+        """Return the signals of an agent's row, without the state."""
         rows = self._form.rows
         signals: Info = {}
         if rows.active:
@@ -262,7 +260,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
 
 def _add_missing_attributes(env: Any) -> None:
-    """Give a game the attributes that SuperSuit and SB3 read and PettingZoo does not insist on."""
+    """Add the attributes that SuperSuit and SB3 read but PettingZoo does not require."""
     if not hasattr(env, "metadata"):
         env.metadata = {}
     if not hasattr(env.unwrapped, "render_mode"):
@@ -270,16 +268,16 @@ def _add_missing_attributes(env: Any) -> None:
 
 
 def _inactive() -> Info:
-    """Return the info of an agent that takes no part."""
+    """Return the info of an inactive agent."""
     return {ACTIVE_KEY: False}
 
 
 def _copied(info: Mapping[str, Any], agent: Any) -> Info:
-    """Copy an info as it is now; games may go on to use theirs."""
+    """Copy an info, since games may reuse theirs."""
     if not info:
         return {}
     if all(type(value) in _UNCHANGING for value in info.values()):
-        return dict(info)  # as good as a deep copy, and ten times faster
+        return dict(info)  # equivalent to a deep copy, and ten times faster
     try:
         return deepcopy(dict(info))
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Games of one process, and what they are made of: SuperSuit's ``ConcatVecEnv`` with its faults repaired."""
+"""Games of one process (SuperSuit's ``ConcatVecEnv`` with fixes) and the source they are made from."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from sb3_saf.envs.supersuit_game import Info, Infos, TeamMarkovVectorEnv
 
 class Question(NamedTuple):
     """
-    A question to a game.
+    Query to a game.
 
-    :param game: its index among all
+    :param game: index among all E games
     :param function: of :mod:`sb3_saf.envs.game_layers`, called with the game
     :param args: further arguments
     """
@@ -33,14 +33,12 @@ class Question(NamedTuple):
 
 class Played(NamedTuple):
     """
-    A step of some games, by row.
+    Results of a step of some games, by row.
 
-    :param observations: of the rows
-    :param rewards: float32
+    :param observations: observations of the rows :param rewards: float32
     :param dones: bool
-    :param infos: of the rows
-    :param reset_infos: infos of the last reset of each row's game
-    :param notes: what to warn of
+    :param infos: infos of the rows :param reset_infos: infos of the last reset of each row's game
+    :param notes: texts of warnings to issue
     """
 
     observations: Any
@@ -53,15 +51,14 @@ class Played(NamedTuple):
 
 class GameSource:
     """
-    A factory, or an environment as it is now, from which games are made.
-
-    It is kept pickled where that is possible, so that a function around an environment gives each game a copy of it.
+    Factory or environment from which games are made. It is stored pickled if possible, so that a function that returns
+    an existing environment gives each game a copy of it.
 
     :param make_env: the factory or the environment
-    :param is_factory: which of the two it is
-    :param n_cpus: number of processes in which games will be made; if this is the only one, a factory need not be
-        picklable (that of a class in a function with ``functools.lru_cache`` on its methods is not, for instance)
-    :raises ValueError: if it cannot be copied, with what to do
+    :param is_factory: whether ``make_env`` is a factory
+    :param n_cpus: number of processes in which games will be made; with one process a factory need not be picklable
+        (for instance of a local class with ``functools.lru_cache`` on its methods)
+    :raises ValueError: if it cannot be copied, with a fix
     """
 
     def __init__(self, make_env: Any, is_factory: bool, n_cpus: int) -> None:
@@ -101,19 +98,18 @@ class TeamConcatVecEnv(ConcatVecEnv):
     """
     Games of this process, one after another.
 
-    Repairs of :class:`supersuit.vector.ConcatVecEnv`: each game gets its own seed and options, games can be asked for
-    attributes and methods, and all games are closed even if closing one fails.
+    Changes to :class:`supersuit.vector.ConcatVecEnv`: each game gets its own seed and options, attributes and methods
+    of games are accessible, and all games are closed even if closing one fails.
 
     :param source: makes the games
-    :param form: of the games
-    :param indices: of the games among all
-    :raises ValueError: if the source makes the same environment again
+    :param form: form of the games :param indices: indices of the games among all E :raises ValueError: if the source
+        returns the same environment twice
     """
 
     def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:
         self._notes: list[str] = []
         self._indices = indices
-        self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, what could not be made is closed, too
+        self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, close also runs if construction failed
         super().__init__(
             [lambda index=index: TeamMarkovVectorEnv(source.build(), form, index, self._notes) for index in indices]
         )
@@ -123,14 +119,14 @@ class TeamConcatVecEnv(ConcatVecEnv):
         _check_all_differ(self.vec_envs)
 
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
-        """Begin an episode in every game of this process, of which there are seeds and options of all E games."""
+        """Begin an episode in every game of this process; seeds and options are those of all E games."""
         games = zip(self._indices, self.vec_envs, strict=True)
         started = [game.reset(seed=seeds[index], options=options[index]) for index, game in games]
         observations, infos = zip(*started, strict=True)
         return self.concat_obs(observations), [info for game in infos for info in game]
 
     def play(self, actions: npt.NDArray[Any]) -> Played:
-        """Step every game of this process, whose actions are among those of the B rows of all games."""
+        """Step every game of this process; actions are those of the B rows of all games."""
         first, last = self._indices[0], self._indices[-1] + 1
         rows = actions[first * self._n_agents : last * self._n_agents]
         observations, rewards, terminations, truncations, infos = self.step(rows)
@@ -138,7 +134,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
         return Played(observations, rewards, terminations | truncations, infos, reset_infos, self._notes)
 
     def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
-        """Answer questions to games of this process, by the question's place among those to any game."""
+        """Answer the queries to games of this process, keyed by their position in ``questions``."""
         games = dict(zip(self._indices, self.vec_envs, strict=True))
         return {
             place: function(games[game].par_env, *args)
@@ -147,21 +143,21 @@ class TeamConcatVecEnv(ConcatVecEnv):
         }
 
     def snapshots(self) -> list[dict[str, Any]]:
-        """Copy the games of this process; a CheckpointError says that they cannot be copied."""
+        """Copy the games of this process; raise CheckpointError if they cannot be copied."""
         if self._way is None:
             self._way = find_way(self._new_game)
         return [game.snapshot(self._way) for game in self.vec_envs]
 
     def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
-        """Go on from snapshots of all E games."""
+        """Restore the games of this process from snapshots of all E games."""
         for index, game in zip(self._indices, self.vec_envs, strict=True):
             game.restore(snapshots[index])
 
     def close(self) -> None:
-        """Close all games, once, even if closing one fails; then raise its error."""
+        """Close all games, once; if closing one fails, raise its error at the end."""
         self.closed = True
         with ExitStack() as closing:
-            for game in reversed(self.vec_envs):  # the last one is called first
+            for game in reversed(self.vec_envs):  # callbacks run in reverse order
                 closing.callback(game.close)
 
 

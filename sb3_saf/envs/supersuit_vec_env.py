@@ -29,47 +29,47 @@ class SuperSuitVecEnv(TeamVecEnv):
     """
     Games of a PettingZoo ParallelEnv as rows of one VecEnv, flattened by SuperSuit.
 
-    Agents of rows are in the order of ``possible_agents``. An episode is a team's: its N rows are done together, when
-    its last agent has ended. The row of an agent that ended earlier (or has not joined) shows zeros, gets no reward,
-    and its infos hold ``"active": False``; the info of the step at which it ended holds its
-    ``"terminal_observation"``.
+    Agents are in the order of ``possible_agents``. The N rows of a team are done together, when its last agent has
+    ended. The row of an agent that ended earlier (or has not joined) holds zeros and no reward, and its infos hold
+    ``"active": False``; the info of the step at which it ended holds its ``"terminal_observation"``.
 
     Infos of done rows hold ``"terminal_observation"`` and ``"TimeLimit.truncated"`` (True if that row's agent was
     truncated and not terminated at that step); reset infos are in ``reset_infos`` only. A game's own infos named
-    ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which mean something else to
-    Stable-Baselines3, are renamed: ``"game_episode"``, ...
+    ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which Stable-Baselines3 or
+    this package uses, are renamed: ``"game_episode"``, ...
 
     Observations and actions of Discrete and MultiDiscrete spaces are counted from 0 in rows, whatever the ``start``
     of the game's space. Actions of a Box of integers may be given as floats, which are rounded.
 
     ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` and ``get_images`` take and return rows, as SB3's
-    callers expect; what is meant is the row's game. So ``env_method`` without indices calls a game's method N times:
-    for a method that changes the game use :meth:`game_method`. ``action_masks`` is the exception, for sb3-contrib:
-    each game is asked once, and if it answers with a dict by agent, each row gets its own agent's mask.
+    callers expect, and apply to the row's game. ``env_method`` without indices therefore calls a game's method N times:
+    for a method that changes the game use :meth:`game_method`. ``action_masks`` is the exception, for sb3-contrib: it
+    is called once per game, and if it returns a dict by agent, each row gets its own agent's mask.
 
-    On request rows carry signals. The observation of a row is then a Dict of ``"obs"``, the agent's own observation,
-    and
+    With signals, the observation of a row is a Dict of ``"obs"``, the agent's own observation, and
 
     - ``"active"``, Discrete(2): 1 while the row's agent takes part. In the last observation of an episode: 1 if the
-      agent was stopped by a time limit, so that something would have followed;
+      agent was stopped by a time limit;
     - ``"action_mask"``, MultiBinary(A): 1 for legal actions; zeros for agents that do not act;
     - ``"state"``: the game's ``state()``, in the rows of all its agents, active or not.
 
-    An exception in a game is raised here as it is, also from a worker process; afterwards call ``reset``.
+    An exception in a game is raised unchanged, also from a worker process; call ``reset`` afterwards.
 
-    :param make_env: a function that makes the environment, or an environment; each game gets its own copy of it.
-        For worker processes it must be possible to pickle it with cloudpickle
+    :param make_env: a function that makes the environment, or an environment, which is copied for each game. For worker
+        processes cloudpickle must be able to pickle it
     :param n_games: E, number of games
-    :param seed: of the games, as in :meth:`seed`
+    :param seed: seed of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
-    :param active: whether rows tell if their agent takes part
-    :param action_masks: None leaves observations as they are. ``"auto"`` shows masks in rows if the game gives any, in
-        observations of the form {"observation", "action_mask"} or in ``infos[agent]["action_mask"]``, True insists on
-        them, False shows none; all three take observations out of that form, and turn Dicts and Tuples of scalars and
-        vectors into one vector, as ``gymnasium.spaces.flatten`` does
-    :param state: whether rows show the game's ``state()``
-    :raises ValueError: if the environment is no ParallelEnv, cannot be copied, its agents differ in their spaces, or
-        it does not give the signals
+    :param active: whether rows have ``"active"``
+
+    :param action_masks: None leaves observations unchanged. ``"auto"`` adds masks to rows if the game gives any, in
+        observations of the form {"observation", "action_mask"} or in ``infos[agent]["action_mask"]``, True requires
+        them, False adds none; all three split observations of that form, and flatten Dicts and Tuples of scalars and
+        vectors to one vector, as ``gymnasium.spaces.flatten`` does
+
+    :param state: whether rows have the game's ``state()``
+    :raises ValueError: if the environment is no ParallelEnv, cannot be copied, its agents differ in their spaces, or a
+        requested signal is missing
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class SuperSuitVecEnv(TeamVecEnv):
     # ---- episodes
 
     def reset(self) -> VecEnvObs:
-        """Begin an episode in every game; a step that was begun is cancelled."""
+        """Begin an episode in every game; a pending step is cancelled."""
         self._check_open()
         self._begun, self._actions = False, None
         options = [own or None for own in self._options[:: self.n_agents]]
@@ -117,10 +117,10 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     def step_async(self, actions: npt.ArrayLike) -> None:
         """
-        Take the actions of a step.
+        Store the actions of the next step.
 
-        :param actions: of the B rows; those of agents that have ended are ignored
-        :raises ValueError: if one is not in the action space; no game has been stepped then
+        :param actions: actions of the B rows; those of agents that have ended are ignored
+        :raises ValueError: if one is not in the action space; no game is stepped then
         """
         self._check_open()
         if not self._begun:
@@ -128,7 +128,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._actions = checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all games: observations, rewards (float32), dones (bool) and infos of the B rows."""
+        """Step all games; return observations, rewards (float32), dones (bool) and infos of the B rows."""
         if self._actions is None:
             raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
         actions = _in_games_form(self._game_action_space, self._actions)
@@ -143,7 +143,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         return step.observations, step.rewards, step.dones, step.infos
 
     def close(self) -> None:
-        """Close all games and end the worker processes; a second time does nothing."""
+        """Close all games and end the worker processes; a second call does nothing."""
         if not self._closed:
             self._closed = True
             self._games.close()
@@ -173,7 +173,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that the games could be in this state, and that this user has signed what is pickled."""
+        """Check that a state is valid for these games, and that pickled games have this user's signature."""
         where = "the state of the games"
         check_keys(state, ("seeds", "next_seeds", "begun", "warned", "games"), where)
         for name in ("seeds", "next_seeds"):
@@ -193,7 +193,7 @@ class SuperSuitVecEnv(TeamVecEnv):
                 check_signature(game["pickled"], game["signature"])
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state of :meth:`checkpoint_state`."""
         self.check_checkpoint_state(state)
         if state["begun"]:
             self._games.restore(state["games"])
@@ -202,7 +202,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._begun, self._has_warned, self._actions = state["begun"], state["warned"], None
         self.reset_infos = [{} for _ in range(self.num_envs)]
 
-    # ---- what SB3 asks for by row
+    # ---- queries by row
 
     def _ask(self, questions: Sequence[Question]) -> list[Any]:
         self._check_open()
@@ -210,7 +210,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         return [answers[place] for place in range(len(questions))]
 
     def _ask_rows(self, indices: VecEnvIndices, function: Callable[..., Any], *args: Any) -> list[Any]:
-        """Ask the games of some rows, once each; return for each row the answer of its game."""
+        """Query the games of some rows, once each; return for each row the answer of its game."""
         games = [row // self.n_agents for row in chosen_indices(indices, self.num_envs)]
         asked = list(dict.fromkeys(games))
         answers = dict(zip(asked, self._ask([Question(game, function, args) for game in asked]), strict=True))
@@ -221,7 +221,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         return all(self._ask_rows(None, game_layers.has_attribute, attr_name))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Get an attribute of the rows' games, or of wrappers around them; from a worker process comes a copy."""
+        """Get an attribute of the rows' games, or of wrappers around them; worker processes return copies."""
         return self._ask_rows(indices, game_layers.get_attribute, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -241,7 +241,7 @@ class SuperSuitVecEnv(TeamVecEnv):
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
-        """Call a method of games, once each (see the base class)."""
+        """Call a method once per game (see the base class)."""
         return self._call(chosen_indices(games, self.n_games, "game"), method_name, args, kwargs)
 
     def _call(self, games: Sequence[int], *call: Any) -> list[Any]:
@@ -254,7 +254,7 @@ class SuperSuitVecEnv(TeamVecEnv):
 
 
 def _source_and_form(make_env: MakeEnv, n_cpus: int, signals: Signals) -> tuple[GameSource, GameForm]:
-    """Look at an example of the game, and keep what games are made of."""
+    """Determine the form of the game from an example, and return it with the source of the games."""
     is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
     example: Any = make_env() if is_factory else make_env
     check_is_parallel(example, is_factory)
@@ -263,13 +263,13 @@ def _source_and_form(make_env: MakeEnv, n_cpus: int, signals: Signals) -> tuple[
         form = game_form(example, partial(first_infos_of, source.build), signals)
     finally:
         if is_factory:
-            # Games may rely on having been reset before they are closed; this one has only been looked at.
+            # Games may require a reset before they are closed; the example has none.
             with suppress(Exception):
                 example.close()
     return source, form
 
 
 def _in_games_form(space: spaces.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Count actions from where the game counts them."""
+    """Shift actions to the ``start`` of the game's space."""
     start = first_value(space)
     return (actions + start).astype(actions.dtype, copy=False) if np.any(start != 0) else actions

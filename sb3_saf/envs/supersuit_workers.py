@@ -27,12 +27,12 @@ from sb3_saf.envs.game_form import GameForm
 from sb3_saf.envs.supersuit_game import Info, Infos
 from sb3_saf.envs.supersuit_games import GameSource, Played, Question, TeamConcatVecEnv, joined
 
-#: Seconds that a worker process gets to close its games.
+#: Time limit in seconds for a worker process to close its games.
 CLOSE_TIMEOUT = 10.0
 
 
 class Failure(NamedTuple):
-    """An exception on its way from a worker process."""
+    """An exception of a worker process."""
 
     error: BaseException
     trace: str
@@ -40,15 +40,14 @@ class Failure(NamedTuple):
 
 class GameProcess(gymnasium.Env[Any, Any]):
     """
-    A group of games in a worker process, as one environment of a SubprocVecEnv.
+    Group of games in a worker process, as one environment of a SubprocVecEnv.
 
-    Only its method :meth:`run` is used: rows of a group do not fit into the scalar rewards and dones of an environment.
-    What goes there and comes back is pickled by cloudpickle, which takes lambdas, and exceptions are replies, so that a
-    game's error does not end the process.
+    Only the method :meth:`run` is used: rows of a group do not fit into the scalar rewards and dones of an environment.
+    Payloads are pickled by cloudpickle, which supports lambdas, and exceptions are returned, so that a game's error
+    does not end the process.
 
     :param source: makes the games
-    :param form: of the games
-    :param indices: of the games among all
+    :param form: form of the games :param indices: indices of the games among all E
     """
 
     observation_space = action_space = spaces.Discrete(1)
@@ -83,7 +82,7 @@ class GameProcess(gymnasium.Env[Any, Any]):
         return getattr(self._games, name)(*args)
 
     def close_games(self, timeout: float) -> None:
-        """Close the games; the process ends if that takes more seconds."""
+        """Close the games; end the process after ``timeout`` seconds."""
         timer = threading.Timer(timeout, os._exit, [1])
         timer.daemon = True
         timer.start()
@@ -101,13 +100,13 @@ class WorkerGames:
     :param source: makes the games
     :param form: of the games
     :param n_games: E
-    :param n_cpus: number of processes, at most; they start as :mod:`multiprocessing` is set to start them
+    :param n_cpus: maximum number of processes, started with the default start method of :mod:`multiprocessing`
     """
 
     def __init__(self, source: GameSource, form: GameForm, n_games: int, n_cpus: int) -> None:
         size = -(-n_games // n_cpus)
         self._groups = [range(first, min(first + size, n_games)) for first in range(0, n_games, size)]
-        #: Why nothing can be asked any more.
+        #: Why the processes have ended, None while they run.
         self.ended: str | None = None
         self._venv = SubprocVecEnv(
             [partial(GameProcess, source, form, group) for group in self._groups],
@@ -115,7 +114,7 @@ class WorkerGames:
         )
         self._watch = _Watch(self._venv.processes, [_named(group) for group in self._groups])
         self._watch.start()
-        # At the interpreter's exit, or when the environment is forgotten.
+        # Runs at the interpreter's exit, or when the environment is garbage collected.
         self._finalizer = weakref.finalize(self, _close_workers, self._venv, os.getpid())
         self._run("build")
 
@@ -137,7 +136,7 @@ class WorkerGames:
         )
 
     def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
-        """Ask games (see :class:`TeamConcatVecEnv`)."""
+        """Query games (see :class:`TeamConcatVecEnv`)."""
         answers: dict[int, Any] = {}
         for group in self._run("call", "ask", list(questions)):
             answers |= group
@@ -148,7 +147,7 @@ class WorkerGames:
         return [snapshot for group in self._run("call", "snapshots") for snapshot in group]
 
     def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
-        """Go on from snapshots (see :class:`TeamConcatVecEnv`)."""
+        """Restore snapshots (see :class:`TeamConcatVecEnv`)."""
         self._run("call", "restore", snapshots)
 
     def close(self) -> None:
@@ -189,27 +188,26 @@ class WorkerGames:
 
 class _Watch(threading.Thread):
     """
-    End all processes when one has ended.
+    Thread that ends all processes when one has ended.
 
-    A forked process holds copies of the pipes of the others, so that nobody who waits for a reply of a dead process
-    would be told of its end.
+    Forked processes hold copies of each other's pipes, so the pipe of a dead process would never report its end.
 
     :param processes: all workers
-    :param names: of their games, for the message
+    :param names: names of their games, for the message
     """
 
     def __init__(self, processes: Sequence[BaseProcess], names: Sequence[str]) -> None:
         super().__init__(daemon=True)
         self._processes, self._names = processes, names
-        #: What there is to say of the first process that ended.
+        #: Message about the first process that ended.
         self.first_end: str | None = None
 
     def run(self) -> None:
-        """Wait for the first end, and end the others."""
+        """Wait until a process ends, then end the others."""
         ended = connection.wait([process.sentinel for process in self._processes])
         number = next(n for n, process in enumerate(self._processes) if process.sentinel in ended)
         process = self._processes[number]
-        while (code := process.exitcode) is None:  # another thread may be about to learn it
+        while (code := process.exitcode) is None:  # another thread may be about to set it
             time.sleep(0.001)
         self.first_end = (
             f"worker process {number} ({self._names[number]}, pid {process.pid}) ended with exit code {code}"
@@ -225,14 +223,14 @@ def _packed_failure(error: BaseException) -> bytes:
     trace = traceback.format_exc()
     try:
         pickled = cloudpickle.dumps(Failure(error, trace))
-        pickle.loads(pickled)  # some exceptions cannot be made again from their arguments
+        pickle.loads(pickled)  # some exceptions cannot be unpickled
         return bytes(pickled)
     except Exception:
         return bytes(cloudpickle.dumps(Failure(RuntimeError(f"{type(error).__name__}: {error}"), trace)))
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended, even if that was killed."""
+    """End this process when its parent has ended, even by a kill."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
@@ -240,7 +238,7 @@ def _end_with_parent() -> None:
 
 
 def _close_workers(venv: SubprocVecEnv, owner: int) -> list[bytes]:
-    """Close the games of all processes that still live, and end them; return their replies."""
+    """Close the games of all running processes and end these; return their replies."""
     if os.getpid() != owner:  # a copy in a forked process
         return []
     replies: list[bytes] = []

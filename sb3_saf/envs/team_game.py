@@ -1,4 +1,4 @@
-"""Bring games of others into the form that rows need: ParallelEnvs whose agents have equal spaces."""
+"""Conversion of games to ParallelEnvs whose agents have equal spaces, as rows need."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from sb3_saf.envs.teams import ACTION_MASK_KEY
 
 def team_game(env: Any) -> Any:
     """
-    Return the environment in the form that rows need; itself if there is nothing to do, or nothing that can be done.
+    Convert an environment to the form that rows need; return it unchanged if no conversion is necessary or known.
 
-    Gymnasium environments of several agents become ParallelEnvs (:class:`GymnasiumTeam`), agents that differ in their
-    spaces get equal ones (:class:`EqualSpaces`).
+    Gymnasium environments of several agents become ParallelEnvs (:class:`GymnasiumTeam`), agents with different spaces
+    get equal ones (:class:`EqualSpaces`).
 
-    :param env: anything
+    :param env: any object
     """
     if is_gymnasium_team(env):
         env = GymnasiumTeam(env)
@@ -32,7 +32,7 @@ def team_game(env: Any) -> Any:
 
 
 def make_team_game(make: Callable[[], Any]) -> Any:
-    """Call a factory and bring what it makes into the form that rows need."""
+    """Call a factory and convert its result by :func:`team_game`."""
     return team_game(make())
 
 
@@ -46,12 +46,13 @@ def _differ(env: ParallelEnv[Any, Any, Any]) -> bool:
 
 class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
     """
-    A game whose agents differ in their spaces, with equal ones.
+    Wrapper that gives agents with different spaces equal ones.
 
-    Observations: Boxes of as many axes are padded with zeros at the end of each axis; anything else becomes a vector,
-    as ``gymnasium.spaces.flatten`` makes it, and is padded then. Actions: Discrete ones get as many as the agent with
-    most has, and those that an agent does not have are masked (``infos[agent]["action_mask"]``, together with masks of
-    the game's own) and refused; of padded Boxes only the agent's own entries reach the game, clipped to its own bounds.
+    Observations: Boxes with equal numbers of axes are padded with zeros at the end of each axis; other spaces are
+    flattened to vectors by ``gymnasium.spaces.flatten`` and then padded. Actions: Discrete spaces are extended to the
+    largest one, and actions that an agent lacks are masked (``infos[agent]["action_mask"]``, combined with the game's
+    own masks) and refused; Boxes are padded, and only the agent's own entries reach the game, clipped to its own
+    bounds.
 
     :param env: the game
     :raises ValueError: if actions are neither all Discrete nor all vectors
@@ -107,7 +108,7 @@ class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
         return padded
 
     def _with_masks(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> dict[Any, Any]:
-        """Give the infos of agents that were observed a mask each, if there are any masks."""
+        """Add masks to the infos of observed agents, if there are any masks."""
         own = {agent: dict(info or {}) for agent, info in infos.items()}
         if not isinstance(self._action_space, spaces.Discrete):
             return own
@@ -162,7 +163,7 @@ def _common_actions(own: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
     if all(isinstance(space, spaces.Box) and len(space.shape) == 1 for space in own.values()):
         boxes: list[spaces.Box] = list(own.values())  # type: ignore[arg-type]
         shape = (max(box.shape[0] for box in boxes),)
-        # An entry that only others have is free for an agent, so its padding does not widen the bounds.
+        # The padding of an agent that lacks an entry does not widen the bounds of that entry.
         low = np.min([_padded(box.low, shape, np.float32, np.inf) for box in boxes], axis=0)
         high = np.max([_padded(box.high, shape, np.float32, -np.inf) for box in boxes], axis=0)
         return spaces.Box(low, high, dtype=np.float32)

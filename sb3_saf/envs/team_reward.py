@@ -1,4 +1,4 @@
-"""What agents of a team are given to learn from: their own rewards, or the team's."""
+"""Rewards for learning: each agent's own, or the team's."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ TEAM_REWARDS: Final[tuple[TeamReward, ...]] = get_args(TeamReward)
 
 class SharedReward(TeamVecEnvWrapper):
     """
-    Give every agent the sum or the mean of its team's rewards. Around a TeamMonitor, which goes on to log returns as
-    the games give them.
+    Give every agent the sum or the mean of its team's rewards. Wrap it around a TeamMonitor, which logs the games' own
+    returns.
 
     :param venv: rows of flattened teams
     :param team_reward: ``"sum"`` or ``"mean"`` over the agents of a team
-    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
+    :param n_agents: N; None uses the attribute ``n_agents`` of ``venv``
     """
 
     def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"], n_agents: int | None = None) -> None:
@@ -31,7 +31,7 @@ class SharedReward(TeamVecEnvWrapper):
         self.team_reward = team_reward
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Wait for the step of all games; rewards (B,) are equal in a team."""
+        """Wait for the step of all games; rewards (B,) are equal within a team."""
         obs, rewards, dones, infos = self.venv.step_wait()
         by_game = np.asarray(rewards).reshape(self.n_games, self.n_agents)
         shared = by_game.sum(axis=1) if self.team_reward == "sum" else by_game.mean(axis=1)

@@ -1,5 +1,5 @@
 """
-Teams of rows: the one place that knows how agents of a team lie in a vector environment.
+Teams of rows: layout of the agents of a team in a vector environment.
 
 Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row ``e * N + i`` is agent ``i`` of game
 ``e``.
@@ -40,7 +40,7 @@ ACTIVE_KEY: Final = "active"
 ACTION_MASK_KEY: Final = "action_mask"
 #: The state of the row's game, for critics.
 STATE_KEY: Final = "state"
-#: Only observations of environments that give them have these.
+#: Keys that only some environments provide.
 OPTIONAL_KEYS: Final[tuple[OptionalKey, ...]] = get_args(OptionalKey)
 ALL_KEYS: Final[frozenset[str]] = frozenset(TEAM_KEYS + OPTIONAL_KEYS)
 
@@ -49,13 +49,13 @@ Array = npt.NDArray[Any]
 #: Spaces whose samples have one shape and dtype.
 FIXED_SHAPE: Final = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
 
-#: Attributes by which a vector environment of flattened teams tells its shape.
+#: Attributes with the shape of a vector environment of flattened teams.
 _TEAM_ATTRIBUTES: Final = ("n_agents", "n_games")
 
 
 class TeamSpaces(NamedTuple):
     """
-    The parts of the Dict observation that ``CentralizedValueWrapper`` gives.
+    Parts of the Dict observation of ``CentralizedValueWrapper``.
 
     :param own: space of one agent's own observation (key ``"obs"``), shape ``(*shape)``
     :param team: Box of all own observations of a team (key ``"team"``), shape ``(N, *shape)``, dtype as in ``own``
@@ -84,14 +84,14 @@ class TeamSpaces(NamedTuple):
         state: spaces.Space[Any] | None = None,
     ) -> TeamSpaces:
         """
-        Spaces of a team whose agents all have one observation space.
+        Return the spaces of a team whose agents share one observation space.
 
         :param own: Box, Discrete, MultiDiscrete or MultiBinary
         :param n_agents: N
-        :param active: whether rows tell which agents take part
+        :param active: whether rows have ``"active"``
         :param n_masked_actions: A if rows have action masks
         :param state: space of the game's state if rows have it
-        :raises ValueError: if ``own`` is of another kind
+        :raises ValueError: if ``own`` is another kind of space
         """
         low, high = bounds_of(own)
         team = spaces.Box(
@@ -112,10 +112,10 @@ class TeamSpaces(NamedTuple):
     @classmethod
     def from_observation_space(cls, space: spaces.Space[Any]) -> TeamSpaces:
         """
-        Take the Dict observation space of ``CentralizedValueWrapper`` apart.
+        Split the Dict observation space of ``CentralizedValueWrapper`` into its parts.
 
-        :param space: the observation space that an algorithm, a policy or a buffer was given
-        :raises ValueError: if the space is not that of a team, with what to do
+        :param space: observation space of an algorithm, a policy or a buffer
+        :raises ValueError: if the space is not that of a team, with a fix
         """
         if not isinstance(space, spaces.Dict) or not set(TEAM_KEYS) <= set(space.spaces) <= ALL_KEYS:
             raise ValueError(_not_a_team_space(f"got {space}"))
@@ -153,7 +153,7 @@ class TeamSpaces(NamedTuple):
         return self.team.shape[1:]
 
     def to_dict_space(self) -> spaces.Dict:
-        """Observation space of one row; ``own`` stays the same object."""
+        """Return the observation space of one row; ``own`` stays the same object."""
         parts: dict[str, spaces.Space[Any] | None] = {
             OBS_KEY: self.own,
             TEAM_KEY: self.team,
@@ -188,8 +188,8 @@ def bounds_of(space: spaces.Space[Any]) -> tuple[Array, Array]:
     """
     Return the lowest and the highest value of each entry, both included, in the space's shape and dtype.
 
-    :param space: of fixed shape
-    :raises ValueError: for another
+    :param space: a space of fixed shape
+    :raises ValueError: for any other space
     """
     if isinstance(space, spaces.Box):
         return space.low, space.high
@@ -215,7 +215,7 @@ def _not_a_team_space(found: str) -> str:
 
 
 def layers(venv: VecEnv) -> Iterator[VecEnv]:
-    """Return an environment's wrappers, outermost first, and what they wrap."""
+    """Yield an environment's wrappers, outermost first, and the environment they wrap."""
     yield venv
     while isinstance(venv, VecEnvWrapper):
         venv = venv.venv
@@ -224,9 +224,9 @@ def layers(venv: VecEnv) -> Iterator[VecEnv]:
 
 def find_n_agents(venv: VecEnv) -> int | None:
     """
-    N of a vector environment of flattened teams, through any wrappers.
+    Return N of a vector environment of flattened teams, through any wrappers.
 
-    SB3's own look-up through wrappers refuses an attribute that two layers have, so the layers are asked one by one.
+    SB3's look-up through wrappers fails if two layers have the attribute, so each layer is checked.
 
     :param venv: any vector environment
     :return: N, or None if no layer states it
@@ -243,10 +243,10 @@ def _has_own(layer: VecEnv, name: str) -> bool:
 
 def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     """
-    N of a vector environment of flattened teams, checked against its number of rows.
+    Return N of a vector environment of flattened teams, checked against its number of rows.
 
     :param venv: vector environment with B rows
-    :param n_agents: N if the caller was told; None asks the environment
+    :param n_agents: N if known; None reads it from the environment
     :raises ValueError: if N is unknown, contradicts the environment or does not divide B
     """
     stated = find_n_agents(venv)
@@ -266,32 +266,32 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
 
 
 def chosen_rows(indices: VecEnvIndices, n_rows: int) -> list[int]:
-    """Return the rows that indices mean as SB3's methods take them, None for all."""
+    """Return the rows selected by ``indices`` as in SB3's methods, None for all."""
     rows = np.arange(n_rows)
     chosen = rows if indices is None else np.atleast_1d(rows[np.asarray(indices, dtype=np.int64)])
     return [*map(int, chosen)]
 
 
 def check_count(name: str, value: object) -> int:
-    """Check that a value is a whole number of at least 1; the ValueError has its name."""
+    """Check that a value is an integer of at least 1; the ValueError contains ``name``."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Check an argument that is one of a few words; the ValueError has them."""
+    """Check that an argument is one of ``choices``; the ValueError lists them."""
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
 
 
 def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:
     """
-    Check that rows make whole teams.
+    Check that the rows are a whole number of teams.
 
     :param n_rows: B
     :param n_agents: N
-    :param fix: what the error advises
+    :param fix: advice in the error message
     :return: E = B / N
     :raises ValueError: if N does not divide B
     """
@@ -305,12 +305,12 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
 
 def team_dones(dones: Array, n_agents: int) -> npt.NDArray[np.bool_]:
     """
-    Which games ended.
+    Return which games have ended.
 
     :param dones: (B,) one flag per row, of any dtype
     :param n_agents: N
     :return: (E,)
-    :raises ValueError: if the flags differ inside a team
+    :raises ValueError: if the flags differ within a team
     """
     by_game = np.asarray(dones).astype(bool).reshape(-1, n_agents)
     if not by_game.any():
@@ -328,11 +328,10 @@ def team_dones(dones: Array, n_agents: int) -> npt.NDArray[np.bool_]:
 
 def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
     """
-    Check that evaluation does not play the games that are trained on.
+    Check that evaluation does not use the games of training.
 
-    :param training: environment of teams; one that does not tell its seeds in an attribute ``seeded_with`` passes
-    :param evaluation: the other
-    :raises ValueError: if the seed of a game is in both
+    :param training: environment of teams; one without an attribute ``seeded_with`` passes :param evaluation:
+        environment for evaluation :raises ValueError: if both contain a game with the same seed
     """
     common = set(game_seeds_of(training) or ()) & set(game_seeds_of(evaluation) or ()) - {None}
     if common:
@@ -344,16 +343,16 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
 
 
 def game_seeds_of(venv: VecEnv) -> tuple[int | None, ...] | None:
-    """Return the seeds that games were given last, None for fresh ones; None if the environment does not tell."""
+    """Return the last seeds of the games (None for random ones), or None if the environment does not record them."""
     *_, innermost = layers(venv)
     return getattr(innermost, "seeded_with", None)
 
 
 def check_finite(name: str, values: Array, n_agents: int, step: int, first_game: int = 0) -> None:
     """
-    Stop at NaN and infinity; integers pass unread.
+    Raise NonFiniteError for NaN and infinity; integers are not read.
 
-    :param name: what the values are, for the message
+    :param name: name of the values, for the message
     :param values: (B, ...) one entry per row
     :param n_agents: N
     :param step: steps since the environment was made, for the message
@@ -382,16 +381,15 @@ def _others(count: int) -> str:
 
 class TeamVecEnvWrapper(VecEnvWrapper):
     """
-    A wrapper that keeps the shape of a vector environment of flattened teams in plain sight.
+    Base of wrappers around vector environments of flattened teams, with attributes ``n_agents`` and ``n_games``. The
+    layers below may have these attributes, too. SB3 would call that ambiguous in a further wrapper (such as
+    VecNormalize); here all layers have equal values, so it is allowed.
 
-    ``n_agents`` and ``n_games`` are attributes here and may be attributes of the layers below, too. SB3 calls that
-    ambiguous when a further wrapper (such as VecNormalize) is asked for them; here the answers are always equal.
-
-    SB3's ``evaluate_policy``, ``EvalCallback`` and ``VecMonitor`` would take every agent for an environment: who puts
-    them around teams, or VecMonitor below, is warned once, with the names of what counts team episodes.
+    SB3's ``evaluate_policy``, ``EvalCallback`` and ``VecMonitor`` count every agent as an environment: their use around
+    teams, or of VecMonitor below, issues one warning with the names of the team versions.
 
     :param venv: vector environment with B rows
-    :param n_agents: N; None asks ``venv``
+    :param n_agents: N; None reads it from ``venv``
     :param observation_space: observation space of a row if the wrapper changes it
     :raises ValueError: if N is unknown, contradicts the environment or does not divide B
     """
@@ -419,7 +417,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         return attr_name in _TEAM_ATTRIBUTES or super().has_attr(attr_name)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """See the base class; the team's shape is answered here, whether the environments know it or not."""
+        """See the base class; the team's shape is answered here, even if the environments lack it."""
         if attr_name in _TEAM_ATTRIBUTES and attr_name in vars(self):
             return [vars(self)[attr_name] for _ in chosen_rows(indices, self.num_envs)]
         return super().get_attr(attr_name, indices)
@@ -427,7 +425,10 @@ class TeamVecEnvWrapper(VecEnvWrapper):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """See the base class; who asks for SB3's ``Monitor`` is about to count rows for episodes, and is warned."""
+        """
+        See the base class; a query for SB3's ``Monitor`` issues a warning, since its caller would count rows as
+        episodes.
+        """
         if wrapper_class is not Monitor:
             return super().env_is_wrapped(wrapper_class, indices)
         self._warn_of_rows()

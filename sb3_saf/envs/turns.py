@@ -1,4 +1,4 @@
-"""Games whose players take turns, as games in which all act at once and those who wait can do nothing."""
+"""Turn-based games as parallel games in which waiting agents have one legal action."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from pettingzoo.utils.conversions import turn_based_aec_to_parallel
 
 ACTION_MASK: Final = "action_mask"
 
-#: What generators of other projects take (OpenSpiel's, and NumPy's older one). Seeds of games here have 63 bits.
+#: Upper limit for seeds of OpenSpiel's generators and NumPy's older one; seeds of games here have 63 bits.
 _SEEDS: Final = 2**31
 
 
 class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
     """
-    A turn-based game (PettingZoo's AEC form: Connect Four, Hanabi, Leduc hold'em, ...) as a ParallelEnv for
-    ``make_team_env``.
+    ParallelEnv for ``make_team_env`` around a turn-based game (PettingZoo's AEC form: Connect Four, Hanabi, Leduc
+    hold'em, ...).
 
-    At each step one agent moves. All others have one legal action, 0, which nobody looks at: their mask says so, so
-    that they learn nothing from it. The mask is where the game has it, in observations of the form
-    {"observation", "action_mask"}; a game without masks gets them in ``infos[agent]["action_mask"]``, with all actions
-    legal for the agent that moves.
+    At each step one agent moves. All others have one legal action, 0, which is ignored; their mask allows nothing else,
+    so that they learn nothing from it. The mask is where the game has it, in observations of the form {"observation",
+    "action_mask"}; a game without masks gets them in ``infos[agent]["action_mask"]``, with all actions legal for the
+    agent that moves.
 
     ::
 
@@ -60,7 +60,7 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
         return self._with_masks(observations, infos)
 
     def step(self, actions: dict[Any, Any]) -> Any:
-        """Let the agent move whose turn it is; actions of agents that wait are not read."""
+        """Play the move of the agent whose turn it is; actions of waiting agents are ignored."""
         observations, rewards, terminations, truncations, infos = super().step(actions)
         observations, infos = self._with_masks(observations, infos)
         return observations, rewards, terminations, truncations, infos
@@ -68,7 +68,7 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
     def _with_masks(
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]
     ) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        """Say of each agent what it can do; the game's own dicts stay as they are."""
+        """Return observations and infos with the mask of each agent; the game's own dicts are unchanged."""
         shown, told = dict(observations), {agent: dict(info) for agent, info in infos.items()}
         for agent, observation in observations.items():
             if isinstance(observation, Mapping) and ACTION_MASK in observation:
@@ -79,7 +79,7 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
         return shown, told
 
     def _mask(self, agent: Any, mask: Any) -> npt.NDArray[Any]:
-        """(A,) what an agent can do; ``mask`` is what the game says, None for nothing."""
+        """Return the mask (A,) of an agent; ``mask`` is the game's own, None if it has none."""
         if agent == self._aec.agent_selection:
             return np.ones(self._n_actions[agent], np.int8) if mask is None else np.asarray(mask)
         wait = np.zeros(self._n_actions[agent], np.int8 if mask is None else np.asarray(mask).dtype)

@@ -1,4 +1,4 @@
-"""One game of a VecEnv of teams as a PettingZoo ParallelEnv, to be watched and played."""
+"""One game of a VecEnv of teams as a PettingZoo ParallelEnv, for watching and playing."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
 
 class VecGame(ParallelEnv[Any, Any, Any]):
     """
-    The first and only game of a VecEnv whose rows are the agents of a team.
+    ParallelEnv around the single game of a VecEnv whose rows are the agents of a team.
 
-    Masks are in ``infos[agent]["action_mask"]``; agents whose row says that they take no part leave ``agents``.
+    Masks are in ``infos[agent]["action_mask"]``; agents with an inactive row leave ``agents``.
 
-    :param venv: of one game, as :mod:`sb3_saf.suites` describes it
+    :param venv: VecEnv of one game, as described in :mod:`sb3_saf.suites`
     """
 
     def __init__(self, venv: VecEnv) -> None:
@@ -94,7 +94,7 @@ class VecGame(ParallelEnv[Any, Any, Any]):
         self.venv.close()
 
     def _shown(self, obs: Any, infos: list[dict[str, Any]]) -> tuple[dict[Any, Any], dict[Any, dict[str, Any]]]:
-        """Take rows apart, and note who takes part."""
+        """Split rows into observations and infos by agent, and update ``agents``."""
         parts = self._rows.entries(obs, "observations")
         if STATE_KEY in parts:
             self._state = np.array(parts[STATE_KEY][0])
