@@ -310,7 +310,6 @@ class GameBatch:
         Check that a snapshot is a valid state of these games.
 
         :param snapshot: result of :meth:`snapshot`
-
         :raises ValueError: naming the first array with a wrong shape or type, or the first value that no game reaches
         """
         check_snapshot(snapshot, self._games, self._seeded, self.params)

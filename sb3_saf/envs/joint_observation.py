@@ -74,7 +74,6 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     :param venv: rows of flattened teams, game-major, then agent
     :param n_agents: N; None uses the attribute ``n_agents`` of ``venv``
-
     :param time_limit: ``"terminal"`` treats a time limit as a true end (as in the paper's experiments); ``"bootstrap"``
         lets the algorithm add the value of the last observation where the env sets ``"TimeLimit.truncated"``
     :raises ValueError: if N is unknown or does not divide the rows, the observation space is a Tuple or a Dict of

@@ -35,7 +35,6 @@ class Request(NamedTuple):
 
     :param n_envs: E
     :param backend: None for the default
-
     :param n_cpus: number of processes
     :param signals: signals besides own observations
     """

@@ -41,7 +41,8 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
       checked, and errors name agent, game and step.
 
     :param env: the game
-    :param form: its form :param index: index of the game, for messages
+    :param form: its form
+    :param index: index of the game, for messages
     :param notes: gets a note if observations leave their bounds
     """
 
@@ -76,7 +77,8 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         """
         Begin an episode.
 
-        :param seed: seed of the game, None to continue its random stream :param options: options for the game
+        :param seed: seed of the game, None to continue its random stream
+        :param options: options for the game
         :return: observations and infos of the N rows
         :raises ValueError: if the game violates PettingZoo's API
         """

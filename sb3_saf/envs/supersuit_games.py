@@ -35,9 +35,11 @@ class Played(NamedTuple):
     """
     Results of a step of some games, by row.
 
-    :param observations: observations of the rows :param rewards: float32
+    :param observations: observations of the rows
+    :param rewards: float32
     :param dones: bool
-    :param infos: infos of the rows :param reset_infos: infos of the last reset of each row's game
+    :param infos: infos of the rows
+    :param reset_infos: infos of the last reset of each row's game
     :param notes: texts of warnings to issue
     """
 
@@ -102,8 +104,9 @@ class TeamConcatVecEnv(ConcatVecEnv):
     of games are accessible, and all games are closed even if closing one fails.
 
     :param source: makes the games
-    :param form: form of the games :param indices: indices of the games among all E :raises ValueError: if the source
-        returns the same environment twice
+    :param form: form of the games
+    :param indices: indices of the games among all E
+    :raises ValueError: if the source returns the same environment twice
     """
 
     def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:

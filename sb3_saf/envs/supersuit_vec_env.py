@@ -61,12 +61,10 @@ class SuperSuitVecEnv(TeamVecEnv):
     :param seed: seed of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
     :param active: whether rows have ``"active"``
-
     :param action_masks: None leaves observations unchanged. ``"auto"`` adds masks to rows if the game gives any, in
         observations of the form {"observation", "action_mask"} or in ``infos[agent]["action_mask"]``, True requires
         them, False adds none; all three split observations of that form, and flatten Dicts and Tuples of scalars and
         vectors to one vector, as ``gymnasium.spaces.flatten`` does
-
     :param state: whether rows have the game's ``state()``
     :raises ValueError: if the environment is no ParallelEnv, cannot be copied, its agents differ in their spaces, or a
         requested signal is missing

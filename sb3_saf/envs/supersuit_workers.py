@@ -47,7 +47,8 @@ class GameProcess(gymnasium.Env[Any, Any]):
     does not end the process.
 
     :param source: makes the games
-    :param form: form of the games :param indices: indices of the games among all E
+    :param form: form of the games
+    :param indices: indices of the games among all E
     """
 
     observation_space = action_space = spaces.Discrete(1)

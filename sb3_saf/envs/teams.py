@@ -330,8 +330,9 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
     """
     Check that evaluation does not use the games of training.
 
-    :param training: environment of teams; one without an attribute ``seeded_with`` passes :param evaluation:
-        environment for evaluation :raises ValueError: if both contain a game with the same seed
+    :param training: environment of teams; one without an attribute ``seeded_with`` passes
+    :param evaluation: environment for evaluation
+    :raises ValueError: if both contain a game with the same seed
     """
     common = set(game_seeds_of(training) or ()) & set(game_seeds_of(evaluation) or ()) - {None}
     if common:

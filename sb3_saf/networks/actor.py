@@ -1,9 +1,9 @@
 """
-Actors: from the features of an agent's own observation to its action distribution. Nothing else enters, so that an
-actor runs wherever the agent is.
+Actors: networks from the features of an agent's own observation to its action distribution. They have no other input
+(but the agent's index, where enabled), so that execution is decentralised.
 
-IPPO and MAPPO act by a :class:`SinglePolicy`, SAF by a :class:`PolicyPool`: a few policies that all agents share, and a
-choice among them by signature keys (arXiv 2210.03022, section 5).
+IPPO and MAPPO use a :class:`SinglePolicy`, SAF a :class:`PolicyPool`: policies that all agents share, selected by
+signature keys (arXiv 2210.03022, section 5).
 
 Letters: K rows, U policies, d features, P parameters of one policy's action distribution.
 """
@@ -21,19 +21,19 @@ from sb3_saf.networks.distributions import mixture_log_probs, n_action_parameter
 from sb3_saf.networks.layers import AgentHeads, mlp, side_by_side
 from sb3_saf.networks.spaces import AnySpace, spec_of
 
-#: Orthogonal gain of the last layer: first policies are close to uniform.
+#: Orthogonal gain of the last layer: initial policies are close to uniform.
 ACTION_GAIN = 0.01
 
-#: How the pool acts: as the exact mixture of its policies, or through one policy drawn anew at every evaluation.
+#: Action distribution of the pool: the exact mixture of its policies, or one policy drawn at every evaluation.
 Selection = Literal["mixture", "gumbel"]
 
 
 class PoolOutput(NamedTuple):
     """
-    What each policy of a pool would do, and how likely each is to be chosen.
+    Selection weights and action parameters of the policies of a pool.
 
     :param log_weights: (K, U), normalised
-    :param actions: (K, U, P), parameters of each policy's action distribution; in memory, rows are last
+    :param actions: (K, U, P), parameters of each policy's action distribution; rows are the last axis in memory
     """
 
     log_weights: th.Tensor
@@ -72,7 +72,7 @@ class ActionHead(nn.Module):
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
-        Parameters of the action distribution.
+        Return the parameters of the action distribution.
 
         :param features: (K, d)
         :return: (K, P)
@@ -87,7 +87,7 @@ class ActorNetwork(nn.Module, ABC):
 
     :param action_space: the action space
     :param reads_agent: whether ``forward`` needs the agent's index
-    :param n_identities: N if the network reads who acts, as a one-hot vector beside the features; 0 if it does not
+    :param n_identities: N if the network reads the agent's index as a one-hot vector beside the features; else 0
     """
 
     def __init__(self, action_space: AnySpace, reads_agent: bool, n_identities: int = 0):
@@ -99,7 +99,7 @@ class ActorNetwork(nn.Module, ABC):
     @abstractmethod
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
-        Everything that the action distribution depends on, as one vector per row.
+        Return the parameters of the whole action distribution, one vector per row.
 
         :param features: (K, d) features of own observations
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
@@ -109,7 +109,7 @@ class ActorNetwork(nn.Module, ABC):
     @abstractmethod
     def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """
-        Ask every policy and weigh them; a single policy has the weight 1.
+        Evaluate every policy and its weight; a single policy has weight 1.
 
         :param features: (K, d) features of own observations
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
@@ -118,11 +118,11 @@ class ActorNetwork(nn.Module, ABC):
 
     def with_identity(self, features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
         """
-        Put who acts beside the features, where the network reads it.
+        Append the one-hot agent index to the features if the network reads it.
 
         :param features: (K, d)
         :param agent: (K,) int64 index of the agent
-        :return: (K, d + N), or the features where ``n_identities`` is 0
+        :return: (K, d + N), or the features if ``n_identities`` is 0
         """
         if not self.n_identities:
             return features
@@ -133,7 +133,7 @@ class ActorNetwork(nn.Module, ABC):
 
     def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
-        As ``forward``, but with the parameters of every policy, which is where masks of actions have to apply.
+        Return the parameters of every policy, to which action masks must be applied before mixing.
 
         :param features: (K, d) features of own observations
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
@@ -153,7 +153,7 @@ class SinglePolicy(ActorNetwork):
     :param activation_fn: activation of the hidden layers
     :param log_std_init: first log standard deviation, Box actions only
     :param n_agents: N for one policy per agent; None for one that all share
-    :param n_identities: N if a shared policy reads who acts, as a one-hot vector beside the features
+    :param n_identities: N if a shared policy reads the agent's index as a one-hot vector beside the features
     """
 
     def __init__(
@@ -193,16 +193,16 @@ class SinglePolicy(ActorNetwork):
 
 class PolicyPool(ActorNetwork):
     """
-    U policies, of which one is chosen for each observation: weights = softmax(q . k_u / sqrt(d)), q = g_psel(z).
+    Pool of U policies with selection weights softmax(q . k_u / sqrt(d)), q = g_psel(z).
 
-    ``selection="mixture"``: acting by drawing u from the weights, then the action from policy u. Likelihood, entropy
-    and most likely action are those of the mixture, exactly where the action space allows it (see
+    ``selection="mixture"``: u is drawn from the weights, then the action from policy u. Likelihood, entropy and most
+    likely action are those of the mixture, exact where the action space allows it (see
     ``sb3_saf.networks.distributions``).
 
-    ``selection="gumbel"``: one policy is drawn whenever a distribution is made (Gumbel noise on the logits, hard
-    choice, straight-through gradient), and likelihood and entropy are that policy's. This is how the released code
-    behaves; two evaluations of one action may compare different policies. Deterministic actions are the favourite
-    policy's.
+    ``selection="gumbel"``: one policy is drawn for each distribution (Gumbel noise on the logits, hard choice,
+    straight-through gradient), and likelihood and entropy are that policy's. This is the behaviour of the released
+    code; two evaluations of one action may use different policies. Deterministic actions are those of the policy with
+    the highest weight.
 
     :param features_dim: size of z
     :param action_space: the action space
@@ -213,7 +213,7 @@ class PolicyPool(ActorNetwork):
     :param latent_dim: d, size of queries and signature keys
     :param projection_hidden: sizes of the hidden layers of g_psel
     :param log_std_init: first log standard deviation, Box actions only
-    :param n_identities: N if choice and policies read who acts, as a one-hot vector beside z; 0 if they do not
+    :param n_identities: N if selection and policies read the agent's index as a one-hot vector beside z; else 0
     """
 
     def __init__(
@@ -233,7 +233,7 @@ class PolicyPool(ActorNetwork):
         features_dim += n_identities
         self.selection = selection
         self.n_policies = n_policies
-        # First choices are close to uniform, too: policies become different before they are chosen for good.
+        # Initial selection is close to uniform, so that policies differentiate before the selection settles.
         self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn, output_gain=ACTION_GAIN)
         self.signature_keys = nn.Parameter(th.randn(n_policies, latent_dim))
         self.policies = nn.ModuleList(
@@ -270,7 +270,7 @@ class PolicyPool(ActorNetwork):
 
     def split(self, parameters: th.Tensor) -> PoolOutput:
         """
-        Take what :meth:`unmixed` gave apart.
+        Split the result of :meth:`unmixed`.
 
         :param parameters: (B, U + U P)
         """
@@ -279,13 +279,13 @@ class PolicyPool(ActorNetwork):
 
     @property
     def is_categorical_mixture(self) -> bool:
-        """Whether the pool's distribution is one categorical: the mixture is then computed before rows are gathered."""
+        """Return whether the mixture is a single categorical, which is then computed before rows are gathered."""
         return self.selection == "mixture" and self.space.kind == "discrete"
 
 
 def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """
-    Draw one policy per row with its weight; gradients reach the weights straight through the hard choice.
+    Draw one policy per row by its weight, with straight-through gradients to the weights.
 
     :param log_weights: (B, U)
     :param actions: (B, U, P)
@@ -294,6 +294,6 @@ def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
     uniform = th.rand_like(log_weights).clamp_min(th.finfo(log_weights.dtype).tiny)
     noisy = log_weights - (-uniform.log()).log()
     soft = noisy.softmax(dim=1)
-    # Zero in value; in the gradient, the choice counts as if it had been soft.
+    # Zero in value; its gradient is that of the soft choice.
     straight_through = ((soft - soft.detach()).unsqueeze(2) * actions.detach()).sum(dim=1)
     return policy_parameters(actions, noisy.argmax(dim=1)) + straight_through

@@ -1,6 +1,6 @@
 """
-One head of scaled dot-product attention. On the CPU its core is compiled: with a few queries and a few sources in each
-of many groups, PyTorch's batched products and its softmax take ten times as long.
+One head of scaled dot-product attention. Its core is compiled on the CPU: for many groups of few queries and few
+sources, PyTorch's batched products and softmax take ten times as long.
 
 Letters: G groups, Q queries, S sources, d features.
 """
@@ -20,16 +20,16 @@ from torch.autograd.function import once_differentiable
 from sb3_saf.networks.layers import Linear
 
 Floats = npt.NDArray[np.float32]
-#: Sums may be added up in any order, which is the same every time.
+#: Allows reordering of sums; the order is fixed at compile time.
 _FAST: Final = {"contract", "reassoc", "nsz"}
 
 
 class Attended(NamedTuple):
     """
-    What an attention layer gives.
+    Output of an attention layer.
 
     :param values: (G, Q, d)
-    :param weights: (G, Q, S), the share of each source in each query's answer; sums to 1 over sources
+    :param weights: (G, Q, S), weight of each source for each query; sums to 1 over sources
     """
 
     values: th.Tensor
@@ -40,8 +40,8 @@ class Attention(nn.Module):
     """
     One head of scaled dot-product attention: softmax(Q K^T / sqrt(d)) V, then a linear output layer.
 
-    Queries, keys and values have no bias (spec: SAF's parameter table). So queries meet sources through one matrix,
-    W_q^T W_k, and what they take reaches the output through another, W_o W_v: sources are not projected at all.
+    Queries, keys and values have no bias (spec: SAF's parameter table). The projections are therefore merged to W_q^T
+    W_k, applied to queries, and W_o W_v, applied to the weighted sums: sources are not projected.
 
     :param features_dim: d
     """
@@ -56,11 +56,11 @@ class Attention(nn.Module):
 
     def forward(self, queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None = None) -> Attended:
         """
-        Let each query look at the sources.
+        Attend to the sources.
 
         :param queries: (G, Q, d), or (Q, d) that are the same for all G
         :param sources: (G, S, d)
-        :param active: (G, S) bool, sources to look at; all if None. Without any active source the values are zero
+        :param active: (G, S) bool, sources to attend to; all if None. Without any active source the values are zero
         :return: values (G, Q, d), with the output layer applied, and weights (G, Q, S)
         """
         queries = queries @ ((self.query.weight.t() * self.scale) @ self.key.weight)
@@ -70,19 +70,19 @@ class Attention(nn.Module):
 
 
 def _taken(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> Attended:
-    """(G, Q, d) sums of sources by their weights, softmax(queries sources^T), and these (G, Q, S)."""
+    """Return weighted sums of sources (G, Q, d) and the weights softmax(queries sources^T), (G, Q, S)."""
     scores = queries @ sources.transpose(1, 2)
     if active is None:
         weights = scores.softmax(dim=2)
     else:
-        # The lowest finite number instead of -inf: a row without sources gives zeros, not NaN.
+        # The lowest finite number instead of -inf: a row without sources gives zeros instead of NaN.
         shown = active.unsqueeze(1)
         weights = scores.masked_fill(~shown, th.finfo(scores.dtype).min).softmax(dim=2) * shown
     return Attended(weights @ sources, weights)
 
 
 def _taken_on_cpu(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> Attended:
-    """The same, compiled."""
+    """Compute :func:`_taken` compiled."""
     taken, weights = _Taken.apply(queries, sources, active)
     return Attended(taken, weights)
 
@@ -113,7 +113,7 @@ class _Taken(th.autograd.Function):
 
 
 def _by_group(queries: th.Tensor) -> Floats:
-    """(G or 1, Q, d)."""
+    """Return queries with a group axis, (G or 1, Q, d)."""
     array: Floats = queries.detach().numpy()
     return array if array.ndim == 3 else array[np.newaxis]
 
@@ -161,7 +161,7 @@ def _give_back(
     of_queries: Floats,
     of_sources: Floats,
 ) -> None:
-    """Add gradients to those of queries and sources."""
+    """Add the gradients of queries and sources to ``of_queries`` and ``of_sources``."""
     n_groups, n_sources, n_features = sources.shape
     of_weight = np.empty(n_sources, np.float32)
     for g in range(n_groups):

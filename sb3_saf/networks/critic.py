@@ -1,8 +1,7 @@
 """
-Critics: value estimates for training. Letters: K unique own observations, G unique teams, N agents, d features.
-
-Own observations and teams come separately (``features`` and ``teams``), so that what depends on a single observation is
-computed once for it.
+Critics: value estimates for training. Letters: K unique own observations, G unique teams, N agents, d features. Own
+observations and teams are separate arguments (``features`` and ``teams``), so that functions of a single observation
+are computed once per unique observation.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ Heads = Literal["shared", "per_agent"]
 
 
 class TeamCritic(nn.Module, ABC):
-    """Base of critics that read what the whole team sees."""
+    """Base of critics that read the observations of the whole team."""
 
     @abstractmethod
     def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """
-        Value of every agent of every team.
+        Return the value of every agent of every team.
 
         :param features: (K, d) features of own observations
-        :param teams: (G, N), which of them each agent of a team has
+        :param teams: (G, N), index into ``features`` of each agent of a team
         :param active: (G, N) bool, agents that take part; all if None
         :return: (G, N)
         """
@@ -36,7 +35,7 @@ class TeamCritic(nn.Module, ABC):
 
 class TeamStates(nn.Module, ABC):
     """
-    What a critic knows of each agent, before it judges. A critic with memory remembers these.
+    Base of modules that compute a critic's state of each agent: the input of its value head, or of its LSTM.
 
     :param states_dim: S, size of a state
     """
@@ -48,10 +47,10 @@ class TeamStates(nn.Module, ABC):
     @abstractmethod
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """
-        State of every agent of every team.
+        Return the state of every agent of every team.
 
         :param features: (K, d) features of own observations
-        :param teams: (G, N), which of them each agent of a team has
+        :param teams: (G, N), index into ``features`` of each agent of a team
         :param active: (G, N) bool, agents that take part; all if None
         :return: (G, N, S)
         """
@@ -59,12 +58,12 @@ class TeamStates(nn.Module, ABC):
 
 class JointStates(TeamStates):
     """
-    An agent's state is that of its whole team, side by side, and whose state it is (one-hot).
+    An agent's state is the concatenation of its team's states and its one-hot index.
 
     :param features_dim: d
     :param n_agents: N
-    :param agent_identity: False leaves out whose state it is: all agents of a team then have the same
-    :param members: makes each agent's own state, of size d; None for the features of its own observation
+    :param agent_identity: False omits the one-hot index: all agents of a team then have the same state
+    :param members: computes each agent's own state, of size d; None for the features of its own observation
     """
 
     def __init__(self, features_dim: int, n_agents: int, agent_identity: bool, members: TeamStates | None = None):
@@ -73,13 +72,13 @@ class JointStates(TeamStates):
         self.members = members
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`TeamStates`; agents that take no part are read as zeros."""
+        """See :class:`TeamStates`; inactive agents are read as zeros."""
         members = gather(features, teams) if self.members is None else self.members.states(features, teams, active)
         return self.join(members, active)
 
     def join(self, members: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """
-        Put the states of a team's members side by side.
+        Concatenate the states of a team's members.
 
         :param members: (G, N, d)
         :param active: (G, N) bool, agents that take part; all if None
@@ -95,12 +94,12 @@ class JointStates(TeamStates):
 
 
 class StateCritic(nn.Module, ABC):
-    """Base of critics that read the state of the game and nothing else."""
+    """Base of critics that read only the state of the game."""
 
     @abstractmethod
     def forward(self, states: th.Tensor) -> th.Tensor:
         """
-        Value of every agent of every game.
+        Return the value of every agent of every game.
 
         :param states: (G, *state) states, as SB3 preprocesses observations
         :return: (G, N)
@@ -111,7 +110,7 @@ class OwnValueHead(nn.Module):
     """
     Value of an agent from its own features.
 
-    :param spec: of the policy
+    :param spec: spec of the policy
     :param features_dim: d
     :param heads: one head for all agents, or one for each
     """
@@ -127,7 +126,7 @@ class OwnValueHead(nn.Module):
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
-        Values of single agents.
+        Return values of single agents.
 
         :param features: (K, d)
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
@@ -138,7 +137,7 @@ class OwnValueHead(nn.Module):
 
     def of_teams(self, features: th.Tensor) -> th.Tensor:
         """
-        Values of whole teams.
+        Return values of whole teams.
 
         :param features: (G, N, d)
         :return: (G, N)
@@ -153,13 +152,13 @@ class JointValueHead(nn.Module):
     """
     Value of an agent from the features of its whole team.
 
-    One head for all agents is told whose value is asked by the agent's identity (one-hot); without it, all agents of
-    a team get the same value. With one head per agent the head is the identity.
+    A head shared by all agents reads the agent's one-hot index; without it, all agents of a team get the same value.
+    With one head per agent the index selects the head.
 
-    :param spec: of the policy
+    :param spec: spec of the policy
     :param joint_dim: size of the joint features
     :param heads: one head for all agents, or one for each
-    :param agent_identity: whether a shared head reads the agent's identity
+    :param agent_identity: whether a shared head reads the agent's index
     """
 
     def __init__(self, spec: NetworkSpec, joint_dim: int, heads: Heads, agent_identity: bool):
@@ -172,7 +171,7 @@ class JointValueHead(nn.Module):
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
-        Values of whole teams.
+        Return values of whole teams.
 
         :param features: (G, N, d), or joint features of any other form (G, ...)
         :return: (G, N)
@@ -187,7 +186,7 @@ class JointValueHead(nn.Module):
         return values.squeeze(2).t()
 
     def _with_identity(self, joint: th.Tensor) -> th.Tensor:
-        """(G, N) values of [joint features, one-hot agent]; the first layer reads the joint part once per team."""
+        """Return values (G, N) of [joint features, one-hot agent]; the joint part is computed once per team."""
         first, *rest = cast(nn.Sequential, self.heads[0])
         assert isinstance(first, nn.Linear)
         weight_joint, weight_agent = first.weight.split([joint.shape[1], self.n_agents], dim=1)

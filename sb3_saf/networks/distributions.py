@@ -1,5 +1,5 @@
 """
-Action distributions of single policies and of pools of policies: likelihoods, masks and decisions, in torch alone.
+Action distributions of single policies and of pools of policies, in pure torch: likelihoods, masks, samples, modes.
 
 A policy's parameters are one vector per row: logits (Discrete, MultiDiscrete, MultiBinary), or means and then log
 standard deviations (Box). A pool is given by log weights (B, U), normalised, and the parameters of all its policies
@@ -20,11 +20,11 @@ from torch.utils.checkpoint import checkpoint
 
 from sb3_saf.networks.spaces import AnySpace, SpaceSpec, spec_of
 
-#: Up to this many joint actions, a pool's entropy and most likely action are found by enumeration.
+#: Maximum number of joint actions for which a pool's entropy and most likely action are enumerated.
 MAX_ENUMERATED_ACTIONS: Final = 4096
-#: Numbers held at once while enumerating; more rows are done in parts that backpropagation computes again.
+#: Maximum number of values in memory while enumerating; more rows are split into checkpointed chunks.
 _ENUMERATED_AT_ONCE: Final = 1 << 22
-#: Logit of what a mask forbids: its probability is zero to the last bit, and no sum or gradient is NaN as with -inf.
+#: Logit of masked actions: the probability is exactly zero, without the NaN in sums and gradients of -inf.
 _FORBIDDEN: Final = -1e8
 
 
@@ -41,17 +41,17 @@ def n_action_parameters(action_space: AnySpace) -> int:
 
 def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.Tensor) -> th.Tensor:
     """
-    Take forbidden choices out of the parameters of policies.
+    Mask illegal choices in the parameters of policies.
 
-    A mask that allows none of the choices of an action dimension leaves them equally likely: such rows (agents that
-    are out of the game) act, but teach nothing.
+    If a mask allows none of the choices of an action dimension, these become equally likely: such rows (inactive
+    agents) act, but have no gradient.
 
     :param action_space: Discrete, MultiDiscrete or MultiBinary
     :param parameters: (B, P), or (B, U, P) for a pool
-    :param masks: (B, M) bool, True for what is allowed: the choices of each dimension in turn (of a MultiBinary: off,
-        on), as sb3-contrib wants them
+    :param masks: (B, M) bool, True for allowed choices: those of each dimension in turn (of a MultiBinary: off, on), as
+        in sb3-contrib
     :return: as ``parameters``
-    :raises ValueError: if the masks do not fit, or the actions are of a Box
+    :raises ValueError: if the masks have a wrong shape, or the action space is a Box
     """
     space = spec_of(action_space)
     if space.kind == "box":
@@ -77,7 +77,7 @@ def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.T
 
 def sample_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
     """
-    Draw an action of one policy per row, with the random numbers that SB3's distributions would use.
+    Draw an action of one policy per row, with the same random numbers as SB3's distributions.
 
     :param action_space: the action space
     :param parameters: (B, P)
@@ -93,7 +93,7 @@ def sample_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
 
 def likeliest_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
     """
-    Find the most likely action of one policy per row.
+    Return the most likely action of one policy per row.
 
     :param action_space: the action space
     :param parameters: (B, P)
@@ -129,7 +129,7 @@ def policy_log_probs(action_space: AnySpace, parameters: th.Tensor, actions: th.
 
 
 def _factors(space: SpaceSpec, parameters: th.Tensor) -> list[Distribution]:
-    """Torch's distributions: one of all dimensions (Box, MultiBinary), or one of each."""
+    """Return torch's distributions: one for all dimensions (Box, MultiBinary), or one for each."""
     if space.kind == "box":
         mean, log_std = parameters.chunk(2, dim=-1)
         return [Normal(mean, log_std.exp(), validate_args=False)]
@@ -139,7 +139,7 @@ def _factors(space: SpaceSpec, parameters: th.Tensor) -> list[Distribution]:
 
 
 def _split(space: SpaceSpec, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
-    """The logits of each action dimension."""
+    """Return the logits of each action dimension."""
     return th.split(parameters, list(space.choices), dim=-1)
 
 
@@ -148,25 +148,25 @@ def _split(space: SpaceSpec, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
 
 def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
     """
-    Parameters of one policy per row.
+    Return the parameters of one policy per row.
 
     :param parameters: (B, U, P)
     :param policy: (B,) index of a policy
     :return: (B, P)
     """
-    # shape[0], not len(), here and elsewhere: a graph that is exported keeps it open.
+    # shape[0], not len(), here and elsewhere: it stays dynamic in exported graphs.
     return parameters[th.arange(policy.shape[0], device=policy.device), policy]
 
 
 def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
     """
-    Log-probabilities of a mixture of categorical policies: log sum_u w_u pi_u(a).
+    Return log-probabilities of a mixture of categorical policies: log sum_u w_u pi_u(a).
 
     :param log_weights: (B, U), normalised
     :param logits: (B, U, A)
     :return: (B, A), normalised
     """
-    # With rows last in memory, loops run over many rows instead of few actions.
+    # With rows last in memory, inner loops run over many rows instead of few actions.
     of_policies = logits.permute(1, 2, 0).contiguous().log_softmax(dim=1)
     return (log_weights.t().unsqueeze(1) + of_policies).logsumexp(dim=0).t()
 
@@ -175,7 +175,7 @@ def mixture_log_prob(
     action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor, actions: th.Tensor
 ) -> th.Tensor:
     """
-    Log-likelihood of a mixture, exactly: log sum_u w_u pi_u(a).
+    Return the exact log-likelihood of a mixture: log sum_u w_u pi_u(a).
 
     :param action_space: the action space
     :param log_weights: (B, U)
@@ -200,14 +200,14 @@ def mixture_sample(action_space: AnySpace, log_weights: th.Tensor, parameters: t
 
 
 def is_enumerable(action_space: AnySpace) -> bool:
-    """Whether a mixture's entropy and most likely action are found by trying all joint actions."""
+    """Return whether a mixture's entropy and most likely action are computed by enumerating joint actions."""
     space = spec_of(action_space)
     return space.kind != "box" and prod(space.choices) <= MAX_ENUMERATED_ACTIONS
 
 
 def mixture_mode(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
     """
-    Find a mixture's most likely action, or that of its likeliest policy where actions cannot be enumerated.
+    Return a mixture's most likely action, or that of its likeliest policy if actions cannot be enumerated.
 
     :param action_space: the action space
     :param log_weights: (B, U)
@@ -225,7 +225,7 @@ def mixture_mode(action_space: AnySpace, log_weights: th.Tensor, parameters: th.
 
 def mixture_entropy(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor | None:
     """
-    Entropy of a mixture by enumeration; None where actions cannot be enumerated.
+    Return the entropy of a mixture by enumeration; None if actions cannot be enumerated.
 
     :param action_space: the action space
     :param log_weights: (B, U)
@@ -239,7 +239,7 @@ def mixture_entropy(action_space: AnySpace, log_weights: th.Tensor, parameters: 
 def _over_joint_actions(
     space: SpaceSpec, log_weights: th.Tensor, parameters: th.Tensor, reduce: Callable[[th.Tensor], th.Tensor]
 ) -> th.Tensor:
-    """(B,) of a function of the mixture's joint log-probabilities (rows, J), in parts of bounded memory."""
+    """Apply a function (rows, J) -> (rows,) to the mixture's joint log-probabilities, in chunks of bounded memory."""
 
     def part(log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         joint = _joint_log_probs(space, parameters)
@@ -255,7 +255,7 @@ def _over_joint_actions(
 
 
 def _joint_log_probs(space: SpaceSpec, parameters: th.Tensor) -> th.Tensor:
-    """(B, U, J) log-probabilities of every joint action under every policy, the last action dimension fastest."""
+    """Return log-probabilities (B, U, J) of every joint action under every policy, last action dimension fastest."""
     if space.kind == "multi_binary":
         factors = list(th.stack([F.logsigmoid(-parameters), F.logsigmoid(parameters)], dim=3).unbind(dim=2))
     else:

@@ -1,12 +1,11 @@
 """
-Encoders: networks that read one agent's own observation. Letters: K observations, C channels, H x W pixels, t pixels
+Encoders: networks for one agent's own observation. Letters: K observations, C channels, H x W pixels, t pixels
 per tile, d features.
 
-Each takes raw observations (uint8 pictures, tile codes, indices) as well as what :func:`preprocess` makes of them
-(floats in [0, 1], one-hot vectors). *Tile codes* are whole numbers that come with an atlas (n_codes, t, t, C) of the
-pixels of every code; they become pixels on the device of the network. Encoders of tiles and of the same pictures have
-the same weights and give the same features. Policies use them through ``sb3_saf.policies.extractors``, exported actors
-as they are.
+Each takes raw observations (uint8 pictures, tile codes, indices) as well as results of :func:`preprocess` (floats in
+[0, 1], one-hot vectors). *Tile codes* are integers with an atlas (n_codes, t, t, C) of the pixels of every code; they
+become pixels on the device of the network. Encoders of tile codes and of the same pictures have the same weights and
+features. Policies use them through ``sb3_saf.policies.extractors``, exported actors directly.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ from torch import nn
 from sb3_saf.networks.layers import HIDDEN_GAIN, Linear, mlp
 from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec
 
-#: The least side of a picture from which NatureCNN's convolutions leave something.
+#: Smallest side of a picture for NatureCNN's convolutions.
 NATURE_PIXELS: Final = 36
-#: A one-hot code is as long as the pixels of a tile, roughly.
+#: Value of one-hot codes, so that their norm is close to that of a tile's pixels.
 _ONE_HOT_SCALE: Final = 2.0
 
 
 def preprocess(observations: th.Tensor, space: SpaceSpec, normalize_images: bool = True) -> th.Tensor:
     """
-    Make floats of raw observations, as SB3 does before it calls a features extractor.
+    Convert raw observations to floats, as SB3 does before it calls a features extractor.
 
     :param observations: (K, *shape)
-    :param space: of one observation
+    :param space: space of one observation
     :param normalize_images: whether pictures of bytes are scaled to [0, 1]
     :return: (K, *shape) float, or (K, n) one-hot vectors of Discrete and MultiDiscrete
     """
@@ -48,15 +47,15 @@ class Encoder(nn.Module):
     """Base of all encoders."""
 
     def __init__(self) -> None:
-        # Not super(): between this and SB3's extractors that inherit from it stands a class that needs arguments.
+        # Not super(): in SB3's extractors that inherit from this class, the next class needs arguments.
         nn.Module.__init__(self)
 
 
 class PixelInput(nn.Module):
     """
-    Pictures of any layout, or tile codes, as float pictures in [0, 1].
+    Convert pictures of any layout, or tile codes, to float pictures in [0, 1].
 
-    The result is a channels-first tensor whose memory is channels-last, which is what convolutions are fastest on.
+    The result is a channels-first tensor with channels-last memory, for which convolutions are fastest.
 
     :param observation: a Box of shape (C, H, W) or (H, W, C), or of tile codes (rows, columns)
     """
@@ -69,8 +68,8 @@ class PixelInput(nn.Module):
         self.layout: Literal["codes", "channels_first", "channels_last"]
         if atlas is not None:
             self.layout = "codes"
-            # Not part of the state dict: what codes look like belongs to the space, and weights fit pictures as well.
-            # from_numpy, because it makes numbers even where networks are made without (on the device "meta").
+            # Not part of the state dict: the atlas belongs to the space, and the weights also fit pictures. from_numpy,
+            # because it holds data even if networks are made on the device "meta".
             self.register_buffer("atlas", th.from_numpy(np.array(atlas)).float() / 255.0, persistent=False)
         elif space.kind != "box" or len(space.shape) != 3:
             raise ValueError(
@@ -83,9 +82,9 @@ class PixelInput(nn.Module):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
-        Make pictures.
+        Return pictures.
 
-        :param observations: (K, C, H, W), (K, H, W, C) or codes (K, rows, columns); whole numbers are taken for 0..255
+        :param observations: (K, C, H, W), (K, H, W, C) or codes (K, rows, columns); integers are in 0..255
         :return: (K, C, H, W) float
         """
         if self.layout == "codes":
@@ -98,12 +97,12 @@ class PixelInput(nn.Module):
         return pictures.contiguous(memory_format=th.channels_last)
 
     def tiles(self, codes: th.Tensor) -> th.Tensor:
-        """(U, C, t, t) pictures of single tiles: (U,) codes."""
+        """Return pictures (U, C, t, t) of single tiles with codes (U,)."""
         return self.atlas[codes].permute(0, 3, 1, 2)
 
 
 class _FlattenPictures(nn.Flatten):
-    """Flattens channels-last memory; the gradient comes back in that order, too, or the layer before is slow."""
+    """Flatten pictures, and keep the gradient in channels-last memory, which makes the previous layer fast."""
 
     def forward(self, pictures: th.Tensor) -> th.Tensor:
         """(K, C, H, W) to (K, C * H * W)."""
@@ -162,8 +161,8 @@ class NatureEncoder(Encoder):
     The encoder for larger pictures: SB3's ``NatureCNN`` (convolutions 8x8/4 -> 32, 4x4/2 -> 64, 3x3/1 -> 64, linear
     ``features_dim``, ReLU after each).
 
-    Its steps are larger than the paper's and nothing wide follows them: at 84 x 84 x 3 it has 0.3 million weights where
-    ``PaperCNN`` has 13 million, and is six times faster; at 280 x 480 it has 7 million instead of 269 million.
+    Its strides are larger than the paper's and no wide layer follows: at 84 x 84 x 3 it has 0.3 million weights instead
+    of ``PaperCNN``'s 13 million, and is six times faster; at 280 x 480 it has 7 million instead of 269 million.
 
     :param observation: pictures (either layout) or tile codes, 36 x 36 pixels or more
     :param features_dim: size of the features
@@ -187,7 +186,7 @@ class NatureEncoder(Encoder):
 
 
 class _NatureCNN(nn.Module):
-    """SB3's ``NatureCNN``, with the same names and the same first weights, without SB3."""
+    """SB3's ``NatureCNN`` without SB3: the same parameter names and initial weights."""
 
     def __init__(self, shape: tuple[int, int, int], features_dim: int):
         super().__init__()
@@ -212,21 +211,20 @@ class _NatureCNN(nn.Module):
 
 class LightEncoder(Encoder):
     """
-    An encoder for small computers: one linear embedding for every tile, linear 128, ReLU, linear ``features_dim``.
+    Fast encoder for CPUs: a linear embedding of each tile, linear 128, ReLU, linear ``features_dim``.
 
-    Tile codes are embedded once per code and looked up. In pictures, tiles are cut out first.
+    Tile codes are embedded once per code and looked up. Pictures are cut into tiles first.
 
-    Tiles that look nearly alike have nearly the same embedding, as if they were nearly the same thing. With zones that
-    is in the way: an agent in orange means other actions than one in red. ``one_hot_codes`` tells them apart (measured:
-    ``results/README.md``).
+    Tiles with similar pixels have similar embeddings. With zones that is a disadvantage: an orange agent's actions
+    differ from a red one's. ``one_hot_codes`` separates them (measured: ``results/README.md``).
 
     :param observation: pictures (either layout) or tile codes
     :param features_dim: size of the features
-    :param tile_size: t, pixels per tile of pictures; tile codes bring their own
+    :param tile_size: t, pixels per tile of pictures; tile codes have their own
     :param embedding_dim: size of a tile's embedding
     :param hidden: size of the hidden layer
     :param one_hot_codes: whether the embedding reads a tile's code beside its pixels, which needs tile codes; the
-        weights do not fit pictures then. None: where observations are tile codes
+        weights then do not fit pictures. None: True for tile codes
     :raises ValueError: for pictures that are not made of whole tiles, or with ``one_hot_codes=True``
     """
 
@@ -276,7 +274,7 @@ class LightEncoder(Encoder):
         return features
 
     def _inputs_of_codes(self, one_hot: bool) -> th.Tensor:
-        """(n_codes, inputs) what the embedding reads of every tile."""
+        """Return the embedding's inputs of every tile, (n_codes, inputs)."""
         pixels = self.pixels.atlas.flatten(1)
         return (
             th.cat([pixels, _ONE_HOT_SCALE * th.from_numpy(np.eye(len(pixels), dtype=np.float32))], dim=1)
@@ -285,7 +283,7 @@ class LightEncoder(Encoder):
         )
 
     def _cut(self, pictures: th.Tensor) -> th.Tensor:
-        """(K, tiles, t * t * C) pixels of each tile, in the order of an atlas: (K, C, H, W)."""
+        """Cut pictures (K, C, H, W) into tiles (K, tiles, t * t * C), with pixels in the order of an atlas."""
         channels, height, width = self.pixels.shape
         t = self.tile_size
         tiles = pictures.reshape(-1, channels, height // t, t, width // t, t).permute(0, 2, 4, 3, 5, 1)
@@ -294,7 +292,7 @@ class LightEncoder(Encoder):
 
 class MLPEncoder(Encoder):
     """
-    An encoder for vectors: linear 128, tanh, linear ``features_dim``. Whole-number spaces are read as one-hot vectors.
+    Encoder for vectors: linear 128, tanh, linear ``features_dim``. Integer spaces are read as one-hot vectors.
 
     :param observation: Box (flattened), Discrete, MultiDiscrete or MultiBinary
     :param features_dim: size of the features

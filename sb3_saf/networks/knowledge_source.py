@@ -1,5 +1,5 @@
 """
-The knowledge source: a few slots that all agents write to and read from (arXiv 2210.03022, section 5).
+Knowledge source: slots that all agents write to and read from (arXiv 2210.03022, section 5).
 
 Letters: G teams, N agents, L slots, d features. Attention weights are (G, query, source).
 """
@@ -17,10 +17,10 @@ from sb3_saf.networks.layers import mlp
 
 class Written(NamedTuple):
     """
-    The state of the knowledge source after writing.
+    State of the knowledge source after writing.
 
     :param slots: (G, L, d)
-    :param attention: (G, L, N), how much each slot took from each agent; sums to 1 over agents
+    :param attention: (G, L, N), attention of each slot to each agent; sums to 1 over agents
     """
 
     slots: th.Tensor
@@ -29,11 +29,11 @@ class Written(NamedTuple):
 
 class Exchanged(NamedTuple):
     """
-    What went through the knowledge source: who wrote where, who read where, and what was read.
+    Result of writing and reading.
 
     :param read: (G, N, d), m of every agent
-    :param write_attention: (G, L, N), how much each slot took from each agent; sums to 1 over agents
-    :param read_attention: (G, N, L), how much each agent took from each slot; sums to 1 over slots
+    :param write_attention: (G, L, N), attention of each slot to each agent; sums to 1 over agents
+    :param read_attention: (G, N, L), attention of each agent to each slot; sums to 1 over slots
     """
 
     read: th.Tensor
@@ -43,7 +43,7 @@ class Exchanged(NamedTuple):
 
 class CrossAttentionBlock(nn.Module):
     """
-    Slots look at the agents' messages: x + attend(norm(x), norm(messages)), then x + mlp(norm(x)).
+    Slots attend to the agents' messages: x + attend(norm(x), norm(messages)), then x + mlp(norm(x)).
 
     :param features_dim: d
     """
@@ -72,7 +72,7 @@ class CrossAttentionBlock(nn.Module):
 
 class SelfAttentionBlock(nn.Module):
     """
-    Slots look at each other: x + attend(norm(x)), then x + mlp(norm(x)).
+    Slots attend to each other: x + attend(norm(x)), then x + mlp(norm(x)).
 
     :param features_dim: d
     """
@@ -101,8 +101,8 @@ class KnowledgeSource(nn.Module):
     """
     Slots that attend to the agents' messages (write) and that agents attend to (read).
 
-    Writing costs L x N and reading N x L: linear in the number of agents. Which agent sent a message is marked by a
-    learned embedding; apart from that, the order of agents does not matter.
+    Writing costs L x N and reading N x L: linear in the number of agents. A learned embedding marks the sender of a
+    message; apart from that, the order of agents does not matter.
 
     :param n_agents: N
     :param features_dim: d of messages, states and slots
@@ -113,8 +113,8 @@ class KnowledgeSource(nn.Module):
     def __init__(self, n_agents: int, features_dim: int = 64, n_slots: int = 4, n_self_attention: int = 2):
         super().__init__()
         self.agent_embeddings = nn.Parameter(th.randn(n_agents, features_dim) * features_dim**-0.5)
-        # As large as the normed values that writing adds to them, and at right angles: smaller slots all become the
-        # mean of what is written, and nobody has a choice of what to read.
+        # Orthogonal, and as large as the normed values that writing adds: smaller slots would all become the mean of
+        # the messages, which makes reading from them indistinguishable.
         self.slots = nn.Parameter(nn.init.orthogonal_(th.empty(n_slots, features_dim), gain=features_dim**0.5))
         self.write_block = CrossAttentionBlock(features_dim)
         self.slot_blocks = nn.ModuleList(SelfAttentionBlock(features_dim) for _ in range(n_self_attention))
@@ -127,7 +127,7 @@ class KnowledgeSource(nn.Module):
         Fill the slots.
 
         :param messages: (G, N, d), m' of every agent
-        :param active: (G, N) bool, agents that are heard; all if None
+        :param active: (G, N) bool, agents whose messages are written; all if None
         :return: slots (G, L, d) and write attention (G, L, N)
         """
         slots, attention = self.write_block(self.slots, messages + self.agent_embeddings, active)
@@ -137,7 +137,7 @@ class KnowledgeSource(nn.Module):
 
     def read(self, states: th.Tensor, slots: th.Tensor) -> Attended:
         """
-        Answer the agents' queries.
+        Read from the slots with the agents' queries.
 
         :param states: (G, N, d), s of every agent
         :param slots: (G, L, d)
@@ -148,7 +148,7 @@ class KnowledgeSource(nn.Module):
 
     def exchange(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
         """
-        Write, then read, and tell who attended to what.
+        Write, then read; return the attention weights, too.
 
         :param messages: (G, N, d)
         :param states: (G, N, d)

@@ -1,5 +1,5 @@
 """
-Building blocks that actors and critics are made of.
+Building blocks of actors and critics.
 
 Letters: B, G, K rows of any kind, N agents, S sources, d features.
 """
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from gymnasium import spaces
 
 HIDDEN_GAIN: Final = math.sqrt(2)
-#: Up to so many outputs of a layer are laid out column by column.
+#: Layers with at most this many outputs are stored column by column.
 _FEW_OUTPUTS: Final = 16
 
 
 class NetworkSpec(NamedTuple):
     """
-    What a policy tells the networks that it is built from.
+    Properties of a policy from which its networks are built.
 
     :param features_dim: size of an encoded observation
     :param n_agents: N
@@ -35,7 +35,7 @@ class NetworkSpec(NamedTuple):
     :param value_hidden: sizes of the hidden layers of each value head
     :param activation_fn: activation of hidden layers
     :param log_std_init: first log standard deviation, Box actions only
-    :param state_space: space of the game's state where rows have it
+    :param state_space: space of the game's state if rows have it
     """
 
     features_dim: int
@@ -50,24 +50,24 @@ class NetworkSpec(NamedTuple):
 
 class InOrder(NamedTuple):
     """
-    The rows 0, 1, 2 ... laid out in a shape: indices that need neither memory nor a copy of what they select.
+    Indices 0, 1, 2 ... in a shape, which need neither memory nor a copy of the selected rows.
 
-    :param shape: of the indices
+    :param shape: shape of the indices
     """
 
     shape: tuple[int, ...]
 
 
-#: Which rows: int64 indices of any shape, or all in order.
+#: Row indices: int64 of any shape, or all in order.
 Rows: TypeAlias = th.Tensor | InOrder
 
 
 def gather(x: th.Tensor, rows: Rows) -> th.Tensor:
     """
-    Return ``x[rows]``, with a gradient that is the same every time.
+    Return ``x[rows]`` with a reproducible gradient.
 
-    On the CPU, PyTorch adds up the gradient of ``x[rows]`` in parallel, in an order that changes from run to run; that
-    of ``index_select`` is added in order, and in a third of the time.
+    On the CPU, PyTorch sums the gradient of ``x[rows]`` in parallel, in an order that varies between runs; that of
+    ``index_select`` is summed in order, in a third of the time.
 
     :param x: (K, *shape)
     :param rows: int64 of any shape, each in 0..K-1, or all K in order
@@ -92,7 +92,7 @@ def gather_agents(x: th.Tensor, teams: th.Tensor, agent: th.Tensor) -> th.Tensor
 
 class Linear(nn.Linear):
     """
-    A linear layer that knows the gain of its orthogonal initialisation (see :func:`orthogonal_init`).
+    Linear layer with the gain of its orthogonal initialisation (see :func:`orthogonal_init`).
 
     :param in_features: inputs
     :param out_features: outputs
@@ -107,7 +107,7 @@ class Linear(nn.Linear):
 
 def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float = 1.0) -> nn.Sequential:
     """
-    Multi-layer perceptron with a linear output.
+    Make a multi-layer perceptron with a linear output.
 
     :param sizes: inputs, hidden layers, outputs
     :param activation_fn: activation after every layer but the last; ``nn.Tanh`` becomes :class:`Tanh`
@@ -122,13 +122,12 @@ def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float
 
 def side_by_side(groups: Sequence[Sequence[nn.Sequential]], x: th.Tensor) -> list[th.Tensor]:
     """
-    Outputs of several MLPs for the same inputs, in few large operations: the first layers of all in one product, and
-    every further layer of a group in one batch. Equal to calling them one by one, up to the order of summation.
+    Evaluate several MLPs on the same inputs in few large operations: the first layers of all in one product, every
+    further layer of a group in one batch. Equal to separate calls, up to the order of summation.
 
     :param groups: MLPs of :func:`mlp` with one activation; those of a group have one shape
     :param x: (K, d)
-    :return: for each group of U MLPs, (U, K, P); few outputs lie in memory as (U, P, K), in which order what goes over
-        them is fastest
+    :return: for each group of U MLPs, (U, K, P); few outputs are stored as (U, P, K), which is faster for what follows
     """
     firsts = [cast(nn.Linear, net[0]) for group in groups for net in group]
     wide = nn.functional.linear(x, th.cat([one.weight for one in firsts]), th.cat([one.bias for one in firsts]))
@@ -143,7 +142,7 @@ def side_by_side(groups: Sequence[Sequence[nn.Sequential]], x: th.Tensor) -> lis
 
 
 def _deeper(group: Sequence[nn.Sequential], hidden: th.Tensor) -> th.Tensor:
-    """(U, K, P) outputs of a group, from (K, U * h) of its first layers."""
+    """Return outputs (U, K, P) of a group from those of its first layers, (K, U * h)."""
     x = hidden.unflatten(1, (len(group), -1)).transpose(0, 1)
     for number in range(2, len(group[0]), 2):
         layers = [cast(nn.Linear, net[number]) for net in group]
@@ -183,13 +182,13 @@ class AgentHeads(nn.Module):
 
     def forward(self, x: th.Tensor, agent: th.Tensor) -> th.Tensor:
         """
-        Send each row through the head of its agent.
+        Apply the head of its agent to each row.
 
         :param x: (K, d)
         :param agent: (K,) int64 in 0..N-1
         :return: (K, P)
         """
-        if th.compiler.is_compiling():  # a graph has no parts whose sizes depend on numbers
+        if th.compiler.is_compiling():  # graphs have no data-dependent sizes
             every = th.stack([head(x) for head in self.heads], dim=1)
             return every.gather(1, agent.reshape(-1, 1, 1).expand(-1, 1, every.shape[2])).squeeze(1)
         order = agent.argsort(stable=True)

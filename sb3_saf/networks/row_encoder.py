@@ -1,7 +1,8 @@
 """
-Encode own observations: each different one of a batch once, and those of whole teams in one go with the rows' own.
+Encoding of own observations: each unique one of a batch once, and those of whole teams together with the rows' own.
 
-Letters: B rows, K unique own observations, G teams, N agents, d features; ``*shape`` is that of one own observation.
+Letters: B rows, K unique own observations, G teams, N agents, d features; ``*shape`` is the shape of one own
+observation.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numba import njit
 from sb3_saf.networks.layers import InOrder, Rows, gather
 
 _WORD: Final = 8  # bytes in a machine word
-#: Bytes of temporary words per step of the device path; bounds its memory, not its result.
+#: Bytes of temporary words per step of the device path; limits memory, does not change the result.
 _HASH_CHUNK_BYTES: Final = 1 << 26
 
 
@@ -27,19 +28,18 @@ class UniqueRows(NamedTuple):
     """
     The unique rows of a batch, in order of first appearance: ``x[index][inverse]`` equals ``x``.
 
-    :param index: (K,) int64, where each unique row appears first; increasing
+    :param index: (K,) int64, first position of each unique row; increasing
     :param inverse: (B,) int64, the unique row that each row equals
     """
 
-    index: th.Tensor  # type: ignore[assignment]  # hides a method of tuples that nobody needs here
+    index: th.Tensor  # type: ignore[assignment]  # hides tuple.index
     inverse: th.Tensor
 
 
 def unique_rows(x: th.Tensor) -> UniqueRows:
     """
-    Find the unique rows of a batch, compared by their bytes: rows that are merged are equal to the last bit.
-
-    0.0 and -0.0 count as different, which costs time and nothing else.
+    Find the unique rows of a batch, compared by their bytes: merged rows are bitwise equal. 0.0 and -0.0 count as
+    different, which only costs time.
 
     :param x: (B, ...) any dtype, any device
     :return: K indices and their inverse, on the device of ``x``
@@ -52,7 +52,7 @@ def unique_rows(x: th.Tensor) -> UniqueRows:
 
 def every_row(x: th.Tensor) -> UniqueRows:
     """
-    Count every row as unique: the naive counterpart of :func:`unique_rows`.
+    Treat every row as unique, without a search.
 
     :param x: (B, ...)
     :return: index and inverse 0..B-1
@@ -67,7 +67,7 @@ class EncodedRows(NamedTuple):
 
     :param observations: (K, *shape) unique own observations
     :param features: (K, d) their features
-    :param inverse: (B,) which of them each row has
+    :param inverse: (B,) index of each row's observation among the unique ones
     """
 
     observations: th.Tensor
@@ -76,7 +76,7 @@ class EncodedRows(NamedTuple):
 
     @property
     def n_rows(self) -> int:
-        """B."""
+        """Number of rows B."""
         return self.inverse.shape[0]
 
     def of_rows(self) -> th.Tensor:
@@ -93,21 +93,21 @@ class EncodedRows(NamedTuple):
 
     def arranged(self, shape: tuple[int, ...]) -> Rows:
         """
-        Lay the rows out.
+        Arrange the rows in a shape.
 
-        :param shape: of B entries
-        :return: of that shape, which of the features each row has
+        :param shape: shape with B entries
+        :return: index into ``features`` of each row, in that shape
         """
         return InOrder(shape) if isinstance(self.inverse, InOrder) else self.inverse.view(shape)
 
 
 class EncodedTeams(NamedTuple):
     """
-    Encoded own observations of whole teams, as critics read them.
+    Encoded own observations of whole teams, the input of critics.
 
     :param features: (K, d) features of unique own observations
-    :param members: (G, N) which of them each agent of a team has
-    :param rows: (B,) where the agent of each row is among the G N agents, team by team; None if rows are these agents
+    :param members: (G, N) index into ``features`` of each agent of a team
+    :param rows: (B,) index of each row's agent among the G N agents, team by team; None if rows are these agents
     :param active: (G, N) bool, agents that take part; None if all do
     """
 
@@ -118,7 +118,7 @@ class EncodedTeams(NamedTuple):
 
     def of_rows(self, of_agents: th.Tensor) -> th.Tensor:
         """
-        Select what rows need of all agents.
+        Select the entries of rows from those of all agents.
 
         :param of_agents: (G, N, ...)
         :return: (B, ...)
@@ -129,9 +129,9 @@ class EncodedTeams(NamedTuple):
 
 def joined_rows(parts: Sequence[EncodedRows]) -> EncodedRows:
     """
-    Put encoded rows one after another.
+    Concatenate encoded rows.
 
-    :param parts: rows that were encoded apart
+    :param parts: rows that were encoded separately
     """
     return EncodedRows(
         th.cat([part.observations for part in parts]),
@@ -142,9 +142,9 @@ def joined_rows(parts: Sequence[EncodedRows]) -> EncodedRows:
 
 def joined_teams(parts: Sequence[EncodedTeams]) -> EncodedTeams:
     """
-    Put encoded teams one after another.
+    Concatenate encoded teams.
 
-    :param parts: teams that were encoded apart
+    :param parts: teams that were encoded separately
     """
     if len(parts) == 1:
         return parts[0]
@@ -164,7 +164,7 @@ def joined_teams(parts: Sequence[EncodedTeams]) -> EncodedTeams:
 
 
 def _joined(parts: Sequence[Rows], counts: Sequence[int]) -> Rows:
-    """Indices into what was put one after another: those of each part count from where it starts."""
+    """Concatenate indices, shifted by the start of each part."""
     if all(isinstance(part, InOrder) for part in parts):
         return InOrder((sum(part.shape[0] for part in parts), *parts[0].shape[1:]))
     starts = accumulate(counts, initial=0)
@@ -173,10 +173,10 @@ def _joined(parts: Sequence[Rows], counts: Sequence[int]) -> Rows:
 
 class RowEncoder:
     """
-    Encodes the own observations of a batch.
+    Encoder of the own observations of a batch.
 
     :param encode: (K, *shape) observations to (K, d) features
-    :param once: whether equal observations are encoded once; False encodes every row, which gives the same numbers
+    :param once: whether equal observations are encoded once; False encodes every row, with the same result
     """
 
     def __init__(self, encode: Callable[[th.Tensor], th.Tensor], once: bool = True):
@@ -186,7 +186,7 @@ class RowEncoder:
 
     def rows(self, observations: th.Tensor) -> EncodedRows:
         """
-        Encode own observations. Nothing but they decide the result, to the last bit.
+        Encode own observations. The result depends on them only, to the last bit.
 
         :param observations: (B, *shape)
         """
@@ -200,18 +200,18 @@ class RowEncoder:
         self, observations: th.Tensor, agent: th.Tensor, own: EncodedRows, active: th.Tensor | None = None
     ) -> EncodedTeams:
         """
-        Encode the teams of rows in any order, each different team once; what rows see themselves is encoded already.
+        Encode the teams of rows in any order, each unique team once; the rows' own observations are encoded already.
 
         :param observations: (B, N, *shape) joint observations
-        :param agent: (B,) whose rows they are
-        :param own: own observations of the rows
-        :param active: (B, N) bool, agents that take part; teams that differ in it are different
+        :param agent: (B,) agent of each row
+        :param own: encoded own observations of the rows
+        :param active: (B, N) bool, agents that take part; unique teams differ in observations or in it
         """
         found = self.find(observations)
         if active is not None:
             found = self.find(th.cat([found.inverse.unsqueeze(1), active.long()], dim=1))
         joint, n_known = observations[found.index], len(own.features)
-        # The known ones come first and differ from each other: they keep their numbers.
+        # The known ones come first and are unique: they keep their indices.
         candidates = th.cat([own.observations, joint.flatten(0, 1)])
         unique = self.find(candidates)
         missing = candidates[unique.index[n_known:]]
@@ -227,8 +227,8 @@ class RowEncoder:
         Apply a head to rows, once per unique observation (and agent).
 
         :param module: (K, d) features and (K,) agents or None, to (K, ...)
-        :param own: own observations of B rows
-        :param agent: (B,) the rows' agents where the head depends on them, else None
+        :param own: encoded own observations of B rows
+        :param agent: (B,) the rows' agents if the head depends on them, else None
         :return: (B, ...)
         """
         if agent is None:
@@ -240,18 +240,18 @@ class RowEncoder:
         return gather(of_pairs, pairs.inverse)
 
 
-# --- which rows are equal ---------------------------------------------------------------------------------------------
+# --- equality of rows -------------------------------------------------------------------------------------------------
 
 
 def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
-    """(B, bytes) uint8, padded with zeros to whole words, at least one: (B, ...) of any dtype."""
+    """Return rows (B, ...) of any dtype as bytes (B, bytes), padded with zeros to at least one whole word."""
     n_rows = len(x)
     width = prod(x.shape[1:])
     flat = x.contiguous().view(n_rows, width).view(th.uint8)
     missing = -flat.shape[1] % _WORD if width else _WORD
     if missing:
         return th.nn.functional.pad(flat, (0, missing))
-    # Words must start at whole words of the storage, which a slice of bytes need not.
+    # Words must be aligned in the storage, which a slice of bytes may not be.
     return flat.clone() if flat.storage_offset() % _WORD else flat
 
 
@@ -262,7 +262,7 @@ def _unique_on_cpu(rows: th.Tensor) -> UniqueRows:
     words = np.require(rows.numpy(), requirements="A").view(np.uint64)
     index = np.empty(len(words), dtype=np.int64)
     inverse = np.empty(len(words), dtype=np.int64)
-    # At most half full, so that probing stays short; a power of two, so that masking replaces the remainder.
+    # At most half full, for short probing; a power of two, so that a bit mask replaces the modulo.
     table = np.full(1 << max(2, 2 * len(words) - 1).bit_length(), -1, dtype=np.int32)
     count = _find_unique(words, table, np.empty(len(words), dtype=np.uint64), index, inverse)
     return UniqueRows(th.from_numpy(index[:count].copy()), th.from_numpy(inverse))
@@ -280,7 +280,7 @@ def _hash_row(words: npt.NDArray[np.uint64], row: int) -> np.uint64:
         b = (b ^ words[row, i + 1]) * multiplier
         c = (c ^ words[row, i + 2]) * multiplier
         d = (d ^ words[row, i + 3]) * multiplier
-        # A product carries upwards only: bring the high half down before the next word enters.
+        # Products carry upwards only: fold the high half down before adding the next word.
         a ^= a >> shift
         b ^= b >> shift
         c ^= c >> shift
@@ -300,7 +300,7 @@ def _hash_row(words: npt.NDArray[np.uint64], row: int) -> np.uint64:
 def _equal_rows(words: npt.NDArray[np.uint64], row: int, other: int) -> bool:
     width = words.shape[1]
     i = 0
-    # Eight words per branch: the inner loop becomes vector instructions.
+    # Eight words per branch, so that the inner loop is vectorised.
     while i + 8 <= width:
         difference = np.uint64(0)
         for j in range(i, i + 8):
@@ -327,7 +327,7 @@ def _find_unique(
     mask = np.uint64(table.size - 1)
     count = 0
     for row in range(words.shape[0]):
-        # Rows of one team follow each other and share their joint observation: look back before hashing.
+        # Consecutive rows of one team share their joint observation: compare with the previous row before hashing.
         if row > 0 and _equal_rows(words, row - 1, row):
             inverse[row] = inverse[row - 1]
             continue
@@ -349,21 +349,21 @@ def _find_unique(
     return count
 
 
-# --- other devices: 64-bit hashes, sorted, then every row compared with the one that stands for it ------------------
+# --- other devices: 64-bit hashes, sorted, then every row compared with the first of its group ----------------------
 
 
 def _unique_on_device(rows: th.Tensor) -> UniqueRows:
-    """Works on any device, the CPU included."""
+    """Find unique rows on any device, the CPU included."""
     words = rows.view(th.int64)
     proposal = _in_order_of_appearance(*th.unique(_hash_words(words), return_inverse=True))
     if _confirmed(words, proposal):
         return proposal
-    # Two different rows share a hash (odds of about B^2 / 2^65): sort whole rows instead.
+    # Hash collision (probability about B^2 / 2^65): sort whole rows instead.
     return _in_order_of_appearance(*th.unique(words, dim=0, return_inverse=True))
 
 
 def _hash_words(words: th.Tensor) -> th.Tensor:
-    """(B,) int64 hashes of (B, W) words: a sum of mixed words, arithmetic modulo 2^64."""
+    """Return int64 hashes (B,) of words (B, W): a sum of mixed words, modulo 2^64."""
     generator = np.random.default_rng(0x5AF)
     low, high = np.iinfo(np.int64).min, np.iinfo(np.int64).max
     factors = generator.integers(low, high, size=(2, words.shape[1]), dtype=np.int64) | 1

@@ -1,7 +1,6 @@
 """
-Spaces as plain words and numbers: what networks are built from, and what the manifest of an export says.
-
-Neither Gymnasium nor torch is imported here, so that exported actors run without them.
+Spaces as plain data, for building networks and for the manifest of an export. Neither Gymnasium nor torch is imported
+here, so that exported actors run without them.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = npt.NDArray[Any]
 
-#: Limits of what a file may ask for: far above what is ever trained.
+#: Upper limit for sizes read from files.
 MAX_SIZE: Final = 1 << 20
 MAX_ENTRIES: Final = 1 << 22
 
@@ -53,7 +52,7 @@ class SpaceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     :param choices: number of choices of each entry; empty for Boxes
     :param low: lowest values of a Box, else None
     :param high: highest values of a Box, else None
-    :param picture: whether it is a picture of bytes, which may come with channels first or last
+    :param picture: whether it is a uint8 picture, with channels first or last
     :param atlas: shape (n_codes, t, t, C) of the pixels of tile codes, else None
     """
 
@@ -79,22 +78,22 @@ class SpaceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def n_inputs(self) -> int:
-        """Numbers that a network for vectors reads."""
+        """Number of inputs of a network for vectors."""
         return sum(self.choices) if self.is_one_hot else prod(self.shape)
 
     @property
     def n_outputs(self) -> int:
-        """Numbers that the last layer of a policy gives for actions of this space."""
+        """Number of outputs of a policy's last layer for actions of this space."""
         return self.n_inputs
 
     @property
     def picture_shape(self) -> tuple[int, int, int]:
-        """Channels, height and width of the pictures that an encoder sees."""
+        """Channels, height and width of the pictures for an encoder."""
         if self.atlas is not None:
             _, tile, _, channels = self.atlas
             return channels, self.shape[0] * tile, self.shape[1] * tile
         first, second, third = self.shape
-        # As SB3 tells the two layouts apart.
+        # SB3's rule for the two layouts.
         return (first, second, third) if first == min(self.shape) else (third, first, second)
 
     def bounds(self) -> tuple[Array, Array]:
@@ -107,9 +106,9 @@ AnySpace: TypeAlias = "SpaceSpec | spaces.Space[Any]"
 
 class ObservationSpec(NamedTuple):
     """
-    What an encoder is built for.
+    Input of an encoder.
 
-    :param space: of one agent's own observation
+    :param space: space of one agent's own observation
     :param atlas: (n_codes, t, t, C) uint8 pixels of every tile code, else None
     """
 
@@ -163,15 +162,15 @@ def observation_spec(space: ObservationSpec | AnySpace) -> ObservationSpec:
 
 def pixels_to_codes(pictures: Array, atlas: Array) -> Array:
     """
-    Read the tile codes out of pictures, exactly.
+    Convert pictures to tile codes, exactly.
 
-    An agent that was trained on tile codes can so act on the game's pixels. Where several codes look alike, the first
-    is given, which networks that see the pixels of codes cannot tell from the others.
+    With them an agent trained on tile codes can act on the game's pixels. Of several codes with equal pixels the first
+    is returned; for networks that read the pixels of codes these are equivalent.
 
     :param pictures: (..., rows * t, columns * t, C) uint8, or channels first
     :param atlas: (n_codes, t, t, C) uint8 pixels of every code
     :return: (..., rows, columns) int64
-    :raises ValueError: if the pictures are not made of tiles of the atlas
+    :raises ValueError: if a picture has a tile that the atlas lacks
     """
     pictures, (n_codes, tile, _, channels) = np.asarray(pictures), atlas.shape
     if pictures.ndim >= 3 and pictures.shape[-1] != channels and pictures.shape[-3] == channels:
@@ -241,7 +240,7 @@ def _bound_array(bound: Bound, space: SpaceSpec, side: str) -> Array:
 
 
 def _checked_atlas(space: Any) -> Array:
-    """(n_codes, t, t, C) uint8 pixels of every code."""
+    """Return the checked atlas, (n_codes, t, t, C) uint8."""
     atlas = np.asarray(space.atlas)
     square = atlas.ndim == 4 and atlas.shape[1] == atlas.shape[2]
     if not square or atlas.dtype != np.uint8 or len(space.shape) != 2 or int(space.high.max()) >= len(atlas):
@@ -253,7 +252,7 @@ def _checked_atlas(space: Any) -> Array:
 
 
 def _bound(values: Array) -> Bound:
-    """One number if all are equal, else nested lists."""
+    """Return one number if all are equal, else nested lists."""
     if values.size and (values == values.flat[0]).all():
         values = values.flat[0]
     words = np.where(np.isinf(values), np.where(values > 0, "inf", "-inf"), "")

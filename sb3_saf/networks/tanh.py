@@ -1,9 +1,9 @@
 """
-Tanh as a quotient of polynomials, for the CPU: x P(x^2) / Q(x^2), which loops over float32 compute eight or sixteen at
-a time. PyTorch's takes ten times as long and would be a fifth of a training with small networks.
+Tanh as a rational function for the CPU: x P(x^2) / Q(x^2), in vectorised float32 loops. PyTorch's tanh takes ten times
+as long, a fifth of the training time with small networks.
 
-P and Q are the least-squares fit to tanh at the Chebyshev nodes of [0, 9], weighted so that the quotient's own error is
-what is least; beyond 9 the tanh is 1 to the last bit. In float32 the result differs from the tanh by 4e-7 at most.
+P and Q are the least-squares fit to tanh at the Chebyshev nodes of [0, 9], weighted to minimise the error of the
+quotient; beyond 9 tanh rounds to 1. In float32 the error is at most 4e-7.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _ONE: Final = np.float32(1.0)
 
 
 class Tanh(th.nn.Tanh):
-    """``nn.Tanh`` that takes less time on the CPU."""
+    """``nn.Tanh`` that is faster on the CPU."""
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """Of any shape."""
+        """Return the tanh of a tensor of any shape."""
         if x.device.type != "cpu" or x.dtype != th.float32 or th.compiler.is_compiling():
             return super().forward(x)
         if not (x.requires_grad and th.is_grad_enabled()):
@@ -45,7 +45,7 @@ class _Tanh(th.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: th.Tensor) -> th.Tensor:
-        # Autograd's own formula, which can be differentiated again, as TRPO does.
+        # Autograd's formula, which is differentiable again, as TRPO needs.
         gradient: th.Tensor = th.ops.aten.tanh_backward(gradients[0], *ctx.saved_tensors)
         return gradient
 

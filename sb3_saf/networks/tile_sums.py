@@ -1,13 +1,13 @@
 """
-The first layer over tile codes without pixels: what a tile adds to the layer's output depends on its code alone, so it
+First layer over tile codes without pixels: a tile's contribution to the layer's output depends on its code only, so it
 is computed once per code and looked up.
 
-A linear layer or a convolution over pictures made of tiles is a sum of what each tile adds. Few codes occur in a batch,
-so all that tiles can add fits a small table; a view's output is then a sum of rows of the table, some ten times cheaper
-than the products, and the gradient goes the same way back. Equal to the layer over pixels up to float summation order.
+A linear layer or a convolution over pictures of tiles is a sum of the tiles' contributions. Few codes occur in a batch,
+so all contributions fit a small table; a view's output is then a sum of rows of the table, about ten times cheaper than
+the products, and the gradient likewise. Equal to the layer over pixels up to float summation order.
 
-Letters: K views, T tiles per view, U codes that occur, P places of the output, S ways in which a tile can meet a place,
-W numbers per place, J pairs of a place and a tile that it sees.
+Letters: K views, T tiles per view, U codes that occur, P places (positions) of the output, S ways (relative positions
+of a tile and a place), W numbers per place, J pairs of a place and a tile in its window.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Floats: TypeAlias = npt.NDArray[Any]
 
 class Places(NamedTuple):
     """
-    Which tiles each place of the output sees, and how.
+    Tiles in the window of each place of the output.
 
-    :param size: of the output but for its W numbers per place: (), or (height, width); P is their product
-    :param first: (P + 1,) pairs ``first[p]`` to ``first[p + 1] - 1`` are those of place p; none has no pairs
+    :param size: shape of the output without the W numbers per place: (), or (height, width); P is their product
+    :param first: (P + 1,) pairs ``first[p]`` to ``first[p + 1] - 1`` are those of place p; each place has at least one
     :param tile: (J,) in 0..T-1
     :param way: (J,) in 0..S-1
     """
@@ -42,10 +42,10 @@ class Places(NamedTuple):
 
 class UsedCodes(NamedTuple):
     """
-    The codes that occur in some views.
+    Codes that occur in a batch of views.
 
     :param codes: (U,) int64, increasing
-    :param views: (K, T) int64, each code's number among them
+    :param views: (K, T) int64, index of each tile's code in ``codes``
     """
 
     codes: th.Tensor
@@ -53,22 +53,22 @@ class UsedCodes(NamedTuple):
 
 
 def places_of_linear(n_tiles: int) -> Places:
-    """A linear layer: a single place that sees every tile, each in a way of its own."""
+    """Return the places of a linear layer: a single place with every tile, each in its own way."""
     tiles = np.arange(n_tiles)
     return Places((), np.array([0, n_tiles]), tiles, tiles)
 
 
 def places_of_convolution(rows: int, columns: int, tile: int, kernel: int, stride: int) -> Places:
     """
-    A convolution without padding whose stride divides the tile: how a window meets a tile does not depend on where.
+    Return the places of a convolution without padding whose stride divides the tile, so that ways repeat across tiles.
 
     Ways are numbered as in :func:`table_of_convolution`; places row by row.
 
-    :param rows: of tiles
-    :param columns: of tiles
+    :param rows: rows of tiles
+    :param columns: columns of tiles
     :param tile: pixels per tile
     :param kernel: pixels per side of the kernel
-    :param stride: pixels
+    :param stride: stride in pixels
     """
     n_rows, n_columns = ((n * tile - kernel) // stride + 1 for n in (rows, columns))
     before, per_side = (kernel - 1) // stride, _ways_per_side(tile, kernel, stride)
@@ -92,7 +92,7 @@ def _ways_per_side(tile: int, kernel: int, stride: int) -> int:
 
 def table_of_convolution(pictures: th.Tensor, weight: th.Tensor, stride: int) -> th.Tensor:
     """
-    What single tiles add to a convolution.
+    Return the contributions of single tiles to a convolution.
 
     :param pictures: (U, C, t, t) pixels of tiles
     :param weight: (W, C, kernel, kernel)
@@ -108,7 +108,7 @@ def table_of_convolution(pictures: th.Tensor, weight: th.Tensor, stride: int) ->
 
 def used_codes(views: th.Tensor) -> UsedCodes:
     """
-    Number the codes that occur.
+    Find the codes that occur, and index the views by them.
 
     :param views: (K, T) codes of any type on the CPU
     """
@@ -123,20 +123,20 @@ def used_codes(views: th.Tensor) -> UsedCodes:
 
 def rectified_sums(views: th.Tensor, table: th.Tensor, bias: th.Tensor, places: Places) -> th.Tensor:
     """
-    Add up what tiles add and the bias, and cut off below zero: a first layer and its ReLU in one pass over memory.
+    Sum the tiles' contributions and the bias, and apply ReLU, in one pass over memory.
 
-    :param views: (K, T) int64 on the CPU, numbers of codes
+    :param views: (K, T) int64 on the CPU, indices of codes
     :param table: (U, S, W)
     :param bias: (W,)
-    :param places: of the layer
-    :return: (K, W) or (K, W, height, width), channels last in memory; differentiable by table and bias, twice
+    :param places: places of the layer
+    :return: (K, W) or (K, W, height, width), channels last in memory; twice differentiable in table and bias
     """
     summed: th.Tensor = _Rectified.apply(table, bias, views, places)
     return summed
 
 
 class _Rectified(th.autograd.Function):
-    """(U, S, W) table and (W,) bias -> (K, W, *size). But for what is cut off, :class:`_Back` is its transpose."""
+    """(U, S, W) table and (W,) bias -> (K, W, *size). Apart from the ReLU, :class:`_Back` is its transpose."""
 
     @staticmethod
     def forward(ctx: Any, table: th.Tensor, bias: th.Tensor, views: th.Tensor, places: Places) -> th.Tensor:
@@ -152,7 +152,7 @@ class _Rectified(th.autograd.Function):
 
 
 class _Back(th.autograd.Function):
-    """(K, W, *size) -> (U, S, W) and (W,): each place above zero gives its numbers to the bias and all that it sees."""
+    """(K, W, *size) -> (U, S, W) and (W,): sums over places above zero, for the table and the bias."""
 
     @staticmethod
     def forward(
@@ -176,7 +176,7 @@ class _Back(th.autograd.Function):
 
 
 def _gathered(table: th.Tensor, bias: th.Tensor, views: th.Tensor, places: Places, rectify: bool) -> th.Tensor:
-    # Not a permuted view: writing into one in place makes autograd copy.
+    # Not a permuted view: writing into a view in place makes autograd copy.
     sums = table.new_empty((len(views), table.shape[2], *places.size))
     if places.size:
         sums = th.empty_like(sums, memory_format=th.channels_last)
@@ -186,7 +186,7 @@ def _gathered(table: th.Tensor, bias: th.Tensor, views: th.Tensor, places: Place
 
 
 def _places_last(sums: th.Tensor) -> th.Tensor:
-    """(K, W, *size) with W moved to the end, where it is in memory."""
+    """Return (K, W, *size) with W moved to the end, its position in memory."""
     return sums.movedim(1, -1)
 
 
@@ -195,7 +195,7 @@ def _flat(tensor: th.Tensor) -> npt.NDArray[Any]:
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
-# Arrays are flat and indices unsigned: numba then leaves out looking for negative indices, and loops become vectors.
+# Arrays are flat and indices unsigned: numba then omits the check for negative indices, and loops are vectorised.
 
 
 @njit(cache=True, nogil=True)
@@ -221,7 +221,7 @@ def _gather(
     u = np.uint64
     width = len(bias)
     size, to = u(width), u(0)
-    # Arrays, since a zero written as such would be of double precision.
+    # Arrays, since a literal zero would have double precision.
     lowest = np.full_like(bias, 0 if rectify else -np.inf)
     for view in range(views.size // n_tiles):
         base = u(view) * u(n_tiles)
@@ -262,7 +262,7 @@ def _scatter(
     n_tiles: int,
     n_ways: int,
 ) -> None:
-    """Add the numbers of every place that is above zero to the rows of the table that it took, and to the bias."""
+    """Add the gradient of every place above zero to its rows of the table, and to the bias."""
     u = np.uint64
     width = len(bias)
     size, source = u(width), u(0)

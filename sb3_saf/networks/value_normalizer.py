@@ -1,15 +1,14 @@
 """
-Value normalisation: the critic learns returns of mean 0 and variance 1, everybody else sees values on the raw scale.
+Value normalisation: the critic learns returns of mean 0 and variance 1; values outside the critic are on the raw scale.
+How it works with SB3's unmodified PPO:
 
-How it works inside stock PPO:
-
-1. The policy sends every output of its critic through its :class:`ValueNormalizer`, so *all* values that leave the
-   policy are on the raw scale: those in the buffer, in the advantages, in the bootstrap of a time limit.
-2. SB3 trains with its squared error on the raw scale. The gradient of a value is rescaled on its way back, which makes
-   it the gradient of the squared error of normalised numbers (:meth:`ValueNormalizer.forward`).
-3. The statistics need the returns, which the rollout buffer computes. The minibatches of ``TeamRolloutBuffer`` carry
-   them (``sb3_saf.buffers.rollout``); the policy takes them in when it sees the first minibatch of a rollout, before
-   anything is learned from it. Training on minibatches of other buffers raises a ValueError.
+1. The policy passes every output of its critic through its :class:`ValueNormalizer`, so *all* values outside the policy
+  are on the raw scale: in the buffer, in the advantages, in the bootstrap of a time limit.
+2. SB3 trains with its squared error on the raw scale. The gradient of a value is rescaled in the backward pass to the
+  gradient of the squared error of normalised values (:meth:`ValueNormalizer.forward`).
+3. The statistics need the returns, which the rollout buffer computes. The minibatches of ``TeamRolloutBuffer`` contain
+  them (``sb3_saf.buffers.rollout``); the policy updates the statistics at the first minibatch of a rollout, before the
+  gradient step. Training on minibatches of other buffers raises a ValueError.
 
 Letters: B rows.
 """
@@ -24,13 +23,13 @@ import numpy.typing as npt
 import torch as th
 from torch import nn
 
-#: Returns that hardly vary are not blown up to a variance of 1.
+#: Lower limit of the standard deviation: nearly constant returns are not scaled to variance 1.
 MIN_STD: Final = 1e-2
 
 
 class Rescaling(NamedTuple):
     """
-    How new statistics change values that the critic gave under the old ones: ``scale * value + shift``.
+    Conversion of the critic's values from the old statistics to new ones: ``scale * value + shift``.
 
     :param scale: new standard deviation / old
     :param shift: in the units of returns
@@ -42,7 +41,7 @@ class Rescaling(NamedTuple):
 
 class ValueNormalizer(nn.Module):
     """
-    Mean and variance of all returns so far, each counting alike, and the way from the critic's outputs to values.
+    Running mean and variance of all returns with equal weights, and the conversion of the critic's outputs to values.
 
     Before the first update the mean is 0 and the variance 1: values are the critic's outputs, bit for bit.
     """
@@ -59,21 +58,21 @@ class ValueNormalizer(nn.Module):
 
     @property
     def std(self) -> th.Tensor:
-        """() standard deviation that values are scaled by."""
+        """() standard deviation by which values are scaled."""
         return self.var.sqrt().clamp_min(MIN_STD)
 
     def forward(self, outputs: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """
         De-normalise: ``v = mean + std * n`` for the critic's outputs n.
 
-        The gradient that arrives at v is divided by std². With returns R, SB3's loss sends back
+        The incoming gradient at v is divided by std². With returns R, SB3's loss sends back
         ``d/dv (R - v)² = -2 (R - v)``, and the chain rule through ``v = mean + std * n`` makes ``-2 std (R - v)`` of it
-        at n. The loss of normalised numbers is ``((R - mean) / std - n)²`` with the gradient
+        at n. The loss of normalised values is ``((R - mean) / std - n)²`` with the gradient
         ``-2 ((R - mean) / std - n) = -2 (R - v) / std`` at n: the same, divided by std². So SB3's ``vf_coef`` weighs
         the normalised loss, while the ``train/value_loss`` that it logs and ``clip_range_vf`` stay on the raw scale.
 
-        :param outputs: (B, ...) of the critic
-        :param active: (B, ...) bool, rows that take part; the values of others are exactly zero. All do if None
+        :param outputs: (B, ...) outputs of the critic
+        :param active: (B, ...) bool, rows that take part; the values of others are exactly zero. All if None
         :return: (B, ...) values on the scale of returns
         """
         std = self.std
@@ -85,10 +84,10 @@ class ValueNormalizer(nn.Module):
 
     def update(self, returns: npt.NDArray[np.floating]) -> Rescaling:
         """
-        Take more returns into the statistics.
+        Update the statistics with more returns.
 
-        :param returns: of any shape, on the raw scale
-        :return: how values of before change
+        :param returns: returns of any shape, on the raw scale
+        :return: conversion of values under the old statistics
         :raises ValueError: for NaN or infinity
         """
         returns = np.asarray(returns, dtype=np.float64)
@@ -101,7 +100,7 @@ class ValueNormalizer(nn.Module):
         return Rescaling(scale, float(self.mean) - scale * old_mean)
 
     def _merge(self, mean: float, var: float, count: int) -> None:
-        """Mean and variance of two sets of numbers together, from those of each."""
+        """Merge the mean and variance of two sets of values."""
         n_old = int(self.count)
         share = count / (n_old + count)
         old_mean, old_var = float(self.mean), float(self.var)
