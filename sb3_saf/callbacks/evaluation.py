@@ -17,11 +17,11 @@ class TeamEvalCallback(EvalCallback):
     """
     SB3's EvalCallback for teams.
 
-    It writes what SB3's writes: ``evaluations.npz`` (with one more array, ``game_steps``), ``best_model.zip``,
+    It writes the same results: ``evaluations.npz`` (with one more array, ``game_steps``), ``best_model.zip``,
     ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/success_rate``, and also ``eval/game_steps``. Returns are team
-    returns, lengths are game steps. SB3's ``timesteps`` stay agents' steps (game steps x N), in which SB3 counts.
+    returns, lengths are game steps. SB3's ``timesteps`` remain agent steps (game steps x N).
 
-    :param eval_env: environment of teams, for instance from ``make_team_env`` with a seed of its own
+    :param eval_env: environment of teams, for instance from ``make_team_env`` with another seed
     :param callback_on_new_best: called when the mean team return is the best so far
     :param callback_after_eval: called after every evaluation
     :param n_eval_episodes: team episodes per evaluation
@@ -32,7 +32,7 @@ class TeamEvalCallback(EvalCallback):
     :param render: whether to render the evaluation
     :param verbose: 0 for silence, 1 to print results
     :param warn: warn if ``eval_env`` has no TeamMonitor
-    :raises ValueError: if ``eval_env`` is not made of teams, or its games are those of training
+    :raises ValueError: if ``eval_env`` has no teams, or its games are those of training
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class TeamEvalCallback(EvalCallback):
         return team_steps(self.model)
 
     def _plan_next(self) -> None:
-        """The next multiple of ``eval_freq``: E games at a time, steps may jump over it."""
+        """Set the next multiple of ``eval_freq``, which steps of E games at a time may skip."""
         if self.eval_freq > 0:
             self._next_evaluation = (self._game_steps() // self.eval_freq + 1) * self.eval_freq
 
@@ -92,7 +92,7 @@ class TeamEvalCallback(EvalCallback):
         return self._evaluate()
 
     def _evaluate(self) -> bool:
-        """Play, store and log: whether training goes on."""
+        """Play, store and log; return whether training continues."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         self._is_success_buffer = []
@@ -143,7 +143,7 @@ class TeamEvalCallback(EvalCallback):
         self.logger.dump(self.num_timesteps)
 
     def _react(self, result: EvaluationResult) -> bool:
-        """Keep the best model and call the callbacks: whether training goes on."""
+        """Save the best model and call the callbacks; return whether training continues."""
         go_on = True
         if result.mean > self.best_mean_reward:
             self._say("New best mean team return")

@@ -1,4 +1,4 @@
-"""NaN and infinity stop training before they reach the weights."""
+"""Callback that stops training at NaN and infinity before they reach the weights."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from torch.utils.hooks import RemovableHandle
 from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.errors import NonFiniteError
 
-#: What SB3's rollout buffers hold, in the order in which one makes the next.
+#: Arrays of SB3's rollout buffers, in the order of computation.
 _ROLLOUT: Final = ("observations", "rewards", "values", "log_probs", "returns", "advantages")
 
 
 class FiniteCallback(BaseCallback):
     """
-    Stop training at NaN or infinity, with the step and the tensor's name, while the weights are still good.
+    Stop training at NaN or infinity, with the step and the tensor's name, before the weights are damaged.
 
     It checks gradients before every step of the optimiser, weights after it, rollouts before every update, losses and
     the policy's statistics after it. ``CentralizedValueWrapper`` checks observations and rewards of teams.
 
-    It checks sums: NaN and infinity stay in them, and memory is read once. Per gradient step that is two numbers of
-    each parameter, and two that leave the GPU.
+    It checks sums, which keep NaN and infinity and read memory once. Per gradient step that is two sums per parameter,
+    and two numbers copied from the GPU.
 
-    ``resumable_learn`` uses it by itself.
+    ``resumable_learn`` adds it automatically.
     """
 
     def __init__(self) -> None:
@@ -65,7 +65,7 @@ class FiniteCallback(BaseCallback):
     # --- gradients --------------------------------------------------------------------------------------------------
 
     def _note(self, name: str, parameter: th.Tensor) -> None:
-        """Before gradients are clipped: a single NaN in their norm would spread to all of them."""
+        """Record the sum of a gradient before clipping, which would spread a single NaN to all gradients."""
         assert parameter.grad is not None
         self._sums[name] = parameter.grad.sum()
 
@@ -73,7 +73,7 @@ class FiniteCallback(BaseCallback):
         sums, self._sums = self._sums, {}
         if not sums or math.isfinite(float(th.stack(list(sums.values())).sum())):
             return
-        for name, value in sums.items():  # from the loss backwards, so the first is the nearest to it
+        for name, value in sums.items():  # in backward order, so the first is the nearest to the loss
             if not bool(value.isfinite()):
                 self._stop(f"the gradient of {name}", float(value))
 
@@ -92,7 +92,7 @@ class FiniteCallback(BaseCallback):
         self._check_update()
 
     def _check_update(self) -> None:
-        """Once per update: an algorithm off-policy begins a rollout at every step."""
+        """Check once per update: off-policy algorithms begin a rollout at every step."""
         if self._n_optimizer_steps == self._n_checked:
             return
         self._n_checked = self._n_optimizer_steps
@@ -108,7 +108,7 @@ class FiniteCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         for name, array in _floats(getattr(self.model, "rollout_buffer", None)):
-            with np.errstate(invalid="ignore"):  # infinity less infinity
+            with np.errstate(invalid="ignore"):  # infinity minus infinity
                 value = float(array.sum(dtype=np.float64))
             if not math.isfinite(value):
                 self._stop(f"{name} of the rollout", value)
@@ -126,7 +126,7 @@ class FiniteCallback(BaseCallback):
 
 
 def _floats(buffer: object) -> Iterator[tuple[str, np.ndarray[Any, np.dtype[np.floating[Any]]]]]:
-    """Arrays of a rollout that may hold NaN, by name."""
+    """Yield the float arrays of a rollout by name."""
     for name in _ROLLOUT:
         value = getattr(buffer, name, None)
         parts = value.items() if isinstance(value, dict) else [("", value)]

@@ -1,4 +1,4 @@
-"""Game steps in the logs (SB3 counts rows: every agent of every game), and the check of a model before it learns."""
+"""Game steps in the logs (SB3 counts agent steps), and the check of a model before training."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"
 
 def game_steps(model: BaseAlgorithm) -> int | None:
     """
-    Return the steps of games that a model was trained for: its ``num_timesteps`` (agents' steps) divided by N.
+    Return the game steps that a model was trained for: its ``num_timesteps`` (agent steps) divided by N.
 
     :param model: an algorithm with or without an environment
-    :return: None if its environment is not made of teams
+    :return: None if its environment has no teams
     """
     venv = model.get_env()
     n_agents = None if venv is None else find_n_agents(venv)
@@ -32,7 +32,7 @@ def game_steps(model: BaseAlgorithm) -> int | None:
 
 
 def team_steps(model: BaseAlgorithm) -> int:
-    """Return the same of a model whose environment was checked to be made of teams."""
+    """Return :func:`game_steps` of a model whose environment is known to have teams."""
     steps = game_steps(model)
     assert steps is not None
     return steps
@@ -40,10 +40,10 @@ def team_steps(model: BaseAlgorithm) -> int:
 
 def check_training(model: BaseAlgorithm) -> None:
     """
-    Check a model before it learns; the callbacks of this package call it.
+    Check a model before training; the callbacks of this package call it.
 
-    SB3's own ``"MultiInputPolicy"`` reads all entries of a row, what the whole team sees included, so that no agent
-    could act on its own observation: a warning says so. It may go on, as the policy of one learner that sees all.
+    Warns about SB3's own ``"MultiInputPolicy"``: it reads all entries of a row, the joint observation included, so that
+    execution is not decentralised. It is allowed as a centralised policy.
 
     :param model: any algorithm on any environment
     """
@@ -66,9 +66,9 @@ def check_training(model: BaseAlgorithm) -> None:
 
 class GameStepsBoard(TensorBoardOutputFormat):
     """
-    A run's TensorBoard file with game steps on the x-axis, where SB3 has agents' steps.
+    A run's TensorBoard file with game steps on the x-axis instead of SB3's agent steps.
 
-    :param board: that SB3 opened
+    :param board: output format opened by SB3
     :param n_agents: N
     """
 
@@ -77,7 +77,7 @@ class GameStepsBoard(TensorBoardOutputFormat):
         self.board, self.n_agents, self.writer = board, n_agents, board.writer
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """See the base class; ``step`` counts agents' steps."""
+        """See the base class; ``step`` counts agent steps."""
         self.board.write(key_values, key_excluded, step // self.n_agents)
 
     def close(self) -> None:
@@ -87,9 +87,9 @@ class GameStepsBoard(TensorBoardOutputFormat):
 
 def show_game_steps(model: BaseAlgorithm) -> None:
     """
-    Let TensorBoard count game steps from now on, whatever logs; callbacks of this package do so when training starts.
+    Make TensorBoard count game steps from now on; callbacks of this package do so when training starts.
 
-    :param model: in ``learn``; one whose environment is not made of teams is left as it is
+    :param model: a model in ``learn``; nothing changes if its environment has no teams
     """
     venv = model.get_env()
     n_agents = None if venv is None else find_n_agents(venv)
@@ -106,12 +106,11 @@ def show_game_steps(model: BaseAlgorithm) -> None:
 class GameStepsCallback(BaseCallback):
     """
     Log ``time/game_steps`` and ``time/game_steps_per_second`` beside SB3's ``time/total_timesteps`` and ``time/fps``,
-    which count agents' steps, and let TensorBoard's x-axis count game steps. On environments that are not made of teams
-    it does nothing.
+    which count agent steps, and make TensorBoard's x-axis count game steps. Without teams it does nothing.
 
     Before training it checks policy, buffer and batch size (:func:`check_training`).
 
-    ``sb3_saf.train`` and ``resumable_learn`` use it by themselves; pass it to any other ``learn``.
+    ``sb3_saf.train`` and ``resumable_learn`` add it automatically; pass it to any other ``learn``.
     """
 
     def __init__(self) -> None:

@@ -34,11 +34,11 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
     Changes to :class:`supersuit.vector.MarkovVectorEnv`:
 
-    - an agent that has ended or not joined yet keeps its row, with zeros and no reward; - the last step's infos are
-      kept: those of the next episode's reset are in ``reset_infos``;
+    - an agent that has ended or not joined yet keeps its row, with zeros and no reward;
+    - the last step's infos are kept: those of the next episode's reset are in ``reset_infos``;
     - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
-    - rows have signals on request: active agents, action masks, the game's state; - all results of the game are
-      checked, and errors name agent, game and step.
+    - rows have signals on request: active agents, action masks, the game's state;
+    - all results of the game are checked, and errors name agent, game and step.
 
     :param env: the game
     :param form: its form

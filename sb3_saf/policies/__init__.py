@@ -1,1 +1,1 @@
-"""The policies of SB3 and sb3-contrib: an algorithm's actor and critic in the form that PPO and others ask for."""
+"""Policies for SB3 and sb3-contrib: the actors and critics of the algorithms as policy classes."""

@@ -1,9 +1,9 @@
 """
-What the policies of SAF, MAPPO and IPPO share: ``TeamPolicy``, and what it becomes for PPO, A2C and TRPO
+Base of the policies of SAF, MAPPO and IPPO: ``TeamPolicy``, and its versions for PPO, A2C and TRPO
 (``TeamActorCriticPolicy``) and for MaskablePPO (``TeamMaskablePolicy``).
 
-The actor reads ``obs`` (and ``agent``, where it reads who acts); only the critic reads ``team``. Letters: B rows, N
-agents.
+The actor reads ``obs`` (and ``agent``, if it depends on the agent's index); only the critic reads ``team``. Letters: B
+rows, N agents.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Head = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
 NetArch = list[int] | dict[str, list[int]]
 
-#: Arguments of SB3's base class that only gSDE reads; team policies refuse gSDE and do not save them.
+#: Arguments of SB3's base class for gSDE only; team policies do not support gSDE and do not save them.
 _SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
 
 
@@ -53,8 +53,8 @@ class Encoded(NamedTuple):
     """
     Encoded rows.
 
-    :param own: own observations of the rows
-    :param teams: those of their teams; None if the critic does not read them
+    :param own: encoded own observations of the rows
+    :param teams: encoded teams of the rows; None if the critic does not read them
     """
 
     own: EncodedRows
@@ -63,10 +63,10 @@ class Encoded(NamedTuple):
 
 class Step(NamedTuple):
     """
-    What a critic reads of one step of all games.
+    Critic's input of one step of all games.
 
-    :param obs: who acts and who takes part, of the rows
-    :param encoded: what they see
+    :param obs: entries of the rows (agent indices, active agents)
+    :param encoded: their encoded observations
     """
 
     obs: dict[str, th.Tensor]
@@ -77,40 +77,40 @@ class TeamPolicy(TeamRowsPolicy):
     """
     Base of policies on rows of teams: one row is one agent in one game at one step.
 
-    It is inherited together with one of the actor-critic policies of SB3 or sb3-contrib, whose networks it replaces.
+    Mixin for the actor-critic policies of SB3 or sb3-contrib, whose networks it replaces.
 
-    A row's observation is that of ``CentralizedValueWrapper``: ``obs``, ``team`` and ``agent``. The actor reads
-    ``obs`` alone: what other agents see cannot change an action's probability by a bit. Equal observations of a batch
-    are encoded once, so extractors must treat observations one by one (no batch normalisation).
+    A row's observation is that of ``CentralizedValueWrapper``: ``obs``, ``team`` and ``agent``. Action probabilities
+    depend on ``obs`` only, bit for bit. Equal observations of a batch are encoded once, so extractors must treat
+    observations independently (no batch normalisation).
 
-    Where observations have ``action_mask``, illegal actions have probability zero: in every policy of a pool, so also
-    in their mixture; entropies are over legal actions. ``predict`` then needs the mask beside ``obs``. Where they have
-    ``active``, critics leave out agents that take no part, and the value of such an agent is exactly zero.
+    With ``action_mask`` in observations, illegal actions have probability zero in every policy of a pool, hence in the
+    mixture; entropies are over legal actions. ``predict`` then needs the mask beside ``obs``. With ``active``, critics
+    ignore inactive agents, and the value of an inactive agent is exactly zero.
 
-    Beside these arguments, a policy takes the fields of its ``parts_class`` by keyword.
+    A policy also takes the fields of its ``parts_class`` by keyword.
 
-    :param observation_space: Dict of ``obs``, ``team``, ``agent``, and perhaps ``active``, ``action_mask``, ``state``
+    :param observation_space: Dict of ``obs``, ``team``, ``agent``, and optionally ``active``, ``action_mask``,
+        ``state``
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of actor and critic heads, or ``dict(pi=..., vf=...)``; None for [128, 128]
-    :param encode_once: whether equal observations of a batch are encoded once; False encodes every row, which gives
-        the same numbers. None: once where observations are whole numbers (pictures, codes, choices); float
-        observations are hardly ever equal
-    :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all but where pictures are
-        convolved, whose intermediate results shall fit the cache
+    :param encode_once: whether equal observations of a batch are encoded once; False encodes every row, with the same
+        result. None: True for integer observations (pictures, codes, choices); float observations are rarely equal
+    :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for convolved
+        pictures, whose intermediate results should fit the cache
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
-        ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. Values that the policy
-        gives, ``train/value_loss`` and ``clip_range_vf`` are on the raw scale either way
-    :param use_sde: refused; here because SB3's algorithms pass it
-    :param share_features_extractor: actor and critic always share the encoder; False is refused
-    :param features_extractor_class: encoder, built on the space of ``obs``
+        ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. The policy's values,
+        ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in both cases
+    :param use_sde: must be False; present because SB3's algorithms pass it
+    :param share_features_extractor: must be True: actor and critic always share the encoder
+    :param features_extractor_class: encoder, built for the space of ``obs``
     :param features_extractor_kwargs: its further arguments
     :param kwargs: fields of ``parts_class``, and other arguments of SB3's ``ActorCriticPolicy``: activation_fn,
-        ortho_init, log_std_init, normalize_images, optimizer_class, optimizer_kwargs (Adam and AdamW step all weights
-        at once, ``fused=True``, unless told otherwise)
+        ortho_init, log_std_init, normalize_images, optimizer_class, optimizer_kwargs (Adam and AdamW use ``fused=True``
+        by default)
     """
 
-    #: The algorithm: which actor and critic to make.
+    #: Actor and critic of the algorithm.
     parts_class: ClassVar[type[TeamParts]]
 
     actor: ActorNetwork
@@ -121,7 +121,7 @@ class TeamPolicy(TeamRowsPolicy):
     activation_fn: type[nn.Module]
     log_std_init: float
     ortho_init: bool
-    #: Whether the algorithm takes TeamRolloutBuffer, which ``normalize_values`` needs.
+    #: Whether the algorithm supports TeamRolloutBuffer, which ``normalize_values`` needs.
     normalizes_values: ClassVar[bool] = False
 
     def __init__(
@@ -150,21 +150,22 @@ class TeamPolicy(TeamRowsPolicy):
                 "take; leave normalize_values=False, or use PPO with SAFPolicy, MAPPOPolicy or IPPOPolicy"
             )
         self.normalize_values = normalize_values
-        # The next class in line is SB3's or sb3-contrib's, which takes more than BasePolicy.
+        # The next class in the MRO is SB3's or sb3-contrib's, which has more arguments than BasePolicy.
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,
             [128, 128] if net_arch is None else net_arch,
             features_extractor_class=features_extractor_class,
-            features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # SB3 writes into it
+            features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # SB3 modifies it
             **kwargs,
         )
 
     # --- construction -----------------------------------------------------------------------------------------------
 
     def _build(self, lr_schedule: Schedule) -> None:
-        # The critic comes last: policies of one seed that differ in the critic start with the same encoder and actor.
+        # The critic is built last: with one seed, policies with different critics have the same initial encoder and
+        # actor.
         self._build_actor()
         self._build_critic(lr_schedule)
 
@@ -175,8 +176,8 @@ class TeamPolicy(TeamRowsPolicy):
             orthogonal_init(self.actor)
 
     def _build_critic(self, lr_schedule: Schedule) -> None:
-        """Make the critic, and the optimizer of everything."""
-        # TRPO tells the critic's parameters by "value" in their name: everything below value_net has it.
+        """Make the critic, and the optimizer of all parameters."""
+        # TRPO identifies the critic's parameters by "value" in their name, as in all names below value_net.
         self.value_net = self._make_critic()
         if self.ortho_init:
             orthogonal_init(self.value_net)
@@ -213,7 +214,7 @@ class TeamPolicy(TeamRowsPolicy):
 
     @property
     def log_std(self) -> th.Tensor:
-        """(policies, D) log standard deviations of Box actions; there is no such attribute for other actions."""
+        """(policies, D) log standard deviations of Box actions; AttributeError for other actions."""
         heads = [module for module in self.actor.modules() if isinstance(module, ActionHead)]
         found: list[th.Tensor] = [head.log_std for head in heads if head.log_std is not None]
         if not found:
@@ -231,8 +232,7 @@ class TeamPolicy(TeamRowsPolicy):
         :param obs: rows
         :param deterministic: whether to take the most likely actions
         :param action_masks: (B, M) of MaskablePPO; None allows everything
-        :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In a rollout, values are computed when they are
-            used
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In a rollout, values are computed lazily
         """
         encoded = self._encoded(obs)
         distribution = self._distribution(obs, encoded.own, action_masks)
@@ -261,7 +261,7 @@ class TeamPolicy(TeamRowsPolicy):
         """
         Return the action distribution; ``team`` is not read and may be missing.
 
-        :param obs: rows, or own observations alone (B, ...)
+        :param obs: rows, or only own observations (B, ...)
         :param action_masks: (B, M) of MaskablePPO; None allows everything
         """
         return self._distribution(obs, self.encode_own(obs), action_masks)
@@ -276,12 +276,12 @@ class TeamPolicy(TeamRowsPolicy):
         return self._values(obs, self._encoded(obs))
 
     def _check_minibatch(self, obs: PyTorchObs) -> None:
-        """Warn once of minibatches that TeamRolloutBuffer would give better."""
+        """Warn once about minibatches for which TeamRolloutBuffer is the better choice."""
         if self._warned_of_minibatch or not self.training or isinstance(obs, TeamMinibatch):
             return
         active, takes_part = self._active(obs), self._takes_part(obs)
         if active is not None and takes_part is not None and (active.any(dim=1) & ~takes_part.squeeze(1)).any():
-            # Rows of a padding have no team.
+            # Padding rows have no team.
             message = (
                 "The minibatch has rows of agents that take no part (dead, or not joined yet); they enter the loss, "
                 f"the entropy and the normalisation of advantages. {self._advice()}"
@@ -307,7 +307,7 @@ class TeamPolicy(TeamRowsPolicy):
         )
 
     def _encoded(self, obs: PyTorchObs) -> Encoded:
-        """Encode what actor and critic read of rows."""
+        """Encode the inputs of actor and critic."""
         if self._critic_reads_teams:
             return Encoded(*self.encode_teams(obs))
         return Encoded(self.encode_own(obs), None)
@@ -317,17 +317,17 @@ class TeamPolicy(TeamRowsPolicy):
         return isinstance(self.value_net, TeamCritic)
 
     def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
-        """(B,) log-likelihoods; sb3-contrib's buffers give the bits of MultiBinary actions as whole numbers."""
+        """Return log-likelihoods (B,); sb3-contrib's buffers give MultiBinary actions as integers."""
         return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
 
     def _distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None = None) -> Distribution:
-        """Over actions that both the rows' own masks and ``action_masks``, (B, M), allow."""
+        """Return the distribution over actions allowed by both the rows' own masks and ``action_masks``, (B, M)."""
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._legal(obs, action_masks, own.features.device)
         return self._distribution_of(lambda module: self.row_encoder.apply(module, own, agent), masks)
 
     def _legal(self, obs: PyTorchObs, action_masks: Masks | None, device: th.device) -> th.Tensor | None:
-        """(B, M) choices that both the rows' own masks and ``action_masks`` allow; None if all are."""
+        """Return the choices (B, M) allowed by both the rows' own masks and ``action_masks``; None if all are."""
         masks = self._action_mask(obs)
         if action_masks is None:
             return masks
@@ -337,10 +337,10 @@ class TeamPolicy(TeamRowsPolicy):
 
     def evaluate_pool(self, obs: PyTorchObs, latent: th.Tensor, action_masks: Masks | None = None) -> PoolOutput:
         """
-        Return what actions are drawn from; a single policy is a pool of one.
+        Return weights and parameters of the policies; a single policy is a pool of one.
 
         :param obs: rows
-        :param latent: (B, H) what the actor reads: features, or what a memory makes of them
+        :param latent: (B, H) input of the actor: features, or the output of its LSTM
         :param action_masks: (B, M) of MaskablePPO; None allows everything
         :return: log weights (B, U) and parameters (B, U, P), illegal actions masked
         """
@@ -351,12 +351,12 @@ class TeamPolicy(TeamRowsPolicy):
         return output._replace(actions=masked_parameters(self.action_space, output.actions, legal))
 
     def _distribution_of(self, apply: Callable[[Head], th.Tensor], masks: th.Tensor | None) -> Distribution:
-        """Of the actor, which ``apply`` calls for all rows; masks apply to every policy of a pool."""
+        """Return the actor's distribution; ``apply`` calls a head for all rows, masks apply to every policy."""
         parameters = apply(self.actor if masks is None else self.actor.unmixed)
         return actor_distribution(self.actor, self.action_space, parameters, masks)
 
     def _values(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
-        """(B, 1) values."""
+        """Return values (B, 1)."""
         critic, teams = self.value_net, encoded.teams
         if isinstance(critic, TeamCritic):
             assert teams is not None
@@ -368,18 +368,18 @@ class TeamPolicy(TeamRowsPolicy):
         return self._raw_values(obs, values)
 
     def _values_of_step(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
-        """(B, 1) values of a step of all games: in a rollout those of many steps are computed together."""
+        """Return values (B, 1) of a step of all games; in a rollout, many steps are evaluated together."""
         if self.training or th.is_grad_enabled() or isinstance(self.value_net, StateCritic):
             return self._values(obs, encoded)
         entries = {} if isinstance(obs, th.Tensor) else obs
         read: dict[str, th.Tensor] = {key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}
         features = encoded.own.features
-        # Critics read features: the observations need not be kept.
+        # Critics read features only: the observations can be dropped.
         encoded = encoded._replace(own=encoded.own._replace(observations=features.new_empty(0)))
         return LaterValues.of(Step(read, encoded), features.new_empty(encoded.own.n_rows, 0), self._values_of_steps)
 
     def _values_of_steps(self, steps: Sequence[Step]) -> list[th.Tensor]:
-        """(B, 1) values of each step."""
+        """Return values (B, 1) of each step."""
         with th.no_grad():
             obs = {key: th.cat([step.obs[key] for step in steps]) for key in steps[0].obs}
             own = joined_rows([step.encoded.own for step in steps])
@@ -389,8 +389,8 @@ class TeamPolicy(TeamRowsPolicy):
             return list(th.split(values, [step.encoded.own.n_rows for step in steps]))
 
     def _raw_values(self, obs: PyTorchObs, outputs: th.Tensor) -> th.Tensor:
-        """(B, 1) values on the raw scale, of the critic's outputs (B,)."""
-        # The value of who takes no part is zero: an agent's own end is the end of its return.
+        """Return values (B, 1) on the raw scale from the critic's outputs (B,)."""
+        # The value of an inactive agent is zero: its return ends when the agent ends.
         values, takes_part = outputs.unsqueeze(1), self._takes_part(obs)
         if self.value_normalizer is None:
             return values if takes_part is None else values * takes_part
@@ -401,7 +401,7 @@ class TeamPolicy(TeamRowsPolicy):
         return self.value_normalizer(values, takes_part)
 
     def _values_of_states(self, obs: PyTorchObs, critic: StateCritic) -> th.Tensor:
-        """(B,) values, equal states encoded once."""
+        """Return values (B,), with equal states encoded once."""
         space = self.team_spaces.state
         assert space is not None
         states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
@@ -419,7 +419,7 @@ def _refuse_to_train(gradient: th.Tensor) -> NoReturn:
 
 
 def _with_fused_steps(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of Adam with the implementation that takes a third of the time, if none is asked for."""
+    """Return arguments of Adam with the fused implementation, unless one is given; it takes a third of the time."""
     if optimizer_class not in (th.optim.Adam, th.optim.AdamW) or kwargs.keys() & {"fused", "foreach", "differentiable"}:
         return kwargs
     return {**kwargs, "fused": True}
@@ -435,15 +435,15 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
     """
     Policy for MaskablePPO on rows of teams; see :class:`TeamPolicy` for the parameters.
 
-    sb3-contrib asks the environment for masks, ``venv.env_method("action_masks")``: one per row, that is, per agent.
+    sb3-contrib reads masks by ``venv.env_method("action_masks")``: one per row, that is, per agent.
 
-    Masks are (B, M): one flag per choice of an action, those of each dimension in turn (of a MultiBinary: off, on).
-    The actions of each policy of a pool are masked before they are mixed: likelihood and entropy are exactly those of
-    drawing a policy and then one of its allowed actions. A mask that allows nothing leaves the actions equally likely.
-    Where observations have masks, too, an action must be allowed by both.
+    Masks are (B, M): one flag per choice, those of each action dimension in turn (of a MultiBinary: off, on). Each
+    policy of a pool is masked before mixing: likelihood and entropy are those of drawing a policy and then one of its
+    allowed actions. If a mask allows nothing, all actions are equally likely. If observations also have masks, an
+    action must be allowed by both.
     """
 
-    #: There are no masks for Box actions, so nothing reads it.
+    #: Unused: Box actions have no masks.
     log_std_init: float = 0.0
 
 
@@ -457,7 +457,7 @@ def _refuse(use_sde: bool, share_features_extractor: bool) -> None:
 
 
 def _hidden_sizes(net_arch: NetArch) -> tuple[list[int], list[int]]:
-    """Hidden sizes of action heads and of value heads."""
+    """Return the hidden sizes of action heads and of value heads."""
     if not isinstance(net_arch, dict):
         return list(net_arch), list(net_arch)
     if set(net_arch) != {"pi", "vf"}:

@@ -1,5 +1,5 @@
 """
-SB3's distributions of the networks' outputs. Their mathematics is in ``sb3_saf.networks.distributions``.
+SB3 distributions for the networks' outputs. The mathematics is in ``sb3_saf.networks.distributions``.
 
 Letters: B rows, U policies, P parameters, D action dimensions.
 """
@@ -38,12 +38,12 @@ def actor_distribution(
     actor: ActorNetwork, action_space: spaces.Space[Any], parameters: th.Tensor, masks: th.Tensor | None = None
 ) -> Distribution:
     """
-    Make the distribution of what an actor gave.
+    Make the distribution of an actor's output.
 
-    :param actor: which network gave it
+    :param actor: the actor
     :param action_space: the action space
     :param parameters: (B, P') of ``actor(...)``, or with masks of ``actor.unmixed(...)``
-    :param masks: (B, M) bool, the choices that are allowed; None if all are
+    :param masks: (B, M) bool, allowed choices; None if all are
     """
     if not isinstance(actor, PolicyPool):
         allowed = parameters if masks is None else masked_parameters(actor.space, parameters, masks)
@@ -52,7 +52,7 @@ def actor_distribution(
         return distribution_of(action_space, parameters)
     log_weights, actions = actor.split(parameters)
     if masks is not None:
-        # Masked before they are mixed, so that masks leave the choice among policies as it is.
+        # Masked before mixing, so that masks do not change the selection of policies.
         actions = masked_parameters(actor.space, actions, masks)
     return _pool_distribution(actor, action_space, PoolOutput(log_weights, actions))
 
@@ -88,8 +88,8 @@ def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> D
 
 class LeanCategorical(CategoricalDistribution):
     """
-    SB3's distribution of Discrete actions, with its numbers and its draws, in a third of the time: PyTorch's own object
-    is made only for who asks for it.
+    SB3's distribution of Discrete actions, with identical results, in a third of the time: PyTorch's object is only
+    created on access.
 
     :param action_dim: number of actions, A
     """
@@ -98,17 +98,17 @@ class LeanCategorical(CategoricalDistribution):
 
     def proba_distribution(self, action_logits: th.Tensor) -> LeanCategorical:
         """Set the parameters, logits (B, A)."""
-        # With rows last in memory, loops run over many rows instead of few actions.
+        # With rows last in memory, inner loops run over many rows instead of few actions.
         return self.of_log_probs(action_logits.t().contiguous().log_softmax(dim=0).t())
 
     def of_log_probs(self, log_probs: th.Tensor) -> LeanCategorical:
-        """Set the parameters, normalised log probabilities (B, A)."""
+        """Set the parameters, normalised log-probabilities (B, A)."""
         self.log_probs = log_probs
         return self
 
     @property
     def distribution(self) -> Categorical:
-        """PyTorch's distribution, which TRPO compares."""
+        """PyTorch's distribution, for TRPO's KL divergence."""
         return Categorical(logits=self.log_probs, validate_args=False)
 
     @distribution.setter
@@ -146,10 +146,10 @@ def mixture_of(action_space: spaces.Space[Any], log_weights: th.Tensor, paramete
 
 
 class _FromPool(Distribution):
-    """What SB3 asks of a distribution beside its mathematics."""
+    """Methods of SB3's ``Distribution`` that pools share."""
 
     def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
-        """Not here: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
+        """Raise an error: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
         raise NotImplementedError("the parameters of a pool's distribution come from sb3_saf.networks.actor.PolicyPool")
 
     def actions_from_params(self, *args: Any, deterministic: bool = False, **kwargs: Any) -> th.Tensor:
@@ -158,7 +158,7 @@ class _FromPool(Distribution):
         return self.get_actions(deterministic=deterministic)
 
     def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Set the parameters (see ``proba_distribution``), sample, and give the sample's log-likelihood too."""
+        """Set the parameters (see ``proba_distribution``), sample, and return the sample and its log-likelihood."""
         actions = self.actions_from_params(*args, **kwargs)
         return actions, self.log_prob(actions)
 
@@ -167,9 +167,9 @@ class PoolDistribution(_FromPool):
     """
     Mixture of a pool of policies over actions of several dimensions.
 
-    ``log_prob`` is exact. ``entropy`` and ``mode`` are exact while there are at most ``MAX_ENUMERATED_ACTIONS`` joint
-    actions. Beyond, and for Box actions, the entropy is None (no closed form; SB3 then estimates it by -log_prob),
-    and the mode is that of the likeliest policy.
+    ``log_prob`` is exact. ``entropy`` and ``mode`` are exact for at most ``MAX_ENUMERATED_ACTIONS`` joint actions. For
+    more, and for Box actions, the entropy is None (no closed form; SB3 then estimates it by -log_prob), and the mode is
+    that of the likeliest policy.
 
     :param action_space: MultiDiscrete, MultiBinary or Box
     """
@@ -189,7 +189,7 @@ class PoolDistribution(_FromPool):
 
     @property
     def distribution(self) -> PolicyAndAction:
-        """What TRPO compares: the distribution of policy and action together."""
+        """Joint distribution of policy and action, for TRPO's KL divergence."""
         return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
 
     @distribution.setter
@@ -205,20 +205,20 @@ class PoolDistribution(_FromPool):
         return mixture_entropy(self.space, self.log_weights, self.parameters)
 
     def sample(self) -> th.Tensor:
-        """(B, D): draw a policy, then its action."""
+        """Draw a policy, then its action: (B, D)."""
         return mixture_sample(self.space, self.log_weights, self.parameters)
 
     def mode(self) -> th.Tensor:
-        """(B, D): the most likely joint action, or the mode of the likeliest policy where they cannot be enumerated."""
+        """Return the most likely joint action (B, D), or the likeliest policy's mode if they cannot be enumerated."""
         return mixture_mode(self.space, self.log_weights, self.parameters)
 
 
 class PolicyAndAction(TorchDistribution):
     """
-    Which policy is drawn, and what it does: here for its divergence, KL(w || w') + sum_u w_u KL(pi_u || pi'_u).
+    Joint distribution of the drawn policy and its action, with KL(w || w') + sum_u w_u KL(pi_u || pi'_u).
 
-    That is never less than the divergence of the mixtures, which has no closed form (the policy is one more thing to
-    tell them apart by), and zero where nothing differs: who stays within it, as TRPO does, stays within the other.
+    This is an upper bound of the KL divergence of the mixtures, which has no closed form, and zero for equal pools:
+    TRPO's trust region on it also bounds the mixtures.
 
     :param log_weights: (B, U), normalised
     :param policies: distribution of B * U rows, those of a mixture's policies consecutive
@@ -234,16 +234,16 @@ class PolicyAndAction(TorchDistribution):
 
 @register_kl(PolicyAndAction, PolicyAndAction)
 def _divergence(one: PolicyAndAction, other: PolicyAndAction) -> th.Tensor:
-    """(B,) see :class:`PolicyAndAction`."""
+    """Return the divergence (B,), see :class:`PolicyAndAction`."""
     weights = one.log_weights.exp()
-    # SB3 gives one number per row, or one per action dimension.
+    # kl_divergence returns one number per row, or one per action dimension.
     of_actions = kl_divergence(one.policies, other.policies).reshape(*weights.shape, -1).sum(dim=2)
     return (weights * (one.log_weights - other.log_weights + of_actions)).sum(dim=1)
 
 
 class SelectedDistribution(_FromPool):
     """
-    The distribution of the one policy that was drawn; deterministic actions are those of the favourite policy.
+    Distribution of the drawn policy; deterministic actions are those of the favourite policy.
 
     :param drawn: distribution of the policy drawn for each row
     :param favourite: distribution of the policy with the highest selection logit of each row
@@ -256,7 +256,7 @@ class SelectedDistribution(_FromPool):
 
     @property
     def distribution(self) -> TorchDistribution:
-        """Not there: TRPO would compare policies drawn at different times."""
+        """Raise an error: TRPO would compare policies drawn at different times."""
         raise ValueError(
             "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
             "(TRPO's KL divergence) says nothing; use selection='mixture'"

@@ -1,7 +1,7 @@
 """
-The encoders of ``sb3_saf.networks`` as SB3's features extractors, and the default choice among them.
+The encoders of ``sb3_saf.networks`` as SB3 features extractors, and the default choice among them.
 
-On the CPU, extractors of tile codes look up what tiles add to their first layer instead of making pixels
+On the CPU, extractors of tile codes look up the tiles' contributions to their first layer instead of making pixels
 (``sb3_saf.networks.tile_sums``): the same features, up to the order of summation.
 """
 
@@ -29,22 +29,22 @@ from sb3_saf.networks.tile_sums import (
     used_codes,
 )
 
-#: Up to this many pixels the paper's encoder is the default; from there on it grows beyond 7 million weights.
+#: Maximum pixels for which the paper's encoder is the default; beyond, it has more than 7 million weights.
 _PAPERS_PIXELS: Final = 64 * 64
-#: The least side of a picture that the paper's encoder takes.
+#: Smallest side of a picture for the paper's encoder.
 _FEWEST_PIXELS: Final = 8
-#: More pixels, or more weights, than anybody wants to train on without being asked.
+#: Number of pixels above which a warning about slow training is issued.
 _MANY_PIXELS: Final = 128 * 128
 _MANY_WEIGHTS: Final = 10_000_000
 
 
 def looks_up(pixels: PixelInput, observations: th.Tensor) -> bool:
-    """Whether a first layer looks up what tiles add to it: codes on the CPU. Elsewhere products are cheaper."""
+    """Return whether a first layer uses the lookup: for codes on the CPU. On other devices products are cheaper."""
     return pixels.layout == "codes" and observations.device.type == "cpu"
 
 
 class PaperCNN(encoders.PaperCNN, BaseFeaturesExtractor):
-    """SB3's features extractor of :class:`sb3_saf.networks.encoders.PaperCNN`, with its parameters."""
+    """SB3 features extractor of :class:`sb3_saf.networks.encoders.PaperCNN`, with its parameters."""
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
         BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
@@ -62,7 +62,7 @@ class PaperCNN(encoders.PaperCNN, BaseFeaturesExtractor):
         return features
 
     def _first_layer(self, codes: th.Tensor, places: Places) -> th.Tensor:
-        """(K, 32, h, w) outputs of the first convolution and its ReLU: (K, rows, columns)."""
+        """Apply the first convolution and its ReLU: codes (K, rows, columns) to (K, 32, h, w)."""
         first = self.net[0]
         assert isinstance(first, nn.Conv2d) and first.bias is not None
         used = used_codes(codes.flatten(1))
@@ -71,7 +71,7 @@ class PaperCNN(encoders.PaperCNN, BaseFeaturesExtractor):
 
 
 class NatureEncoder(encoders.NatureEncoder, BaseFeaturesExtractor):
-    """SB3's features extractor of :class:`sb3_saf.networks.encoders.NatureEncoder`, with its parameters."""
+    """SB3 features extractor of :class:`sb3_saf.networks.encoders.NatureEncoder`, with its parameters."""
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
         BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
@@ -79,7 +79,7 @@ class NatureEncoder(encoders.NatureEncoder, BaseFeaturesExtractor):
 
 
 class LightEncoder(encoders.LightEncoder, BaseFeaturesExtractor):
-    """SB3's features extractor of :class:`sb3_saf.networks.encoders.LightEncoder`, with its parameters."""
+    """SB3 features extractor of :class:`sb3_saf.networks.encoders.LightEncoder`, with its parameters."""
 
     def __init__(
         self,
@@ -104,19 +104,19 @@ class LightEncoder(encoders.LightEncoder, BaseFeaturesExtractor):
         return features
 
     def _first_layer(self, codes: th.Tensor) -> th.Tensor:
-        """(K, hidden) outputs of the first linear layer and its ReLU: (K, rows, columns)."""
+        """Apply the first linear layer and its ReLU: codes (K, rows, columns) to (K, hidden)."""
         first = self.net[0]
         assert isinstance(first, nn.Linear)
         used = used_codes(codes.flatten(1))
         embedded = self.embed(self.tile_inputs[used.codes])
-        # Weights are (hidden, T * e): what a code adds at each of the T places, (U, T, hidden).
+        # Weights are (hidden, T * e); contributions of a code at each of the T places are (U, T, hidden).
         by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
         table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
         return rectified_sums(used.views, table, first.bias, self._places)
 
 
 class MLPEncoder(encoders.MLPEncoder, BaseFeaturesExtractor):
-    """SB3's features extractor of :class:`sb3_saf.networks.encoders.MLPEncoder`, with its parameters."""
+    """SB3 features extractor of :class:`sb3_saf.networks.encoders.MLPEncoder`, with its parameters."""
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64, hidden: int = 128):
         BaseFeaturesExtractor.__init__(self, observation_space, features_dim)
@@ -125,12 +125,12 @@ class MLPEncoder(encoders.MLPEncoder, BaseFeaturesExtractor):
 
 class PartsEncoder(BaseFeaturesExtractor):
     """
-    An encoder for pictures beside scalars and vectors: each picture's own encoder (an MLP below 8 pixels), one
-    :class:`MLPEncoder` for all the rest, then linear ``features_dim`` and ReLU.
+    Encoder for pictures together with scalars and vectors: one encoder per picture (an MLP below 8 pixels), one
+    :class:`MLPEncoder` for the rest, then linear ``features_dim`` and ReLU.
 
     :param observation_space: a :class:`~sb3_saf.envs.space_reader.PartsSpace`, which ``make_team_env`` makes of Dicts
-    :param features_dim: size of the features, of each encoder and of all together
-    :raises ValueError: for another space
+    :param features_dim: size of the features, of each encoder and of the output
+    :raises ValueError: for any other space
     """
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
@@ -166,9 +166,9 @@ class ObservationEncoder(BaseFeaturesExtractor):
     """
     The default encoder, chosen by space: for pictures (uint8, 0..255) and tile codes :class:`PaperCNN`, or
     :class:`NatureEncoder` if they have more than 64 x 64 pixels; for pictures beside vectors :class:`PartsEncoder`; for
-    all else :class:`MLPEncoder`.
+        other spaces :class:`MLPEncoder`.
 
-    Warns of pictures that make training slow whatever encodes them.
+    Warns about pictures so large that training is slow with any encoder.
 
     :param observation_space: one agent's own observation space
     :param features_dim: size of the features
@@ -199,7 +199,7 @@ def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExt
 
 
 def _picture_encoder_class(space: spaces.Box) -> type[BaseFeaturesExtractor]:
-    """As :func:`_encoder_class`, but an MLP for pictures that are too small to be convolved."""
+    """As :func:`_encoder_class`, but an MLP for pictures too small for convolutions."""
     _, height, width = observation_spec(space).space.picture_shape
     return MLPEncoder if min(height, width) < _FEWEST_PIXELS else _encoder_class(space)
 

@@ -1,4 +1,4 @@
-"""IPPO: independent agents that share weights; actor and critic read the agent's own observation."""
+"""IPPO: independent agents with shared weights; actor and critic read the agent's own observation."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class IPPOParts(TeamParts):
     IPPO's actor and critic.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
-    :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts
+    :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector
     """
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead:
-        """V_i from z_i."""
+        """Make the critic: V_i from z_i."""
         return OwnValueHead(spec, spec.features_dim, self.heads)
 
 
@@ -52,7 +52,7 @@ DECLARATION: Final = Declaration(
     team_policies(IPPOPolicy, IPPOLstmPolicy, IPPOMaskablePolicy),
     {
         "ippo": AlgorithmSpec(PPO, "IPPOPolicy", "ippo"),
-        # The paper's own form: an actor and a critic for each agent.
+        # As in the paper: an actor and a critic for each agent.
         "ippo-separate": AlgorithmSpec(PPO, "IPPOPolicy", "ippo", {"heads": "per_agent"}),
         "ippo-lstm": AlgorithmSpec(RecurrentPPO, "IPPOLstmPolicy", "ippo-lstm"),
     },

@@ -1,4 +1,4 @@
-"""MAPPO: the actor of IPPO, and a critic that reads what the whole team sees."""
+"""MAPPO: the actor of IPPO, and a critic that reads the observations of the whole team."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 
 class JointCritic(TeamCritic):
     """
-    V_i from the features of all agents side by side, [z_1, ..., z_N].
+    V_i from the concatenated features of all agents, [z_1, ..., z_N].
 
     :param spec: of the policy
     :param parts: ``heads`` and ``agent_identity``
@@ -46,7 +46,7 @@ class JointCritic(TeamCritic):
         self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
 
     def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`TeamCritic`; features of agents that take no part are read as zeros."""
+        """See :class:`TeamCritic`; features of inactive agents are read as zeros."""
         members = gather(features, teams)
         if active is not None:
             members = members * active.unsqueeze(2)
@@ -85,17 +85,17 @@ class MAPPOParts(TeamParts):
     MAPPO's actor and critic.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
-    :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts
-    :param agent_identity: whether a shared critic on joint features reads, as a one-hot vector, whose value is asked;
+    :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector
+    :param agent_identity: whether a shared critic on joint features reads the agent's index as a one-hot vector;
         without it all agents of a team get the same value
-    :param critic_input: whether the critic reads what the whole ``"team"`` sees, or the ``"state"`` of the game
-        (``make_team_env(..., state=True)``)
+    :param critic_input: whether the critic reads the observations of the whole ``"team"``, or the ``"state"`` of the
+        game (``make_team_env(..., state=True)``)
     """
 
     agent_identity: bool = True
     critic_input: CriticInput = "team"
 
-    #: What the critic may read.
+    #: Possible inputs of the critic.
     critic_inputs: ClassVar[tuple[CriticInput, ...]] = ("team", "state")
 
     def __post_init__(self) -> None:
@@ -103,11 +103,11 @@ class MAPPOParts(TeamParts):
         check_choice("critic_input", self.critic_input, self.critic_inputs)
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
-        """V_i from [z_1, ..., z_N], or from the state."""
+        """Make the critic: V_i from [z_1, ..., z_N], or from the state."""
         return JointStateCritic(spec, self) if self.critic_input == "state" else JointCritic(spec, self)
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """[z_1, ..., z_N], and whose value is asked where one head serves all agents."""
+        """Make the states [z_1, ..., z_N], with the agent's index for a shared head."""
         if self.critic_input == "state":
             raise ValueError(
                 "critic_input='state' has no critic with memory; pass enable_critic_lstm=False, or leave critic_input "
@@ -142,7 +142,7 @@ DECLARATION: Final = Declaration(
     team_policies(MAPPOPolicy, MAPPOLstmPolicy, MAPPOMaskablePolicy),
     {
         "mappo": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo"),
-        # The paper's own form: an actor and a critic for each agent.
+        # As in the paper: an actor and a critic for each agent.
         "mappo-separate": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo", {"heads": "per_agent"}),
         "mappo-lstm": AlgorithmSpec(RecurrentPPO, "MAPPOLstmPolicy", "mappo-lstm"),
     },

@@ -1,11 +1,11 @@
 """
-What the file of an algorithm gives: its parts (actor and critic), and a declaration (its policies and its names).
+Base classes for algorithm files: the parts (actor and critic), and a declaration (policies and names).
 
-Policy classes differ in what SB3 asks of them (PPO's, recurrent, maskable ...); parts differ in the algorithm. A policy
+Policy classes implement SB3's interfaces (PPO's, recurrent, maskable ...); parts implement the algorithm. A policy
 class names its parts and takes their fields as constructor arguments, so that each default is written once.
 
-Registration, command lines, the paper's table and the tests that sweep over all algorithms read the declaration: a
-further algorithm is one more file in this folder (and its YAML in ``zoo_configs``, and its page).
+Registration, command lines, the paper's table and the tests of all algorithms read the declaration: a new algorithm is
+one more file in this folder (with a YAML in ``zoo_configs``, and a page).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.layers import NetworkSpec
 
-#: What a critic may read: the agent's own part, the whole team's, or the state of the game.
+#: Input of a critic: the agent's own features, the whole team's, or the state of the game.
 CriticInput = Literal["own", "team", "state"]
 
 #: Policy classes by the algorithms that train them.
@@ -39,9 +39,9 @@ class TeamParts(ABC):
     Base of all parts: the actor that MAPPO and IPPO share.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
-    :param actor_identity: whether a shared actor reads, as a one-hot vector, who acts: for teams whose agents have
-        roles that their observations do not tell. Off, because such a model needs the agent's index to act, and where
-        observations tell agents apart it was not reliably better (measured in docs/reference/own_environment.md)
+    :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector: for teams with roles that
+        observations do not show. Off by default, because such a model needs the agent's index to act, and was not
+        reliably better if observations distinguish agents (measured in docs/reference/own_environment.md)
     """
 
     heads: Heads = "shared"
@@ -51,11 +51,11 @@ class TeamParts(ABC):
         check_choice("heads", self.heads, get_args(Heads))
 
     def n_identities(self, spec: NetworkSpec) -> int:
-        """Return N if a shared actor reads who acts, else 0."""
+        """Return N if a shared actor reads the agent's index, else 0."""
         return spec.n_agents if self.actor_identity else 0
 
     def actor(self, spec: NetworkSpec) -> ActorNetwork:
-        """Make the actor; with one for each agent there is nothing to tell them."""
+        """Make the actor; separate actors do not need the agent's index."""
         per_agent = self.heads == "per_agent"
         return SinglePolicy(
             spec.features_dim,
@@ -72,19 +72,19 @@ class TeamParts(ABC):
         """Make the critic."""
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """Make what a critic with memory reads of each agent; None for the features of its own observation."""
+        """Make the input of a critic with memory; None for the features of the agent's own observation."""
         return None
 
 
 @dataclass(frozen=True)
 class AlgorithmSpec:
     """
-    What a name of the command lines stands for.
+    Algorithm behind a name of the command lines.
 
     :param algorithm: the algorithm's class
     :param policy: name of its policy
     :param config: name of the YAML file in ``zoo_configs``, without ``.yml``
-    :param policy_kwargs: what makes the policy this one; nothing overrides it
+    :param policy_kwargs: fixed policy arguments, which cannot be overridden
     """
 
     algorithm: type[BaseAlgorithm]
@@ -94,7 +94,7 @@ class AlgorithmSpec:
 
     @property
     def draws_actions(self) -> bool:
-        """Whether drawn actions are the policy's own; those of off-policy algorithms are exploration."""
+        """Whether sampled actions come from the policy; those of off-policy algorithms are exploration."""
         return not issubclass(self.algorithm, OffPolicyAlgorithm)
 
     @property
@@ -108,7 +108,7 @@ class PaperTable(NamedTuple):
     The algorithm's line in the paper's table of parameters.
 
     :param policy_kwargs: arguments with which a policy has as many parameters
-    :param n_parameters: the paper's figure
+    :param n_parameters: number of parameters in the paper
     """
 
     policy_kwargs: Mapping[str, Any]
@@ -118,11 +118,11 @@ class PaperTable(NamedTuple):
 @dataclass(frozen=True)
 class Declaration:
     """
-    An algorithm.
+    Declaration of an algorithm.
 
-    :param name: what it is called, such as ``"SAF"``
+    :param name: its name, such as ``"SAF"``
     :param policies: its policy classes, by the algorithms of SB3 and sb3-contrib that train them; the first of each is
-        also known as ``f"{name}Policy"``, as ``name`` and as that in lower case
+        also registered as ``f"{name}Policy"``, ``name`` and ``name`` in lower case
     :param commands: its names on command lines, in log folders and results
     :param paper_table: None for an algorithm that is not in it
     """
@@ -134,7 +134,7 @@ class Declaration:
 
 
 def team_policies(policy: type[BasePolicy], recurrent: type[BasePolicy], maskable: type[BasePolicy]) -> Policies:
-    """Return which algorithms train the policies that are made of one set of parts."""
+    """Return the policies of one set of parts by the algorithms that train them."""
     return {
         PPO: (policy,),
         A2C: (policy,),

@@ -1,5 +1,5 @@
 """
-The base of policies for RecurrentPPO: actors and critics that remember (the paper's policies condition on histories).
+Base of policies for RecurrentPPO: actors and critics with LSTMs (the paper's policies condition on histories).
 
 Letters: B rows (sequences one after another, padded by sb3-contrib to one length), N agents, S size of a critic's
 state, H size of the LSTMs' output.
@@ -29,11 +29,12 @@ LstmStates = tuple[th.Tensor, ...]
 
 class RecurrentCritic(nn.Module):
     """
-    An LSTM over what the critic knows of the row's agent at each step, then a value head.
+    LSTM over the critic's state of the row's agent at each step, then a value head.
 
-    :param team_states: makes the LSTM's input, (B, S) of the rows' agents; None for the features of what they see
-    :param lstm: S to H
-    :param head: H to values
+    :param team_states: computes the LSTM's input, (B, S) of the rows' agents; None for the features of their own
+        observations
+    :param lstm: LSTM from S to H
+    :param head: value head on H
     """
 
     def __init__(self, team_states: TeamStates | None, lstm: nn.LSTM, head: OwnValueHead):
@@ -47,28 +48,28 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     """
     Policy for RecurrentPPO on rows of teams.
 
-    Actor: the features of the agent's own observation, an LSTM that all agents share, then selection and pool (or the
-    single policy). An agent acts on its own observation and its own hidden state; nothing else reaches it.
+    Actor: features of the agent's own observation, an LSTM shared by all agents, then selection and pool (or the single
+    policy). Actions depend on the agent's own observation and hidden state only.
 
-    Critic: sb3-contrib keeps one hidden state per row and shuffles rows, so a row never meets the hidden states of its
-    teammates. It needs none: the row holds what the whole team sees, and the critic's LSTM runs over what the critic
-    makes of it at each step. For SAF that is s_i^SAF, so the knowledge source comes first and memory second; for MAPPO
-    [z_1, ..., z_N] and whose value is asked; for IPPO z_i. A value head on the LSTM's output follows.
+    Critic: sb3-contrib keeps one hidden state per row and shuffles rows, so the hidden states of teammates are not
+    available. They are not needed: the row holds the observations of the whole team, and the critic's LSTM runs over
+    the critic's state of each step. For SAF that is s_i^SAF, so the knowledge source precedes the LSTM; for MAPPO [z_1,
+    ..., z_N] and the agent's index; for IPPO z_i. A value head on the LSTM's output follows.
 
-    Equal observations are encoded once, as in other team policies; from the LSTMs on, every row counts.
+    Equal observations are encoded once, as in other team policies; the LSTMs run on every row.
 
     Takes the arguments of :class:`TeamPolicy` and, by keyword, the fields of its parts.
 
     :param observation_space: Dict of ``obs``, ``team`` and ``agent``
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param lr_schedule: learning rate schedule
-    :param net_arch: hidden sizes of actor and critic heads, which read the LSTMs' outputs; see the base class
+    :param net_arch: hidden sizes of actor and critic heads on the LSTMs' outputs; see the base class
     :param lstm_hidden_size: H
     :param n_lstm_layers: layers of each LSTM
-    :param enable_critic_lstm: False leaves the critic without memory: it is then the one of PPO's policies
-    :param shared_lstm: refused; actor and critic read different things
+    :param enable_critic_lstm: False uses the critic of PPO's policies, without memory
+    :param shared_lstm: must be False: actor and critic have different inputs
     :param lstm_kwargs: further arguments of both LSTMs
-    :param kwargs: those of :class:`TeamPolicy`
+    :param kwargs: arguments of :class:`TeamPolicy`
     """
 
     value_net: OwnValueHead | TeamCritic | StateCritic | RecurrentCritic  # type: ignore[assignment]
@@ -101,7 +102,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
             net_arch,
             lstm_hidden_size=lstm_hidden_size,
             n_lstm_layers=n_lstm_layers,
-            # sb3-contrib makes no network for the critic of a shared LSTM: ours comes below.
+            # sb3-contrib makes no critic network for a shared LSTM: it is made below.
             shared_lstm=True,
             enable_critic_lstm=False,
             lstm_kwargs=dict(lstm_kwargs or {}),
@@ -113,7 +114,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     # --- construction -----------------------------------------------------------------------------------------------
 
     def _build(self, lr_schedule: Schedule) -> None:
-        # After this, sb3-contrib makes the actor's LSTM. The critic comes last, see the base class.
+        # sb3-contrib makes the actor's LSTM after this. The critic is made last, see the base class.
         self._build_actor()
 
     def _make_actor(self) -> ActorNetwork:
@@ -151,7 +152,7 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
 
         :param obs: rows
         :param lstm_states: hidden and cell states of actor and critic, each (layers, sequences, H)
-        :param episode_starts: (B,) 1.0 where an episode starts, which forgets the states
+        :param episode_starts: (B,) 1.0 where an episode starts, which resets the states
         :param deterministic: whether to take the most likely actions
         :return: actions (B, ...), values (B, 1), log-likelihoods (B,) and the next states
         """
@@ -189,12 +190,12 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
         self, features: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor | None = None
     ) -> tuple[th.Tensor, LstmStates]:
         """
-        Take one step of the actor's LSTM.
+        Run one step of the actor's LSTM.
 
-        :param features: (B, d) of own observations
-        :param lstm_states: of the actor, (layers, B, H) each
-        :param episode_starts: (B,) 1.0 where an episode starts, which forgets the states; None where none does
-        :return: (B, H), which the actor reads, and the next states
+        :param features: (B, d) features of own observations
+        :param lstm_states: the actor's states, (layers, B, H) each
+        :param episode_starts: (B,) 1.0 where an episode starts, which resets the states; None if none starts
+        :return: the actor's input (B, H), and the next states
         """
         starts = th.zeros(len(features), device=features.device) if episode_starts is None else episode_starts
         return self._process(features, lstm_states, starts, self.lstm_actor)
@@ -229,13 +230,13 @@ class TeamRecurrentPolicy(TeamPolicy, RecurrentActorCriticPolicy):  # type: igno
     def _process(
         self, inputs: th.Tensor, lstm_states: LstmStates, episode_starts: th.Tensor, lstm: nn.LSTM
     ) -> tuple[th.Tensor, LstmStates]:
-        """(B, H) outputs of an LSTM, and its states after the last step: (B, ...) inputs, sequence by sequence."""
+        """Return outputs (B, H) of an LSTM for inputs (B, ...), sequence by sequence, and its last states."""
         outputs, states = self._process_sequence(inputs, lstm_states, episode_starts, lstm)  # type: ignore[arg-type]
         return outputs, states  # type: ignore[return-value]  # sb3-contrib's annotation says one tensor
 
 
 def _critic_inputs(critic: RecurrentCritic, encoded: Encoded) -> th.Tensor:
-    """(B, S) inputs of the critic's LSTM."""
+    """Return the inputs (B, S) of the critic's LSTM."""
     teams = encoded.teams
     if critic.team_states is None:
         return encoded.own.of_rows()

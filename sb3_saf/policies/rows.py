@@ -1,4 +1,4 @@
-"""How policies read rows of teams. Letters: B rows, N agents, K unique own observations, A actions, d features."""
+"""Reading of rows of teams. Letters: B rows, N agents, K unique own observations, A actions, d features."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sb3_saf.envs.teams import (
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.networks.spaces import pixels_to_codes
 
-#: How PettingZoo's environments give masks.
+#: Keys of PettingZoo's observations with masks.
 _CLASSIC: Final = {"observation", ACTION_MASK_KEY}
 
 Observation = np.ndarray | Mapping[str, Any]
@@ -39,7 +39,7 @@ _CHUNK_OF_CONVOLUTIONS: Final = 512
 
 class TeamRowsPolicy(BasePolicy):
     """
-    Base of everything that acts on rows of teams: it reads their entries and encodes them.
+    Base of all policies on rows of teams: reads their entries and encodes them.
 
     Subclasses call :meth:`_read_rows_of` before they call SB3's constructor.
     """
@@ -57,14 +57,15 @@ class TeamRowsPolicy(BasePolicy):
         chunk_size: ChunkSize,
     ) -> None:
         """
-        Take the spaces apart.
+        Read the spaces.
 
-        :param observation_space: Dict of ``obs``, ``team``, ``agent``, and perhaps ``active``, ``action_mask``,
+        :param observation_space: Dict of ``obs``, ``team``, ``agent``, and optionally ``active``, ``action_mask``,
             ``state``
         :param action_space: one agent's action space
-        :param encode_once: whether equal observations of a batch are encoded once; None where they are whole numbers
-        :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all but where pictures
-            are convolved, whose intermediate results shall fit the cache
+        :param encode_once: whether equal observations of a batch are encoded once; None for True with integer
+            observations
+        :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for
+            convolved pictures, whose intermediate results should fit the cache
         :raises ValueError: if the space is not that of a team
         """
         if chunk_size is not None and chunk_size != "auto":
@@ -78,9 +79,9 @@ class TeamRowsPolicy(BasePolicy):
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """
-        Make the encoder, for the observations of one agent.
+        Make the encoder for one agent's observations.
 
-        :raises ValueError: if its class does not take their space
+        :raises ValueError: if its class does not support their space
         """
         own, kind = self.team_spaces.own, self.features_extractor_class
         try:
@@ -97,7 +98,7 @@ class TeamRowsPolicy(BasePolicy):
         """
         Encode own observations.
 
-        :param obs: rows, or own observations alone
+        :param obs: rows, or only own observations
         :param features_extractor: must be the policy's own, or None
         :return: (B, d)
         """
@@ -105,15 +106,15 @@ class TeamRowsPolicy(BasePolicy):
             raise ValueError("a team policy encodes with its own features_extractor; call the other extractor directly")
         return self.encode_own(obs).of_rows()
 
-    # --- what users pass to predict ---------------------------------------------------------------------------------
+    # --- inputs of predict ------------------------------------------------------------------------------------------
 
     def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[Any, tuple[np.ndarray, ...] | None]:
         """
-        Act, as SB3's ``predict``; also on the observations of a PettingZoo environment.
+        Act as SB3's ``predict``; also on the observations of a PettingZoo environment.
 
-        :param observation: rows, some of their entries, own observations alone, or ``{agent: observation}`` as a
-            ParallelEnv gives them. Where an actor reads who acts, these must be all agents in index order. A model
-            that was trained on tile codes also takes the pixels of the same game
+        :param observation: rows, some of their entries, only own observations, or ``{agent: observation}`` of a
+            ParallelEnv. If the actor reads the agent's index, the latter must have all agents in index order. A model
+            trained on tile codes also takes the pixels of the same game
         :param args: state, episode_start, deterministic as in SB3
         :param kwargs: the same, and ``action_masks`` of MaskablePPO
         :return: actions and the next state; ``{agent: action}`` for ``{agent: observation}``
@@ -128,7 +129,7 @@ class TeamRowsPolicy(BasePolicy):
         return isinstance(observation, Mapping) and bool(observation) and not (set(observation) & (ALL_KEYS | _CLASSIC))
 
     def _stacked(self, observations: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Make rows of observations by agent."""
+        """Stack observations by agent to rows."""
         n_agents, first = self.team_spaces.n_agents, next(iter(observations.values()))
         if len(observations) > n_agents:
             raise ValueError(f"expected observations of at most {n_agents} agents, got {len(observations)}")
@@ -142,17 +143,17 @@ class TeamRowsPolicy(BasePolicy):
         return rows
 
     def _renamed(self, entries: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Give PettingZoo's entries the names of ours."""
+        """Rename PettingZoo's keys to those of rows."""
         if set(entries) != _CLASSIC or self.team_spaces.action_mask is None:
             return entries
         return {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
 
     def obs_to_tensor(self, observation: Observation) -> tuple[PyTorchObs, bool]:
         """
-        Make tensors of NumPy observations.
+        Convert NumPy observations to tensors.
 
-        :param observation: rows, some of their entries, or own observations alone; a batch or a single one. Where
-            there are masks, also in PettingZoo's form {"observation", "action_mask"}
+        :param observation: rows, some of their entries, or only own observations; a batch or a single one. With masks,
+            also in PettingZoo's form {"observation", "action_mask"}
         :return: dict of tensors with a batch axis, and whether the observation was a batch
         """
         entries = self._renamed(observation if isinstance(observation, Mapping) else {OBS_KEY: observation})
@@ -182,31 +183,31 @@ class TeamRowsPolicy(BasePolicy):
     # --- entries of rows --------------------------------------------------------------------------------------------
 
     def _own(self, obs: PyTorchObs) -> th.Tensor:
-        """(B, *shape) own observations."""
+        """Return own observations, (B, *shape)."""
         own = obs if isinstance(obs, th.Tensor) else entry_of(obs, OBS_KEY, "the actor")
         return own.reshape(-1, *self.team_spaces.own_shape)
 
     def _team(self, obs: PyTorchObs) -> th.Tensor:
-        """(B, N, *shape) joint observations."""
+        """Return joint observations, (B, N, *shape)."""
         return entry_of(obs, TEAM_KEY, "the critic").reshape(-1, *self.team_spaces.team.shape)
 
     def _agent(self, obs: PyTorchObs) -> th.Tensor:
-        """(B,) agents' indices; buffers give them as (B, 1), some as floats."""
+        """Return the agents' indices, (B,); buffers store them as (B, 1), some as floats."""
         return entry_of(obs, AGENT_KEY, "an actor or critic that depends on the agent").reshape(-1).long()
 
     def _active(self, obs: PyTorchObs) -> th.Tensor | None:
-        """(B, N) bool, agents of the rows' teams that take part; None if all always do."""
+        """Return the active agents of the rows' teams, (B, N) bool; None if all always are."""
         if self.team_spaces.active is None:
             return None
         return entry_of(obs, ACTIVE_KEY, "the critic").reshape(-1, self.team_spaces.n_agents) != 0
 
     def _takes_part(self, obs: PyTorchObs) -> th.Tensor | None:
-        """(B, 1) bool, whether the rows' own agents take part; None if all always do."""
+        """Return whether the rows' own agents are active, (B, 1) bool; None if all always are."""
         active = self._active(obs)
         return None if active is None else active.gather(1, self._agent(obs).unsqueeze(1))
 
     def _action_mask(self, obs: PyTorchObs, padded: bool = False) -> th.Tensor | None:
-        """(B, A) bool, the rows' legal actions; None if all always are. Only rows of a padding may have none."""
+        """Return the rows' legal actions, (B, A) bool; None if all always are. Only padding rows may have none."""
         if self.team_spaces.action_mask is None:
             return None
         if isinstance(obs, th.Tensor) or ACTION_MASK_KEY not in obs:
@@ -227,15 +228,15 @@ class TeamRowsPolicy(BasePolicy):
     # --- encoding ---------------------------------------------------------------------------------------------------
 
     def encode_own(self, obs: PyTorchObs) -> EncodedRows:
-        """Encode the own observations of rows, or own observations alone."""
+        """Encode the own observations of rows, or plain own observations."""
         return self.row_encoder.rows(self._own(obs))
 
     def encode_teams(self, obs: PyTorchObs) -> tuple[EncodedRows, EncodedTeams]:
         """
         Encode the rows' own observations and those of their teams.
 
-        Whole teams need no search: those of TeamRolloutBuffer's minibatches, and the rows of a step. The rows of SB3's
-        shuffled minibatches find their teams by the joint observation.
+        Whole teams (minibatches of TeamRolloutBuffer, rows of a step) are used directly. In SB3's shuffled minibatches,
+        teams are found by their joint observation.
 
         :param obs: rows
         """
@@ -252,7 +253,7 @@ class TeamRowsPolicy(BasePolicy):
         return own, EncodedTeams(own.features, teams, None, None if active is None else active[::n_agents])
 
     def _are_whole_teams(self, obs: PyTorchObs) -> bool:
-        """Whether rows are those of whole teams, agents in index order: as in a step of all games."""
+        """Return whether rows are whole teams with agents in index order, as in a step of all games."""
         n_agents, team, agent, own = self.team_spaces.n_agents, self._team(obs), self._agent(obs), self._own(obs)
         if len(agent) % n_agents or team.requires_grad or own.dtype != team.dtype:
             return False
@@ -269,13 +270,13 @@ class TeamRowsPolicy(BasePolicy):
         return th.equal(by_team, own.view(n_teams, 1, n_agents, *shape).expand_as(by_team))
 
     def _encode(self, observations: th.Tensor) -> th.Tensor:
-        """(K, d) features of own observations (K, *shape)."""
+        """Return features (K, d) of own observations (K, *shape)."""
         return self._in_chunks(self.features_extractor, observations, self.team_spaces.own)
 
     def _in_chunks(
         self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
     ) -> th.Tensor:
-        """(K, ...) outputs of a module for preprocessed observations (K, *shape)."""
+        """Return outputs (K, ...) of a module for preprocessed observations (K, *shape)."""
         size = self._chunk_size_of(module) if observations.device.type == "cpu" else None
         if size is None or len(observations) <= size:
             return module(preprocess_obs(observations, space, self.normalize_images))
@@ -291,7 +292,7 @@ class TeamRowsPolicy(BasePolicy):
 
 
 def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
-    """Tile codes of pixels, where a model was trained on codes; anything else is returned as it is."""
+    """Convert pixels to tile codes for a model trained on codes; return any other observation unchanged."""
     atlas = getattr(space, "atlas", None)
     if atlas is None or space.shape is None or len(space.shape) != 2:
         return observation
@@ -302,7 +303,7 @@ def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
 
 
 def _checked_own(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
-    """Refuse NaN, and tile codes that the atlas lacks, in what users pass to predict."""
+    """Raise ValueError for NaN, and for tile codes that the atlas lacks, in inputs of predict."""
     if observation.dtype.kind == "f" and not np.isfinite(observation).all():
         raise ValueError(f"{OBS_KEY!r} must be finite, got {observation[~np.isfinite(observation)][0]}")
     atlas = getattr(space, "atlas", None)
@@ -314,7 +315,7 @@ def _checked_own(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarra
 
 
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
-    """Return an entry of rows, or raise the error that ``reader`` needs it."""
+    """Return an entry of rows, or raise an error that ``reader`` needs it."""
     if isinstance(obs, th.Tensor) or (key not in obs and not isinstance(obs, TeamMinibatch)):
         index = f", {{{OBS_KEY!r}: ..., {AGENT_KEY!r}: its index}}, or the observations of all agents by name"
         raise ValueError(

@@ -30,7 +30,7 @@ from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 
 class Communicated(NamedTuple):
     """
-    What every agent knows itself, and what went through the knowledge source.
+    States of the agents and the exchange through the knowledge source.
 
     :param states: (G, N, d), s of every agent
     :param exchanged: messages read, and the attention of writing and reading
@@ -68,23 +68,23 @@ class SAFStates(TeamStates):
 
     def communicate(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> Communicated:
         """
-        Send every agent's message through the knowledge source.
+        Exchange the agents' messages through the knowledge source.
 
         :param features: (K, d) features of own observations
-        :param teams: (G, N), which of them each agent of a team has
+        :param teams: (G, N), index into ``features`` of each agent of a team
         :param active: (G, N) bool, agents that take part; all if None
         """
-        # g_theta and g_omega depend on one observation only: computed once for each, then gathered.
+        # g_theta and g_omega depend on one observation only: computed once per unique observation, then gathered.
         ((own_messages, own_states),) = side_by_side([[self.message_net, self.state_net]], features)
         messages, states = gather(own_messages, teams), gather(own_states, teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
 
     def combine(self, states: th.Tensor, read: th.Tensor) -> th.Tensor:
         """
-        s^SAF = g_phi([s, m]).
+        Return s^SAF = g_phi([s, m]).
 
         :param states: (G, N, d), s of every agent
-        :param read: (G, N, d), m of every agent: what it read, or what is to be tried in its place
+        :param read: (G, N, d), m of every agent: the message read, or a substitute
         :return: (G, N, d)
         """
         combined: th.Tensor = self.combine_net(th.cat([states, read], dim=2))
@@ -95,7 +95,7 @@ class SAFCritic(SAFStates, TeamCritic):
     """
     V_i from s_i^SAF, or from those of the whole team.
 
-    :param spec: of the policy
+    :param spec: spec of the policy
     :param parts: ``critic_input``, ``heads``, ``agent_identity`` and sizes
     """
 
@@ -114,7 +114,7 @@ class SAFCritic(SAFStates, TeamCritic):
 
     def judge(self, states: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
         """
-        V_i of every agent.
+        Return V_i of every agent.
 
         :param states: (G, N, d), s^SAF of every agent
         :param active: (G, N) bool, agents that take part; all if None
@@ -135,14 +135,15 @@ class SAFParts(MAPPOParts):
 
     :param heads: ``"shared"`` for one critic that all agents use, ``"per_agent"`` for one each. The pool is always
         shared; without pool there is one actor, or one for each agent
-    :param actor_identity: whether pool and choice, or a shared actor, read, as a one-hot vector, who acts
-    :param agent_identity: whether a shared critic on joint features reads, as a one-hot vector, whose value is asked
+
+    :param actor_identity: whether pool and selection, or a shared actor, read the agent's index as a one-hot vector
+    :param agent_identity: whether a shared critic on joint features reads the agent's index as a one-hot vector
     :param n_policies: U, size of the pool; 1 is the ablation without pool
     :param selection: ``"mixture"`` (exact likelihood) or ``"gumbel"`` (one policy, drawn at every evaluation)
     :param knowledge_source: False is the ablation without knowledge source: MAPPO's critic
     :param critic_input: whether the critic reads the agent's ``"own"`` s^SAF or those of the whole ``"team"``; without
-        knowledge source it is MAPPO's, on the team. SAF's critic does not read the ``"state"`` of the game: what it
-        knows of the game comes through the knowledge source
+        knowledge source it is MAPPO's, on the team. SAF's critic does not support the ``"state"`` of the game: all its
+        information comes through the knowledge source
     :param n_slots: L, slots of the knowledge source
     :param latent_dim: d, size of messages, states, slots, queries and signature keys
     :param projection_arch: hidden sizes of g_theta, g_omega, g_phi and g_psel
@@ -163,11 +164,11 @@ class SAFParts(MAPPOParts):
         check_choice("selection", self.selection, get_args(Selection))
         for name in ("n_policies", "n_slots", "latent_dim"):
             check_count(name, getattr(self, name))
-        # Saved models may bring a list.
+        # Saved models may have a list.
         object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
 
     def actor(self, spec: NetworkSpec) -> ActorNetwork:
-        """The policy pool; with a single policy there is nothing to select, and the actor is MAPPO's."""
+        """Make the policy pool, or MAPPO's actor for a single policy."""
         if self.n_policies == 1:
             return super().actor(spec)
         return PolicyPool(
@@ -184,11 +185,11 @@ class SAFParts(MAPPOParts):
         )
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
-        """V_i from s_i^SAF."""
+        """Make the critic: V_i from s_i^SAF."""
         return SAFCritic(spec, self) if self.knowledge_source else super().critic(spec)
 
     def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """s_i^SAF, or those of all agents."""
+        """Make the states s_i^SAF, or those of all agents."""
         if not self.knowledge_source:
             return super().team_states(spec)
         states = SAFStates(spec, self)
@@ -218,9 +219,9 @@ DECLARATION: Final = Declaration(
     team_policies(SAFPolicy, SAFLstmPolicy, SAFMaskablePolicy),
     {
         "saf": AlgorithmSpec(PPO, "SAFPolicy", "saf"),
-        # Ablations read SAF's file: they differ in one argument and in nothing else.
+        # Ablations use SAF's settings and differ in these arguments only.
         "saf-no-pool": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1}),
-        # The paper's ablation goes back to an actor for each agent.
+        # As in the paper's ablation, with an actor for each agent.
         "saf-no-pool-separate": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1, "heads": "per_agent"}),
         "saf-no-ks": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"knowledge_source": False}),
         "saf-lstm": AlgorithmSpec(RecurrentPPO, "SAFLstmPolicy", "saf-lstm"),
