@@ -1,7 +1,7 @@
 """
 SAF, MAPPO and IPPO for Stable-Baselines3: importing this package registers their policies by name.
 
-Without Stable-Baselines3, which training needs, there is only :class:`Actor`, which runs exported actors.
+Without Stable-Baselines3, only :class:`Actor` for exported actors is available.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sb3_saf.export.actor import Actor
 def _is_installed(name: str) -> bool:
     try:
         return find_spec(name) is not None
-    except ImportError:  # somebody forbids it
+    except ImportError:  # blocked by the caller
         return False
 
 
@@ -69,14 +69,14 @@ if _is_installed("stable_baselines3"):
 else:
 
     def __getattr__(name: str) -> NoReturn:
-        """Say what is missing."""
+        """Raise an error that names the missing package."""
         needs = "needs stable_baselines3, which is not installed" if name in __all__ else "does not exist"
         raise AttributeError(f"sb3_saf.{name} {needs}")
 
 
 try:
     __version__ = version("sb3-saf")
-except PackageNotFoundError:  # run from a checkout that was never installed
+except PackageNotFoundError:  # run from a checkout without installation
     __version__ = "0+unknown"
 
 __all__ = [

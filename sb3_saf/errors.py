@@ -1,23 +1,23 @@
-"""Errors that more than one part of the package raises."""
+"""Errors shared by several parts of the package."""
 
 from __future__ import annotations
 
 
 class ExportError(ValueError):
-    """A file that cannot be trusted or understood, or a model that cannot be exported."""
+    """Raised for an invalid or untrusted file, or a model that cannot be exported."""
 
 
 class NonFiniteError(ValueError):
-    """NaN or infinity where learning from it would ruin the model."""
+    """Raised for NaN or infinity in training data, losses or gradients."""
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be written, read, or used with the given model."""
+    """Raised for a checkpoint that cannot be written, read, or used with the given model."""
 
 
 class DamagedCheckpointError(CheckpointError):
-    """A file that is cut short or changed: its checksum does not match."""
+    """Raised for a truncated or changed file, whose checksum does not match."""
 
 
 class UnknownFormatError(CheckpointError):
-    """An undamaged checkpoint in a format that this version does not read."""
+    """Raised for an undamaged checkpoint in a format that this version cannot read."""

@@ -1,4 +1,4 @@
-"""Evaluation by team episodes: SB3's loop, shown one row per game instead of one row per agent."""
+"""Evaluation by team episodes: SB3's loop with one row per game instead of one row per agent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, Array, check_count, find_n_agents, team_dones
 
-#: SB3's name of what tells that an episode was won.
+#: SB3's key for success of an episode.
 IS_SUCCESS: Final = "is_success"
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
@@ -47,8 +47,8 @@ class EvaluationResult(NamedTuple):
 
     :param returns: team return of each episode, the sum of the rewards of all agents over all steps
     :param lengths: game steps of each episode
-    :param successes: whether each episode was won; empty where the games do not tell (``"is_success"`` in the last info
-        of agent 0)
+    :param successes: whether each episode was won; empty if the games do not report it (``"is_success"`` in the last
+        info of agent 0)
     """
 
     returns: list[float]
@@ -67,11 +67,11 @@ class EvaluationResult(NamedTuple):
 
     @property
     def success_rate(self) -> float | None:
-        """Part of the episodes that were won; None where the games do not tell."""
+        """Fraction of episodes won; None if the games do not report it."""
         return float(np.mean(self.successes)) if self.successes else None
 
     def interval(self, confidence: float = 0.95) -> Interval:
-        """Student's t interval of the mean team return."""
+        """Return Student's t interval of the mean team return."""
         return confidence_interval(self.returns, confidence)
 
     def __str__(self) -> str:
@@ -82,14 +82,14 @@ class EvaluationResult(NamedTuple):
 
 def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Interval:
     """
-    Interval of the mean of independent values by Student's t distribution.
+    Compute the confidence interval of the mean of independent values by Student's t distribution.
 
     mean -+ t * s / sqrt(n), with s the sample standard deviation and t the two-sided quantile for n - 1 degrees of
     freedom.
 
     :param values: (n,) for instance team returns
     :param confidence: above 0, below 1
-    :return: both ends; infinite for a single value, which says nothing about its spread
+    :return: both ends; infinite for a single value
     :raises ValueError: if there are no values or the confidence is out of range
     """
     sample = np.asarray(values, dtype=np.float64).reshape(-1)
@@ -100,7 +100,7 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
     if len(sample) == 1:
         return Interval(-math.inf, math.inf)
     mean = float(sample.mean())
-    from scipy.special import stdtrit  # here, since it takes a tenth of a second that few need
+    from scipy.special import stdtrit  # imported here, since it takes a tenth of a second
 
     t = float(stdtrit(len(sample) - 1, (1 + confidence) / 2))
     margin = t * float(sample.std(ddof=1)) / math.sqrt(len(sample))
@@ -109,12 +109,12 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
 
 class RandomPolicy:
     """
-    The baseline that every learner has to beat: actions uniform over the action space, or over the legal ones where
-    observations have an ``action_mask``.
+    Baseline with random actions, uniform over the action space, or over legal actions if observations have an
+    ``action_mask``.
 
     :param action_space: one agent's action space, a Box must be bounded; or the environment that has it, for instance
         from ``make_team_env``
-    :param seed: of its own generator; None for a fresh one
+    :param seed: seed of its generator; None for a random one
     :raises ValueError: for an unbounded Box or another kind of space
     """
 
@@ -142,11 +142,11 @@ class RandomPolicy:
         """
         Draw an action for each row; see SB3's ``predict``.
 
-        :param observation: observations of B rows, read for their number and masks alone
-        :param state: returned as it is
+        :param observation: observations of B rows, of which only number and masks are used
+        :param state: returned unchanged
         :param episode_start: unused
         :param deterministic: unused, a random policy has no most likely action
-        :return: (B, ...) actions, and ``state``
+        :return: actions (B, ...), and ``state``
         """
         if isinstance(observation, dict) and ACTION_MASK_KEY in observation:
             return self._draw_legal(observation[ACTION_MASK_KEY]), state
@@ -154,7 +154,7 @@ class RandomPolicy:
         return self._draw(len(rows)), state
 
     def _draw_legal(self, masks: Array) -> Array:
-        """(B,) actions of Discrete(A) spaces, each uniform over the ones in its row: (B, A)."""
+        """Draw actions (B,) of a Discrete(A) space, each uniform over the ones in its row of masks (B, A)."""
         assert isinstance(self.action_space, spaces.Discrete)
         keys = np.where(masks, self._rng.random(masks.shape), -1.0)
         return keys.argmax(axis=1) + self.action_space.start
@@ -175,7 +175,7 @@ class RandomPolicy:
 
 
 def _action_space_of(env: Any) -> spaces.Space[Any]:
-    """The action space of a vector environment, or of what else has one and the same for all agents."""
+    """Return the action space of a vector environment, or of another environment with one space for all agents."""
     space = getattr(env, "action_space", None)
     if callable(space) and (agents := getattr(env, "possible_agents", None)):  # PettingZoo's
         space = space(agents[0])
@@ -189,9 +189,8 @@ def _action_space_of(env: Any) -> spaces.Space[Any]:
 
 class _GameRows(VecEnvWrapper):
     """
-    Rows of observations and actions as they are; rewards, dones and infos one per game.
-
-    To code that counts episodes by dones, such as SB3's ``evaluate_policy``, a game looks like an environment.
+    Wrapper with unchanged rows of observations and actions, but rewards, dones and infos per game, so that code that
+    counts episodes by dones, such as SB3's ``evaluate_policy``, treats a game as an environment.
 
     :param venv: rows of flattened teams
     :param n_agents: N
@@ -214,15 +213,15 @@ class _GameRows(VecEnvWrapper):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Tell SB3 to take the episodes of a TeamMonitor, which no wrapper above it has changed."""
+        """Return True for SB3's Monitor if there is a TeamMonitor, so that SB3 uses its unmodified episodes."""
         return [self._monitored and wrapper_class is Monitor for _ in self._get_indices(indices)]
 
 
 class _GamePredictor:
     """
-    A model that is told the starts of episodes per game and hands them on per row, as recurrent policies need them.
+    Model wrapper that expands episode starts from games to rows, as recurrent policies need.
 
-    :param model: anything with SB3's ``predict``
+    :param model: any object with SB3's ``predict``
     :param n_agents: N
     """
 
@@ -254,19 +253,19 @@ def evaluate_team(
     """
     Play team episodes.
 
-    The episodes are divided over the games beforehand, as evenly as possible, as SB3 does it: taking the first that
-    finish would favour short ones.
+    Episodes are divided evenly over the games beforehand, as in SB3, since taking the first ones to finish would favour
+    short episodes.
 
-    :param model: anything with SB3's ``predict``, for instance an algorithm, a policy or a ``RandomPolicy``
+    :param model: any object with SB3's ``predict``, for instance an algorithm, a policy or a ``RandomPolicy``
     :param env: vector environment of teams, for instance from ``make_team_env``
     :param n_eval_episodes: team episodes to play
     :param deterministic: whether the model takes its most likely actions
     :param render: whether to render after each step
-    :param callback: called with ``locals(), globals()`` for each game after each step, as SB3 does it; its ``info`` is
-        agent 0's, its ``reward`` the team's
-    :param warn: warn if no TeamMonitor is there, so that returns are taken as the outermost wrapper gives them
+    :param callback: called with ``locals(), globals()`` for each game after each step, as in SB3; ``info`` is agent
+        0's, ``reward`` the team's
+    :param warn: warn if there is no TeamMonitor, so that returns are those of the outermost wrapper
     :return: team returns and lengths in game steps, in the order in which the episodes ended
-    :raises ValueError: if ``env`` is not made of teams
+    :raises ValueError: if ``env`` has no teams
     """
     check_count("n_eval_episodes", n_eval_episodes)
     n_agents = _team_size(env)
@@ -349,9 +348,7 @@ def evaluate_policy(
     warn: bool = True,
 ) -> tuple[float, float] | tuple[list[float], list[int]]:
     """
-    SB3's ``evaluate_policy`` for teams: it counts team episodes and team returns.
-
-    SB3's own, given flattened teams, takes every agent for an episode.
+    Evaluate a policy as SB3's ``evaluate_policy``, but by team episodes and team returns.
 
     :param model: see :func:`evaluate_team`
     :param env: see :func:`evaluate_team`
@@ -359,11 +356,11 @@ def evaluate_policy(
     :param deterministic: see :func:`evaluate_team`
     :param render: see :func:`evaluate_team`
     :param callback: see :func:`evaluate_team`
-    :param reward_threshold: least mean team return
+    :param reward_threshold: lower limit of the mean team return
     :param return_episode_rewards: return the lists instead of their mean and standard deviation
     :param warn: see :func:`evaluate_team`
     :return: mean and standard deviation of the team return, or the list of team returns and that of lengths
-    :raises ValueError: if ``env`` is not made of teams or the mean is not above ``reward_threshold``
+    :raises ValueError: if ``env`` has no teams or the mean is not above ``reward_threshold``
     """
     result = evaluate_team(model, env, n_eval_episodes, deterministic, render, callback, warn)
     if reward_threshold is not None and result.mean <= reward_threshold:

@@ -2,8 +2,8 @@
 The paper's parameter table: ``python -m sb3_saf.parameters`` counts every weight and prints it beside the paper's
 numbers.
 
-The table is for 10 agents, 28 x 28 x 3 observations, 7 actions, one head per agent. Declarations say which algorithms
-are in it, and with which arguments.
+The table is for 10 agents, 28 x 28 x 3 observations, 7 actions, one head per agent. Declarations define which
+algorithms are in it, and with which arguments.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sb3_saf.policies.parts import Declaration
 from sb3_saf.registration import DECLARATIONS
 
 N_AGENTS: Final = 10
-#: Parts that only the released code has and that the paper's figure for SAF includes.
+#: Parts of the released code only, which the paper's number for SAF includes.
 RELEASED_ONLY: Final = {"variational bottleneck": 125_216, "extra attention projection": 16_640}
 
 
@@ -31,7 +31,7 @@ class TableRow(NamedTuple):
 
     :param name: the model
     :param counted: parameters of our model
-    :param paper: the paper's figure, None where it gives none
+    :param paper: the paper's number, None if it has none
     :param made_of: the parts
     """
 
@@ -50,7 +50,7 @@ def paper_policy(declaration: Declaration) -> TeamPolicy:
     """
     Make a policy as in the paper's table.
 
-    :param declaration: of an algorithm that is in it
+    :param declaration: declaration of an algorithm in the table
     """
     assert declaration.paper_table is not None
     rows = TeamSpaces.of(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
@@ -73,7 +73,7 @@ def parameter_table() -> list[TableRow]:
 
 
 def format_table(rows: list[TableRow]) -> str:
-    """Return the table as text, with the account of SAF's difference."""
+    """Return the table as text, with an explanation of SAF's difference."""
     lines = [f"{'model':<8}{'counted':>12}{'paper':>12}{'difference':>12}  made of"]
     for row in rows:
         paper = "" if row.paper is None else f"{row.paper:,}"

@@ -27,18 +27,18 @@ from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.watching import play, write_video
 
 N_EPISODES = 64
-#: The pictures in TensorBoard cost a few seconds each.
+#: Number of pictures in TensorBoard, which take a few seconds each.
 N_INSPECTIONS = 2
 
 
 class Options(NamedTuple):
     """
-    What the command line chooses.
+    Options of the command line.
 
-    :param settings: of the training
-    :param seed: of the run
-    :param output: folder for everything
-    :param progress_bar: whether to draw one
+    :param settings: settings of the training
+    :param seed: seed of the run
+    :param output: folder for all results
+    :param progress_bar: whether to draw a progress bar
     """
 
     settings: Settings
@@ -67,24 +67,24 @@ def parse(arguments: list[str] | None = None) -> Options:
 
 
 def train_team(options: Options) -> BaseAlgorithm:
-    """Train, leaving TensorBoard logs, ``monitor.csv`` and the model in the output folder."""
+    """Train; write TensorBoard logs, ``monitor.csv`` and the model to the output folder."""
     run = RunOptions(
         tensorboard_log=options.output / "tb",
         inspect_freq=max(1, options.settings.game_steps // N_INSPECTIONS),
         progress=options.progress_bar,
-        num_threads=1,  # small networks gain nothing from more, and lose where other programs run
+        num_threads=1,  # more threads do not help small networks, and slow down on a busy machine
     )
     return train(options.settings, options.seed, options.output, run)
 
 
 def evaluate(options: Options, model: Any) -> EvaluationResult:
-    """Team returns over games that were not trained on, the same for every model."""
+    """Return team returns of games not used in training, the same for every model."""
     with closing(options.settings.make_env(options.seed, evaluation=True, n_envs=N_EPISODES)) as games:
         return evaluate_team(model, games, n_eval_episodes=N_EPISODES, deterministic=False)
 
 
 def describe(settings: Settings) -> str:
-    """The game's name and level."""
+    """Return the game's name and level."""
     level = settings.env_kwargs
     return f"{settings.task}, coordination {level['coordination']}, heterogeneity {level['heterogeneity']}"
 
@@ -114,7 +114,7 @@ def draw_curve(options: Options, random: EvaluationResult) -> Path:
 
 
 def record_episode(options: Options, model: BaseAlgorithm) -> Path:
-    """Play one game, each agent seeing its own observation only, and keep it as a GIF."""
+    """Play one game with decentralised execution and write it as a GIF."""
     path = options.output / "episode.gif"
     with closing(options.settings.make_game("rgb_array")) as game:
         team = TrainedTeam(options.settings, model.policy, options.output / "model.zip")
@@ -123,14 +123,14 @@ def record_episode(options: Options, model: BaseAlgorithm) -> Path:
 
 
 def write_replay(options: Options, model: BaseAlgorithm) -> Path:
-    """Write a page on which the first of the evaluation games can be watched, agent by agent."""
+    """Write a replay page of the first evaluation game."""
     seed = evaluation_seed(options.seed)
     with closing(options.settings.make_env(options.seed, evaluation=True, n_envs=1)) as games:
         return replay({"SAF": model}, games, options.output / "replay.html", seed=seed)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, compare with a random team, and say where everything is."""
+    """Train, compare with a random team, and print the paths of the results."""
     options = parse(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     settings = options.settings

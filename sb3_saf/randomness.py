@@ -1,4 +1,4 @@
-"""Randomness of its own: whatever is drawn in here, training draws what it would have drawn."""
+"""Context manager for random numbers that do not affect those of training."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import torch as th
 @contextmanager
 def own_randomness(seed: int, device: th.device) -> Iterator[None]:
     """
-    Seed all global generators for a while, then put them back as they were.
+    Seed all global generators temporarily, then restore their states.
 
-    :param seed: of Python's, NumPy's and torch's generators
-    :param device: the model's; on a GPU its generator counts, too
+    :param seed: seed of Python's, NumPy's and torch's generators
+    :param device: the model's device; on a GPU its generator is included
     """
     of_python, of_numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - SB3 draws from it
     try:

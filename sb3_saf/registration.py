@@ -1,4 +1,4 @@
-"""Find what the files of algorithms declare, and let SB3's algorithms know their policies by name."""
+"""Collection of the algorithms' declarations, and registration of their policies with SB3's algorithms by name."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DECLARATIONS: Final[tuple[Declaration, ...]] = tuple(
     )
 )
 
-#: What each name of the command lines stands for.
+#: Algorithms by their names on command lines.
 COMMANDS: Final[dict[str, AlgorithmSpec]] = {name: spec for one in DECLARATIONS for name, spec in one.commands.items()}
 
 
@@ -46,10 +46,10 @@ def _names(declaration: Declaration) -> Iterator[tuple[type[BaseAlgorithm], str,
 
 def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:
     """
-    Let an algorithm know a policy by name. A name that belongs to another policy stays with it, with a warning.
+    Register a policy with an algorithm by name. A name of another policy is not replaced, with a warning.
 
     :param algorithm: class with ``policy_aliases``
-    :param name: what users type
+    :param name: name for users
     :param policy: the policy class
     """
     known = algorithm.policy_aliases.setdefault(name, policy)
@@ -65,7 +65,7 @@ def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]
 
 
 def register_all() -> None:
-    """Register every policy; done when ``sb3_saf`` is imported, and all that the import changes."""
+    """Register every policy; called when ``sb3_saf`` is imported, the only side effect of the import."""
     for declaration in DECLARATIONS:
         for algorithm, name, policy in _names(declaration):
             register(algorithm, name, policy)

@@ -1,8 +1,8 @@
 """
 Values of a rollout's steps, computed many steps at a time.
 
-Nothing in a rollout asks for values before its end, where advantages are computed. A few rows at a time, as a step of a
-few games has them, a critic takes mostly the time that calling it takes; those of many steps together take a fraction.
+Values are not needed before the end of a rollout, where advantages are computed. For the few rows of a single step, the
+overhead of calling the critic dominates; evaluating many steps together takes a fraction of the time.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ from typing import Any, Generic, TypeVar
 import torch as th
 
 Step = TypeVar("Step")
-#: From what critics read of several steps to the values of each, (B, 1).
+#: Maps the critic's inputs of several steps to the values of each, (B, 1).
 Compute = Callable[[Sequence[Step]], list[th.Tensor]]
 
 
 class LaterValues(th.Tensor, Generic[Step]):
     """
-    The values of one step, (B, 1), which are not computed yet.
+    Lazily computed values of one step, (B, 1).
 
-    Whoever uses it as a tensor has them computed at once, for this step alone; ``TeamRolloutBuffer`` asks for those of
-    many steps together.
+    Any use as a tensor computes them for this step only; ``TeamRolloutBuffer`` computes those of many steps together.
     """
 
     step: Step
@@ -32,10 +31,10 @@ class LaterValues(th.Tensor, Generic[Step]):
     @classmethod
     def of(cls, step: Step, like: th.Tensor, compute: Compute[Step]) -> LaterValues[Step]:
         """
-        Values to be computed.
+        Make values to be computed later.
 
-        :param step: what the critic reads
-        :param like: (B, ...) whose device and number of rows they have
+        :param step: input of the critic
+        :param like: (B, ...) tensor with their device and number of rows
         :param compute: the critic
         """
         later = like.new_empty(len(like), 1).as_subclass(cls)
@@ -54,7 +53,7 @@ def compute_together(steps: Sequence[LaterValues[Any]]) -> list[th.Tensor]:
     """
     Compute the values of several steps of one policy.
 
-    :return: (B, 1) of each
+    :return: values (B, 1) of each step
     """
     waiting = [step for step in steps if step.known is None]
     if waiting:

@@ -1,5 +1,5 @@
 """
-Replay buffer of teams: what all agents of a game observed and did, each joint observation stored once.
+Replay buffer of teams: joint observations, each stored once, and joint actions.
 
 Letters: S slots, E games, N agents, A actions, G sampled team steps. A *team step* is one game step of one game.
 """
@@ -32,7 +32,7 @@ from sb3_saf.envs.teams import (
 
 try:
     import psutil
-except ImportError:  # SB3 does without it, too
+except ImportError:  # optional, as in SB3
     psutil = None
 
 Indices = npt.NDArray[np.int64]
@@ -44,7 +44,7 @@ _IN_NEXT_SLOT: Final = -1
 
 
 def free_memory() -> int | None:
-    """Return the free memory in bytes, or None where it cannot be found out."""
+    """Return the free memory in bytes, or None if unknown."""
     if psutil is not None:
         return int(psutil.virtual_memory().available)
     try:
@@ -60,7 +60,7 @@ class TeamSteps(NamedTuple):
     :param own: (G, N, *shape) own observations of all agents
     :param masks: (G, N, A) bool, legal actions; None if all always are
     :param active: (G, N) bool, agents that take part; None if all always do
-    :param states: (G, *state) states of the games, where observations have them
+    :param states: (G, *state) states of the games, None if observations have none
     """
 
     own: th.Tensor
@@ -71,13 +71,13 @@ class TeamSteps(NamedTuple):
 
 class Sequences(NamedTuple):
     """
-    The order in time of the G steps of a sample: ``n`` sequences of ``length`` steps, one after the other.
+    Order in time of the G steps of a sample: ``n`` sequences of ``length`` steps, one after the other.
 
     :param n: number of sequences
-    :param length: steps of each, those before the loss counts included
+    :param length: steps of each sequence, burn-in included
     :param last_actions: (G, N) the agents' actions one step earlier; -1 where an episode starts
-    :param resets: (G,) bool, steps at which agents remember nothing
-    :param counted: (G,) bool, steps that the loss counts
+    :param resets: (G,) bool, steps before which the memory is reset
+    :param counted: (G,) bool, steps that enter the loss
     """
 
     n: int
@@ -91,11 +91,11 @@ class TeamReplaySamples(NamedTuple):
     """
     Joint transitions.
 
-    :param now: before the step
+    :param now: observations before the step
     :param actions: (G, N) int64
-    :param after: after the step; of an episode's end, its last observations
+    :param after: observations after the step; at the end of an episode, its last observations
     :param rewards: (G,) team rewards, the sums of the agents' rewards
-    :param dones: (G,) 1.0 where the value of what follows is not bootstrapped
+    :param dones: (G,) 1.0 where the next value is not bootstrapped
     :param sequences: None for single steps
     """
 
@@ -112,22 +112,22 @@ class TeamReplayBuffer(ReplayBuffer):
     Replay buffer for the rows of ``CentralizedValueWrapper``.
 
     - **Memory**: per team step, the N own observations in their own dtype (245 bytes for 5 agents of HECOGrid's tiles),
-      N actions, one reward. The observation after a step is that of the next slot; where it is not (a time limit with
-      ``"bootstrap"``, a reset in between), it is kept aside.
+      N actions, one reward. The observation after a step is that of the next slot; if they differ (a time limit with
+      ``"bootstrap"``, a reset in between), it is stored separately.
     - **Team reward**: the sum of the rewards of all agents.
-    - **Time limits**: as ``CentralizedValueWrapper`` reports them. With ``time_limit="terminal"`` they are ends; with
-      ``"bootstrap"`` the value of the last observation counts.
-    - ``"action_mask"``, ``"active"`` and ``"state"`` are stored where observations have them.
+    - **Time limits**: as ``CentralizedValueWrapper`` reports them. With ``time_limit="terminal"`` they are true ends;
+      with ``"bootstrap"`` the value of the last observation is used.
+    - ``"action_mask"``, ``"active"`` and ``"state"`` are stored if observations have them.
 
     Samples are drawn with NumPy's global generator, as in SB3.
 
     :param buffer_size: **game steps** to keep, over all games
     :param observation_space: Dict observation space of ``CentralizedValueWrapper``
     :param action_space: one agent's action space, Discrete
-    :param device: where samples go
+    :param device: device of samples
     :param n_envs: B = E * N rows
-    :param optimize_memory_usage: not read, here because SB3 passes it: observations are always stored once
-    :raises ValueError: if the space is not that of teams or the rows are no whole teams
+    :param optimize_memory_usage: unused, present because SB3 passes it: observations are always stored once
+    :raises ValueError: if the space is not that of teams or the rows are not whole teams
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class TeamReplayBuffer(ReplayBuffer):
         assert isinstance(action_space, spaces.Discrete)
         self.n_agents = self.team_spaces.n_agents
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
-        # Not ReplayBuffer's constructor: it would make arrays for rows.
+        # Not ReplayBuffer's constructor: it would allocate arrays for rows.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs=n_envs)
         self.buffer_size = max(check_count("buffer_size", buffer_size) // self.n_games, 1)
         self.optimize_memory_usage = True
@@ -153,7 +153,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self._check_memory()
 
     def _allocate(self, n_actions: int) -> None:
-        #: One more slot than steps: for the observation after the newest step.
+        #: One more slot than steps, for the observation after the newest step.
         self.n_slots = self.buffer_size + 1
         shape = (self.n_slots, self.n_games)
         team = self.team_spaces
@@ -166,9 +166,9 @@ class TeamReplayBuffer(ReplayBuffer):
             self.seen[STATE_KEY] = np.zeros((*shape, *(team.state.shape or ())), dtype=team.state.dtype)
         self.actions = np.zeros((*shape, self.n_agents), dtype=np.min_scalar_type(n_actions - 1))
         self.rewards = np.zeros(shape, dtype=np.float32)
-        #: Whether the value of what follows is not bootstrapped; whether the episode ends; whether one starts.
+        #: Whether the next value is not bootstrapped; whether the episode ends; whether one starts.
         self.terminal, self.ended, self.starts = (np.zeros(shape, dtype=np.bool_) for _ in range(3))
-        #: Index in ``aside`` of the observation after a step; -1 if it is that of the next slot.
+        #: Index in ``aside`` of the observation after a step; -1 if it is in the next slot.
         self.aside_index = np.full(shape, _IN_NEXT_SLOT, dtype=np.int32)
         self.aside = {key: array[:0, 0].copy() for key, array in self.seen.items()}
         self._free: list[int] = []
@@ -223,12 +223,13 @@ class TeamReplayBuffer(ReplayBuffer):
         Store one step of all games.
 
         :param obs: Dict observation of B rows
-        :param next_obs: after the step; of rows whose episode ended, their last observation. ``team`` is not read
+        :param next_obs: observation after the step; the last observation for rows whose episode ended. ``team`` is not
+            read
         :param action: (B,)
         :param reward: (B,)
         :param done: (B,)
         :param infos: of B rows, read for ``"TimeLimit.truncated"``
-        :param episode_starts: (B,) whether an episode starts with ``obs``; None to tell by the ends of episodes
+        :param episode_starts: (B,) whether an episode starts with ``obs``; None to infer it from the ends of episodes
         :raises ValueError: if the rows are not whole teams in index order
         """
         now, after = self._parts(obs, "obs"), self._parts(next_obs, "next_obs")
@@ -252,7 +253,7 @@ class TeamReplayBuffer(ReplayBuffer):
         return self._n_steps
 
     def _parts(self, obs: Mapping[str, Array], what: str) -> dict[str, Array]:
-        """Check rows and return what is stored of them, by game: (B, ...) -> (E, N, ...) or (E, ...)."""
+        """Check rows and return their stored parts by game: (B, ...) -> (E, N, ...) or (E, ...)."""
         own, agents = np.asarray(obs[OBS_KEY]), np.asarray(obs[AGENT_KEY]).reshape(-1)
         expected, dtype = (self.n_envs, *self.team_spaces.own_shape), self.team_spaces.team.dtype
         if own.shape != expected or not np.can_cast(own.dtype, dtype, "same_kind"):
@@ -275,7 +276,7 @@ class TeamReplayBuffer(ReplayBuffer):
         return parts
 
     def _begin(self, slot: int, now: dict[str, Array], starts: npt.NDArray[Any] | None) -> None:
-        """Write the observation before a step, and put aside what it replaces if the step before needs it."""
+        """Write the observation before a step; move the one it replaces to ``aside`` if the previous step needs it."""
         if self.size() == 0:
             self.starts[slot] = True
         else:
@@ -298,7 +299,7 @@ class TeamReplayBuffer(ReplayBuffer):
             self.aside[key][place] = array[(slot + 1) % self.n_slots, game]
 
     def _grow(self) -> None:
-        """Add places for observations put aside; at most as many as there are steps are ever in use."""
+        """Add places to ``aside``; at most one per step is in use."""
         n_places = len(self.aside[OBS_KEY])
         n_more = max(n_places, self.n_games)
         for key, array in self.aside.items():
@@ -306,7 +307,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self._free = list(range(n_places, n_places + n_more))[::-1]
 
     def _release(self, slot: int) -> None:
-        """Free the places of a step that is overwritten."""
+        """Free the places in ``aside`` of a step that is overwritten."""
         places = self.aside_index[slot]
         self._free += places[places >= 0].tolist()
         self.aside_index[slot] = _IN_NEXT_SLOT
@@ -315,10 +316,10 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """
-        Return all that is stored, for exact resume; slots that were never filled are left out.
+        Return the stored data, for exact resume; slots that were never filled are left out.
 
-        :return: plain data for :meth:`load_checkpoint_state` of a buffer that was made with the same arguments; its
-            arrays are views of the buffer's
+        :return: plain data for :meth:`load_checkpoint_state` of a buffer with the same arguments; arrays are views of
+            the buffer's
         """
         n_filled = self.n_slots if self.full else self.pos + 1
         return {
@@ -332,9 +333,9 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
-        Check that the buffer could be in a state.
+        Check that a state is valid for this buffer.
 
-        :param state: what :meth:`checkpoint_state` gave
+        :param state: result of :meth:`checkpoint_state`
         :raises ValueError: naming the first part that does not fit
         """
         if state.get("n_slots") != self.n_slots:
@@ -369,7 +370,7 @@ class TeamReplayBuffer(ReplayBuffer):
                 )
 
     def _check_values(self, arrays: Mapping[str, Array], prefix: str) -> None:
-        """Check numbers that networks look up in tables."""
+        """Check values that networks use as table indices."""
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         if "actions" in arrays and (arrays["actions"] >= n_actions).any():
             raise ValueError(f"expected actions from 0 to {n_actions - 1}, got {arrays['actions'].max()}")
@@ -383,9 +384,9 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
-        Go on from there.
+        Restore a state.
 
-        :param state: what :meth:`checkpoint_state` gave
+        :param state: result of :meth:`checkpoint_state`
         :raises ValueError: see :meth:`check_checkpoint_state`
         """
         self.check_checkpoint_state(state)
@@ -409,7 +410,7 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> TeamReplaySamples:  # type: ignore[override]
         """
-        Draw single steps, each equally likely, with replacement.
+        Draw single steps uniformly with replacement.
 
         :param batch_size: G, team steps
         :param env: must be None; normalise below ``CentralizedValueWrapper``
@@ -420,13 +421,13 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def sample_sequences(self, n_sequences: int, length: int, burn_in: int) -> TeamReplaySamples:
         """
-        Draw sequences of consecutive steps of a game, for agents that remember.
+        Draw sequences of consecutive steps of a game, for agents with memory.
 
-        The steps that the loss counts are preceded by steps that only warm up the memory, as many as are stored, at
-        most ``burn_in``. Sequences may go over the ends of episodes, where the memory is reset.
+        The steps that enter the loss follow burn-in steps for the memory, at most ``burn_in`` and as many as are
+        stored. Sequences may span several episodes; the memory is reset between them.
 
-        :param n_sequences: sequences
-        :param length: steps of each that the loss counts; fewer while the buffer holds fewer
+        :param n_sequences: number of sequences
+        :param length: steps of each that enter the loss; fewer while the buffer holds fewer
         :param burn_in: steps before them
         """
         self._check_filled()
@@ -434,7 +435,7 @@ class TeamReplayBuffer(ReplayBuffer):
         first, games = self._draw(self.size() - length + 1, n_sequences)
         window = np.arange(-burn_in, length)
         raw = (first[:, np.newaxis] + window).reshape(-1)
-        # Steps before the oldest are replaced by the oldest: the memory is reset at each, so they have no effect.
+        # Steps before the oldest are replaced by it, with a reset of the memory at each, so they have no effect.
         steps, games = np.maximum(raw, 0), np.repeat(games, len(window))
         samples = self._get_samples(steps * self.n_games + games)
         slots = self._slots(steps)
@@ -460,7 +461,7 @@ class TeamReplayBuffer(ReplayBuffer):
             )
 
     def _draw(self, n_steps: int, count: int) -> tuple[Indices, Indices]:
-        """Draw ``count`` steps counted from the oldest, and games, from the generator that SB3 seeds."""
+        """Draw ``count`` steps, counted from the oldest, and games, with the generator that SB3 seeds."""
         steps = np.random.randint(0, n_steps, size=count)  # noqa: NPY002
         return steps, np.random.randint(0, self.n_games, size=count)  # noqa: NPY002
 

@@ -27,22 +27,22 @@ from sb3_saf.envs.teams import (
 )
 from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
 
-#: Arrays with one entry per step and row, beside the observations.
+#: Arrays with one entry per step and row, without the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
 
 
 #: Where the return of an agent ends.
 Ends = Literal["own", "team"]
 
-#: Rows whose values are computed at once: enough to outweigh the calls, few enough for the cache.
+#: Rows whose values are computed at once: enough to amortise the calls, few enough for the cache.
 _ROWS_AT_ONCE: Final = 1024
 
 
 class RolloutReturns:
     """
-    The returns of one rollout, for policies that normalise values.
+    Returns of one rollout, for policies that normalise values.
 
-    :param returns: all returns that are trained on
+    :param returns: all returns used for training
     """
 
     def __init__(self, returns: npt.NDArray[np.floating]) -> None:
@@ -51,9 +51,9 @@ class RolloutReturns:
 
     def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
         """
-        Return how values change with this rollout; the first call takes the returns into the statistics.
+        Return the conversion of values to the new statistics; the first call updates the statistics with the returns.
 
-        :param normalizer: of the policy that is trained
+        :param normalizer: normaliser of the trained policy
         """
         if self._rescaling is None:
             self._rescaling = normalizer.update(self._returns)
@@ -62,10 +62,10 @@ class RolloutReturns:
 
 class WholeTeams(NamedTuple):
     """
-    The teams that the rows of a minibatch belong to.
+    Teams of the rows of a minibatch.
 
     :param observations: (G, N, *shape) own observations, agents in index order
-    :param rows: (B,) where the agent of each row is among the G N agents; None if rows are these agents in order
+    :param rows: (B,) index of each row's agent among the G N agents; None if rows are these agents in order
     :param active: (G, N) bool, agents that take part; None if all do
     """
 
@@ -78,13 +78,13 @@ class TeamMinibatch(dict[str, th.Tensor]):
     """
     Observations of the rows of whole teams.
 
-    It is the dict that SB3's buffer gives, but that ``"team"``, N times as large as the rest, is made when it is asked
-    for: policies that know this class read :attr:`teams`.
+    The dict of SB3's buffer, except that ``"team"``, N times as large as the rest, is only made on access: policies of
+    this package read :attr:`teams`.
 
     :param teams: the teams
     :param entries: all other entries of the rows' observations, ``"obs"`` among them
-    :param returns: of the rollout that the rows are from
-    :param old_values: (B,) of the rows, in memory of their own
+    :param returns: returns of the rows' rollout
+    :param old_values: (B,) old values of the rows, a copy that may be modified
     """
 
     def __init__(
@@ -97,10 +97,10 @@ class TeamMinibatch(dict[str, th.Tensor]):
 
     def update_statistics(self, normalizer: ValueNormalizer) -> None:
         """
-        Take the rollout's returns into the statistics, and state the minibatch's old values under them: they are then
-        what the unchanged critic says, and PPO's ``clip_range_vf`` starts from no difference. Once per minibatch.
+        Update the statistics with the rollout's returns, and convert the minibatch's old values to them, so that they
+        equal the values of the unchanged critic, as PPO's ``clip_range_vf`` expects. Call it once per minibatch.
 
-        :param normalizer: of the policy that is trained
+        :param normalizer: normaliser of the trained policy
         """
         scale, shift = self._returns.rescaling(normalizer)
         if self._old_values is not None:
@@ -118,44 +118,44 @@ class TeamMinibatch(dict[str, th.Tensor]):
         return self[TEAM_KEY]
 
     def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
-        """Return all entries, ``"team"`` among them: SB3's own policies read every one."""
+        """Return all entries including ``"team"``, which SB3's own policies read."""
         self.__missing__(TEAM_KEY)
         return super().items()
 
 
 class TeamRolloutBuffer(DictRolloutBuffer):
     """
-    SB3's rollout buffer for the observations of ``CentralizedValueWrapper``, through ``rollout_buffer_class``.
+    SB3 rollout buffer for the observations of ``CentralizedValueWrapper``, passed as ``rollout_buffer_class``.
 
     - **Memory**: own observations are stored once, ``(T, E, N, *shape)`` in their own dtype. SB3's buffer stores N + 1
       observations per row. A row of HECOGrid with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes
-      of action, reward, value and so on, where SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Arrays are made
-      once and reused by all rollouts.
-    - **Minibatches** hold whole teams, agents in index order (:class:`TeamMinibatch`), so no
-      team is encoded in two minibatches, and critics need not look for it. ``batch_size`` counts rows and is rounded
-      down to whole teams, at least one: SB3's default of 64 is 60 for 5 agents. The last minibatch may be smaller.
-    - **Advantages** are SB3's, computed by its code.
-    - **Value normalisation**: minibatches carry the returns of the rollout to a policy with ``normalize_values=True``;
+      of action, reward, value etc.; SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Arrays are reused by all
+      rollouts.
+    - **Minibatches** hold whole teams, agents in index order (:class:`TeamMinibatch`), so that each team is encoded in
+      one minibatch only, and critics need no search. ``batch_size`` counts rows and is rounded down to whole teams, at
+      least one: SB3's default of 64 is 60 for 5 agents. The last minibatch may be smaller.
+    - **Advantages** are computed by SB3's code.
+    - **Value normalisation**: minibatches hold the returns of the rollout for policies with ``normalize_values=True``;
       advantages and :attr:`values` are those of the rollout.
-    - **Agents that take no part** (``"active"``, where observations have it): minibatches leave their rows out, so that
-      loss, entropy and the normalisation of advantages see active rows only; ``batch_size`` is then an upper bound. An
-      agent's own end is the end of its return unless ``ends="team"``, see :meth:`compute_returns_and_advantage`.
+    - **Inactive agents** (if observations have ``"active"``): minibatches omit their rows, so that loss, entropy and
+      the normalisation of advantages use active rows only; ``batch_size`` is then an upper bound. An agent's return
+      ends with the agent unless ``ends="team"``, see :meth:`compute_returns_and_advantage`.
     - ``"action_mask"`` is stored for each row, ``"state"`` once per game.
-    - Rows that are not whole teams in index order are refused when they are added.
+    - Adding rows that are not whole teams in index order raises a ValueError.
 
     The order of teams comes from NumPy's global generator, as in SB3, so seeded runs repeat.
 
     :param buffer_size: T, steps per rollout
     :param observation_space: Dict observation space of ``CentralizedValueWrapper``
     :param action_space: one agent's action space
-    :param device: where minibatches go
+    :param device: device of minibatches
     :param gae_lambda: trade-off of bias and variance of the advantages, 1 for Monte-Carlo
     :param gamma: discount factor
     :param n_envs: B, rows
-    :param ends: whether an agent's return ends with its own part in the episode, or, ``"team"``, with its team's
-        episode. The latter is for agents that go on to be paid the team's reward after their own end
-        (``make_team_env(..., team_reward="sum")``): a victory then counts for those who died for it
-    :raises ValueError: if the space is not that of teams, the rows are no whole teams, or ``ends`` is another word
+    :param ends: whether an agent's return ends with its ``"own"`` end, or with the episode of its ``"team"``. The
+        latter is for agents that receive the team's reward after their own end (``make_team_env(...,
+        team_reward="sum")``), so that a later success also counts for them
+    :raises ValueError: if the space is not that of teams, the rows are not whole teams, or ``ends`` is invalid
     """
 
     def __init__(
@@ -182,9 +182,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
     def reset(self) -> None:
-        """Forget the rollout; the arrays stay, since touching fresh memory costs as much as the encoder."""
+        """Clear the rollout; the arrays are reused, since touching new memory takes as long as the encoder."""
         if not self._allocated:
-            # SB3 makes one array for each key of obs_shape, and stores those keys alone.
+            # SB3 allocates one array for each key of obs_shape, and stores only those keys.
             by_row = [key for key in (OBS_KEY, ACTION_MASK_KEY) if key in self.obs_shape]
             self.obs_shape = {key: self.obs_shape[key] for key in by_row}
             super().reset()
@@ -195,7 +195,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         BaseBuffer.reset(self)
 
     def _allocate_by_game(self) -> None:
-        """Arrays with one entry per step and game: (T, E, ...)."""
+        """Allocate the arrays with one entry per step and game, (T, E, ...)."""
         self.active: Array | None = None
         self.states: Array | None = None
         shape = (self.buffer_size, self.n_games)
@@ -207,7 +207,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the rollout takes."""
+        """Size of the rollout in bytes."""
         by_game = [array for array in (self.active, self.states) if array is not None]
         arrays = [*self.observations.values(), *by_game, *(getattr(self, name) for name in _ROW_ARRAYS)]
         return sum(array.nbytes for array in arrays)
@@ -228,7 +228,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param action: (B, ...)
         :param reward: (B,)
         :param episode_start: (B,) whether an episode starts with this step
-        :param value: (B,) or (B, 1) predicted values; those that are to be computed later are, at the rollout's end
+        :param value: (B,) or (B, 1) predicted values; :class:`LaterValues` are computed at the end of the rollout
         :param log_prob: (B,)
         :raises ValueError: if the rows are not whole teams in index order
         """
@@ -238,7 +238,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 array[self.pos] = self._of_games(obs, key, array)
         if isinstance(value, LaterValues):
             self._later.append((self.pos, value))
-            value = log_prob  # any numbers: compute_returns_and_advantage overwrites them
+            value = log_prob  # placeholder: compute_returns_and_advantage overwrites it
         super().add(obs, action, reward, episode_start, value, log_prob)
 
     def _compute_later_values(self) -> None:
@@ -250,7 +250,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._later.clear()
 
     def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
-        """What all rows of a game share, once per game: (B, ...) -> (E, ...)."""
+        """Return an entry that all rows of a game share, once per game: (B, ...) -> (E, ...)."""
         expected = (self.n_envs, *stored.shape[2:])
         rows = np.asarray(obs[key])
         if rows.shape != expected or not np.can_cast(rows.dtype, stored.dtype, "same_kind"):
@@ -267,19 +267,19 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: npt.NDArray[Any]) -> None:
         """
-        Advantages A and returns A + V of each agent, by SB3's recursion.
+        Compute advantages A and returns A + V of each agent by SB3's recursion.
 
         With c_t = 1 if the agent takes part at step t, and b_t = 1 if an episode begins there::
 
-            m_t = c_{t+1} (1 - b_{t+1})              (1 if the agent's own episode goes on after step t)
+            m_t = c_{t+1} (1 - b_{t+1})              (1 if the agent's own episode continues after step t)
             A_t = r_t + gamma m_t V_{t+1} - V_t + gamma lambda m_t A_{t+1}
 
-        So nothing that comes after an agent's own end counts for it. After the last step T, b is ``dones`` and
-        V_T ``last_values``: the policies of this package give zero to agents that take no part, which stands for c_T.
-        Advantages of rows that take no part are never read.
+        An agent's return thus ends with its own end. After the last step T, b is ``dones`` and V_T ``last_values``: the
+        policies of this package return zero for inactive agents, which replaces c_T. Advantages of inactive rows are
+        never read.
 
-        With ``ends="team"``, m_t = 1 - b_{t+1}, and V of an agent that takes no part is the mean of V over those of its
-        team that do: the team's reward is the same for all of them.
+        With ``ends="team"``, m_t = 1 - b_{t+1}, and V of an inactive agent is the mean of V over the active agents of
+        its team, since all receive the same reward.
 
         :param last_values: (B,) or (B, 1) values after the last step
         :param dones: (B,) whether an episode ended with the last step
@@ -303,7 +303,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._returns = RolloutReturns(self.returns[~idle])
 
     def _with_values_of_teams(self, values: Array, active: npt.NDArray[np.bool_]) -> Array:
-        """(..., B) values; those of agents that take no part become the mean of their team's others."""
+        """Return values (..., B) in which those of inactive agents are the mean over their team's active agents."""
         by_team, playing = (array.reshape(-1, self.n_agents) for array in (values, active))
         total = np.where(playing, by_team, 0).sum(axis=1, keepdims=True)
         mean = total / playing.sum(axis=1, keepdims=True).clip(min=1)
@@ -318,8 +318,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 f"{agents.reshape(-1)[: 2 * self.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may "
                 "reorder rows"
             )
-        # All rows of a team hold the same N observations. One row per team is compared at each step, another at the
-        # next: a full comparison would read N times as much memory and finds nothing that N steps of this do not.
+        # All rows of a team hold the same N observations. Each step checks one row per team in turn: a full comparison
+        # would read N times as much memory, and N steps of this cover the same rows.
         seen_by = self.pos % self.n_agents
         seen = team.reshape(self.n_games, self.n_agents, *team.shape[1:])[:, seen_by]
         if not np.array_equal(seen, own.reshape(seen.shape)):
@@ -342,12 +342,12 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
         """
-        Go through the rollout once, in an order of teams drawn anew.
+        Yield minibatches of the whole rollout, with teams in random order.
 
-        :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all. Where agents
-            take no part, rows are fewer
+        :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all. With inactive
+            agents, rows are fewer
         :return: minibatches of whole teams: rows of one team are consecutive and in index order
-        :raises ValueError: if the buffer is not full, or nobody ever took part
+        :raises ValueError: if the buffer is not full, or no agent was ever active
         """
         if not self.full:
             raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
@@ -355,13 +355,13 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         if batch_size is not None:
             teams_per_batch = max(1, batch_size // self.n_agents)
         teams = self._playing_teams()
-        # SB3 seeds NumPy's global generator, and no other, from the run's seed.
+        # SB3 seeds only NumPy's global generator from the run's seed.
         order = teams[np.random.permutation(len(teams))]  # noqa: NPY002
         for start in range(0, len(order), teams_per_batch):
             yield self._get_samples(order[start : start + teams_per_batch])
 
     def _playing_teams(self) -> npt.NDArray[np.int64]:
-        """Team steps in which somebody takes part, each ``step * E + game``."""
+        """Return team steps with at least one active agent, each ``step * E + game``."""
         if self.active is None:
             return np.arange(self.buffer_size * self.n_games)
         playing = np.flatnonzero(self.active.any(axis=2))
@@ -376,11 +376,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None
     ) -> DictRolloutBufferSamples:
         """
-        Rows of the given team steps whose agents take part.
+        Return the active rows of the given team steps.
 
         :param batch_inds: (K,) each is ``step * E + game``
         :param env: unused, as in SB3's buffers for rollouts
-        :return: K * N rows, less those of agents that take no part
+        :return: K * N rows without those of inactive agents
         """
         parts = {
             name: self._gather(getattr(self, name), batch_inds).flatten(end_dim=1)
@@ -408,16 +408,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         )
 
     def _of_team_steps(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
-        """(T, E, ...) -> (K, ...)."""
+        """Select team steps: (T, E, ...) -> (K, ...)."""
         return array.reshape(self.buffer_size * self.n_games, *array.shape[2:])[team_steps]
 
     def _gather(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
-        """(T, B, ...) -> (K, N, ...); rows lie game-major, so each team step is one stretch of memory."""
+        """Gather team steps: (T, B, ...) -> (K, N, ...); with game-major rows, each team step is contiguous."""
         by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
         return self.to_torch(by_team[team_steps], copy=False)
 
     def _entries(self, team_steps: npt.NDArray[np.int64]) -> dict[str, th.Tensor]:
-        """Entries of the rows' observations, beside what agents see, in the shapes of SB3's buffer."""
+        """Return the rows' entries other than own observations, in the shapes of SB3's buffer."""
         entries = {AGENT_KEY: th.arange(self.n_agents, device=self.device).repeat(len(team_steps)).unsqueeze(1)}
         if ACTION_MASK_KEY in self.observations:
             entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)

@@ -1,4 +1,4 @@
-"""The callback that writes checkpoints."""
+"""Callback that writes checkpoints."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from sb3_saf.errors import CheckpointError
 
 class Run(NamedTuple):
     """
-    The run that a model is in.
+    Run of a model.
 
-    :param name: in every checkpoint, so that no other run goes on in the folder
-    :param description: of the model and its games as they were made for the first start
+    :param name: stored in every checkpoint, so that no other run continues in the folder
+    :param description: description of the model and its games at the first start
     """
 
     name: str
@@ -48,15 +48,15 @@ _RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary
 
 
 def enter_run(model: BaseAlgorithm, run: Run) -> None:
-    """Say that a model goes on with a run."""
+    """Set the run that a model continues."""
     _RUNS[model] = run
 
 
 def newest_checkpoint(folder: CheckpointFolder) -> Loaded | None:
     """
-    Read the newest good checkpoint of a run.
+    Read the newest valid checkpoint of a run.
 
-    :raises CheckpointError: see :meth:`CheckpointFolder.newest`; also for a file that holds something else
+    :raises CheckpointError: see :meth:`CheckpointFolder.newest`; also for a file with other content
     """
     newest = folder.newest()
     if newest is not None:
@@ -68,24 +68,25 @@ def newest_checkpoint(folder: CheckpointFolder) -> Loaded | None:
 
 class TeamCheckpointCallback(BaseCallback):
     """
-    Write checkpoints from which :func:`sb3_saf.resume` goes on exactly.
+    Write checkpoints from which :func:`sb3_saf.resume` continues exactly.
 
-    The state is taken at the start of a rollout: the update before is done, and the buffer is empty. The end of
-    training writes one, too. Between them the last state is kept in memory, which :meth:`write_last` writes to disk.
+    The state is copied at the start of a rollout, after the previous update and with an empty buffer, and kept in
+    memory, from where :meth:`write_last` writes it to disk. A checkpoint is also written at the end of training.
 
-    A rollout of QPLEX is one step of all games, and its state holds the replay buffer, too large to copy at every step.
-    So its state is written at once where it is taken, and whoever wants to stop a run calls :meth:`stop_soon`.
+    A rollout of QPLEX is one step of all games, and the replay buffer is too large to copy at every step. Its state is
+    therefore written directly to disk; use :meth:`stop_soon` to stop such a run.
 
-    Give it as the first of several callbacks, for what others do at the start of a rollout comes again on resuming.
+    Pass it before other callbacks, because what these do at the start of a rollout is repeated on resuming.
 
-    :param folder: for the checkpoints of this run alone
-    :param every_game_steps: **game steps**, summed over all parallel games, between checkpoints. They are made at the
-        first start of a rollout after that many
-    :param keep: newest checkpoints to keep
-    :param others: all other callbacks of the run, whose state goes along
-    :param exact: None resumes exactly where the environment can give its state, and warns at the start where it cannot:
-        a resumed run then begins new episodes, and its weights are not those of the undisturbed run. True refuses such
-        environments, False never asks for their state
+    :param folder: folder for the checkpoints of this run only
+    :param every_game_steps: **game steps**, summed over all parallel games, between checkpoints, which are written at
+        the next start of a rollout
+
+    :param keep: number of newest checkpoints to keep
+    :param others: all other callbacks of the run, whose state is included
+    :param exact: None resumes exactly if the environment provides its state, and otherwise warns at the start: a
+        resumed run then begins new episodes, and its weights differ from those of an uninterrupted run. True raises
+        CheckpointError for such environments, False never stores their state
     :param verbose: 1 to print the files' names
     :raises ValueError: if a number is not at least 1
     """
@@ -132,7 +133,7 @@ class TeamCheckpointCallback(BaseCallback):
             self.exact = self._can_be_exact()
 
     def _can_be_exact(self) -> bool:
-        """Return whether all environments give their state; warn if not."""
+        """Return whether all environments provide their state; warn if not."""
         try:
             environment_state(self.training_env)
             callback_states(self.others)
@@ -161,7 +162,7 @@ class TeamCheckpointCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        self._between_rollouts = True  # at the end of training the update is done as well
+        self._between_rollouts = True  # at the end of training the last update is done
 
     def _on_training_end(self) -> None:
         if self._between_rollouts:
@@ -171,9 +172,9 @@ class TeamCheckpointCallback(BaseCallback):
 
     def stop_soon(self, stop: Callable[[], NoReturn]) -> None:
         """
-        End training before the next rollout, with the state of that moment at hand for :meth:`write_last`.
+        End training before the next rollout, with its state available to :meth:`write_last`.
 
-        :param stop: raises what shall end it
+        :param stop: raises the exception that ends training
         """
         self._stop = stop
 
@@ -181,7 +182,7 @@ class TeamCheckpointCallback(BaseCallback):
         return team_steps(self.model)
 
     def _take(self) -> None:
-        """Keep the present state; with a replay buffer, on the disk."""
+        """Copy the present state; with a replay buffer, to disk."""
         steps = self._game_steps()
         if not is_off_policy(self.model):
             self._last = (steps, encode(self._state(), software()["sb3_saf"]))
@@ -203,7 +204,7 @@ class TeamCheckpointCallback(BaseCallback):
         }
 
     def write_last(self) -> None:
-        """Write the last state between rollouts, unless it is written already; CheckpointError if that fails."""
+        """Write the last state between rollouts, unless already written; raise CheckpointError if that fails."""
         if self._last is not None and self._last[0] != self._written:
             steps, data = self._last
             self._write(lambda file: file.write(data), steps)

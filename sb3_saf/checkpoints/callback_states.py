@@ -1,4 +1,4 @@
-"""States of callbacks: those of SB3 and of this package by the names of their counters, others by their methods."""
+"""States of callbacks: named counters for those of SB3 and of this package, methods for others."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sb3_saf.checkpoints.environments import (
 )
 from sb3_saf.inspection.callback import InspectionCallback
 
-#: Kinds of counters: a whole number, any number, a list of whole numbers, a list of evaluations.
+#: Kinds of counters: an integer, any number, a list of integers, a list of evaluations.
 _Kind = Literal["whole", "real", "steps", "results"]
 
 #: Counters of callbacks, the only attributes that a checkpoint sets.
@@ -51,14 +51,14 @@ _COUNTERS: Final[dict[Any, dict[str, _Kind]]] = {
     StopTrainingOnNoModelImprovement: {"last_best_mean_reward": "real", "no_improvement_evals": "whole"},
 }
 
-#: A run may go on without them, or with them: progress bars of a terminal, looks into the policy.
+#: Display-only callbacks, which may be added or removed on resuming.
 _ONLY_SHOWING: Final = (ProgressBarCallback, InspectionCallback, GameStepsCallback)
 
 Callbacks = BaseCallback | Iterable[BaseCallback] | None
 
 
 def all_callbacks(callback: Callbacks) -> Iterator[BaseCallback]:
-    """Callbacks in lists, and those that others call, but for those that only show something."""
+    """Yield callbacks, also nested ones, except display-only ones."""
     if callback is None or isinstance(callback, _ONLY_SHOWING):
         return
     if not isinstance(callback, BaseCallback):
@@ -76,7 +76,7 @@ def all_callbacks(callback: Callbacks) -> Iterator[BaseCallback]:
 
 
 def callback_states(callbacks: Iterable[BaseCallback]) -> list[Tree]:
-    """States of callbacks; CheckpointError if an environment for evaluation cannot give its state."""
+    """Return the states of callbacks; CheckpointError if an evaluation environment has no state."""
     return [
         {
             "counters": {name: getattr(one, name) for name in _kinds(one)},
@@ -88,7 +88,7 @@ def callback_states(callbacks: Iterable[BaseCallback]) -> list[Tree]:
 
 
 def check_callback_states(callbacks: Iterable[BaseCallback], states: Tree) -> None:
-    """Check that callbacks could be in these states; a CheckpointError names the first part that does not fit."""
+    """Check that states are valid for callbacks; a CheckpointError names the first mismatch."""
     callbacks = list(callbacks)
     check_list(states, "the states of callbacks", len(callbacks))
     for one, state in zip(callbacks, states, strict=True):
@@ -104,7 +104,7 @@ def check_callback_states(callbacks: Iterable[BaseCallback], states: Tree) -> No
 
 
 def load_callback_states(callbacks: Iterable[BaseCallback], states: list[Tree]) -> None:
-    """Go on from states that passed :func:`check_callback_states`."""
+    """Restore states that passed :func:`check_callback_states`."""
     for one, state in zip(callbacks, states, strict=True):
         for name in _kinds(one):
             setattr(one, name, state["counters"][name])
@@ -115,7 +115,7 @@ def load_callback_states(callbacks: Iterable[BaseCallback], states: list[Tree]) 
 
 
 def _kinds(callback: BaseCallback) -> dict[str, _Kind]:
-    """The callback's counters."""
+    """Return the callback's counters."""
     return {name: k for kind, names in _COUNTERS.items() if isinstance(callback, kind) for name, k in names.items()}
 
 
@@ -134,7 +134,7 @@ def _check_counter(callback: BaseCallback, value: Tree, kind: _Kind, name: str) 
 
 
 def _check_evaluation(callback: BaseCallback, entry: Tree, name: str) -> None:
-    """One evaluation: a number for each of its episodes."""
+    """Check one evaluation: a number for each of its episodes."""
     assert isinstance(callback, EvalCallback)
     check_list(entry, name)
     if name != "evaluations_successes" and len(entry) != callback.n_eval_episodes:

@@ -1,7 +1,7 @@
 """
-Checks of what a checkpoint holds, before it is loaded.
+Checks of the data in a checkpoint before loading.
 
-A checksum tells damage, not intent: values that no run writes could make compiled code read and write anywhere.
+A checksum detects damage, not manipulation: invalid values could make compiled code access memory out of bounds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LARGEST: Final = 2**63
 
 
 def refused(where: str, expected: str, got: object) -> CheckpointError:
-    """The error of a value that does not fit."""
+    """Return the error for an invalid value."""
     return CheckpointError(
         f"the checkpoint does not fit: expected {where} to be {expected}, got {got}; it was changed, or is that of "
         "another model"
@@ -31,7 +31,7 @@ def refused(where: str, expected: str, got: object) -> CheckpointError:
 
 
 def check_keys(value: Tree, keys: Iterable[object], where: str) -> None:
-    """Check that a value is a dict with just these keys."""
+    """Check that a value is a dict with exactly these keys."""
     expected = list(keys)
     if not isinstance(value, dict):
         raise refused(where, "a dict", type(value).__name__)
@@ -41,7 +41,7 @@ def check_keys(value: Tree, keys: Iterable[object], where: str) -> None:
 
 
 def check_whole(value: Tree, where: str, low: int = 0, high: int = _LARGEST) -> None:
-    """Check that a value is a whole number from ``low`` to ``high``."""
+    """Check that a value is an integer from ``low`` to ``high``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
         raise refused(where, f"a whole number from {low} to {high}", repr(value))
 
@@ -61,39 +61,39 @@ def check_text(value: Tree, where: str) -> None:
 
 
 def check_name(value: Tree, where: str) -> None:
-    """Check that a value names a file or folder, and leads to no other place."""
+    """Check that a value is a plain file or folder name without a path."""
     check_text(value, where)
     if value in ("", ".", "..") or os.path.basename(value) != value or "\0" in value or "\\" in value:
         raise refused(where, "a plain name", repr(value))
 
 
 def check_list(value: Tree, where: str, length: int | None = None) -> None:
-    """Check that a value is a list, of some length."""
+    """Check that a value is a list, of the given length if any."""
     if not isinstance(value, list) or length not in (None, len(value)):
         what = "a list" if length is None else f"a list of {length}"
         raise refused(where, what, type(value).__name__ if not isinstance(value, list) else f"one of {len(value)}")
 
 
 def check_array(value: Tree, shape: tuple[int, ...], dtype: npt.DTypeLike, where: str) -> None:
-    """Check that a value is an array of this form."""
+    """Check that a value is an array of this shape and dtype."""
     if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype != np.dtype(dtype):
         raise refused(where, f"an array of shape {shape} and {np.dtype(dtype)}", _form(value))
 
 
 def check_tensor(value: Tree, like: th.Tensor, where: str) -> None:
-    """Check that a value is a tensor of the same form."""
+    """Check that a value is a tensor of the same shape and dtype."""
     if not isinstance(value, th.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         raise refused(where, f"a tensor of shape {tuple(like.shape)} and {like.dtype}", _form(value))
 
 
 def check_range(value: npt.NDArray[Any], low: float, high: float, where: str) -> None:
-    """Check the entries of an array."""
+    """Check that the entries of an array are in a range."""
     if value.size and (value.min() < low or value.max() > high):
         raise refused(where, f"from {low} to {high}", f"{value.min()} to {value.max()}")
 
 
 def check_like(value: Tree, own: Tree, where: str) -> None:
-    """Check that a tree has the form of another: the same keys and lengths, kinds of numbers, and forms of arrays."""
+    """Check that a tree matches another in keys, lengths, kinds of numbers, and shapes and dtypes of arrays."""
     if isinstance(own, th.Tensor):
         check_tensor(value, own, where)
     elif isinstance(own, np.ndarray):
@@ -111,17 +111,17 @@ def check_like(value: Tree, own: Tree, where: str) -> None:
         if type(value) is not type(own):
             raise refused(where, f"of type {type(own).__name__}", _form(value))
     elif isinstance(own, (int, np.integer)):
-        check_whole(value, where, -(2**200), 2**200)  # generators count with many bits
+        check_whole(value, where, -(2**200), 2**200)  # generators have large integers
     else:
         check_real(value, where)
 
 
 def check_observations(value: Tree, space: spaces.Space[Any], n_rows: int, where: str) -> None:
     """
-    Check the observations of rows. Whole numbers have to lie in the space, since networks look them up in tables.
+    Check the observations of rows. Integers must lie in the space, since networks use them as table indices.
 
     :param value: (B, ...) of every key
-    :param space: of one row
+    :param space: observation space of one row
     :param n_rows: B
     :param where: its name in errors
     """

@@ -1,10 +1,10 @@
 """
-A tree of plain data as a file, and back, without pickle.
+Reading and writing of a tree of plain data without pickle.
 
 A file is a line of text with the format and the version that wrote it, a line of JSON with the tree, the arrays of the
 tree as NumPy's .npy records, then the SHA-256 of all of that. The first line and the checksum are the same in all
-formats, so any version can tell damage from another format. Arrays are written and read one by one: a file takes no
-memory beside the arrays themselves.
+formats, so any version can distinguish damage from another format. Arrays are written and read one by one, without
+additional memory.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _HEADER: Final = re.compile(rb"sb3_saf checkpoint, format (\d{1,9}), written by 
 _LONGEST_HEADER: Final = 200
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
 _CHUNK: Final = 1 << 20
-#: Marks what JSON has no form for: {_KIND: "array", "is": 3}.
+#: Key that marks values without a JSON form: {_KIND: "array", "is": 3}.
 _KIND: Final = "$"
 
 
 class _HashedFile:
     """
-    A file that computes the SHA-256 of what is written to it.
+    A file that computes the SHA-256 of the data written to it.
 
     :param file: open for writing
     """
@@ -63,8 +63,8 @@ def write_tree(file: BinaryIO, tree: Tree, version: str) -> None:
 
     :param file: open for writing
     :param tree: see :data:`Tree`
-    :param version: of this package
-    :raises CheckpointError: for anything else in the tree, naming its place
+    :param version: version of this package
+    :raises CheckpointError: for any other value in the tree, naming its place
     """
     arrays: list[Array] = []
     text = json.dumps(_pack(tree, arrays, "state"), separators=(",", ":"))
@@ -81,7 +81,7 @@ def read_tree(file: BinaryIO) -> Tree:
     Read a checkpoint.
 
     :param file: open for reading, at its start
-    :raises DamagedCheckpointError: if a bit was changed or the file was cut short
+    :raises DamagedCheckpointError: if the file was changed or truncated
     :raises UnknownFormatError: if another version wrote it in another format
     """
     size = file.seek(0, os.SEEK_END) - _DIGEST_BYTES
@@ -103,24 +103,24 @@ def read_tree(file: BinaryIO) -> Tree:
         while file.tell() < size:
             arrays[len(arrays)] = _read_array(file)
         return _unpack(packed, arrays)
-    except Exception as error:  # a right checksum over wrong content: not written by this package
+    except Exception as error:  # a valid checksum of invalid content: not written by this package
         raise DamagedCheckpointError(f"its content cannot be read: {error}") from error
 
 
 def encode(tree: Tree, version: str) -> bytes:
-    """A checkpoint in memory, see :func:`write_tree`; the tree is copied."""
+    """Return a checkpoint as bytes, see :func:`write_tree`; the tree is copied."""
     file = io.BytesIO()
     write_tree(file, tree, version)
     return file.getvalue()
 
 
 def decode(data: bytes) -> Tree:
-    """The tree of a checkpoint in memory, see :func:`read_tree`."""
+    """Return the tree of a checkpoint in memory, see :func:`read_tree`."""
     return read_tree(io.BytesIO(data))
 
 
 def _digest(file: BinaryIO, size: int) -> bytes:
-    """SHA-256 of the first ``size`` bytes."""
+    """Return the SHA-256 of the first ``size`` bytes."""
     digest = hashlib.sha256()
     file.seek(0)
     while size > 0 and (chunk := file.read(min(_CHUNK, size))):
@@ -174,7 +174,7 @@ def _unpack(packed: Any, arrays: dict[int, Array]) -> Tree:
         return {_unpack(key, arrays): _unpack(item, arrays) for key, item in content}
     if kind == "tuple":
         return tuple(_unpack(item, arrays) for item in content)
-    array = arrays.pop(content)  # each belongs to one place
+    array = arrays.pop(content)  # each is used once
     if kind == "tensor":
         return th.from_numpy(array)
     return array[()] if kind == "scalar" else array

@@ -19,24 +19,24 @@ from sb3_saf.errors import CheckpointError
 @runtime_checkable
 class Stateful(Protocol):
     """
-    What a VecEnv, a wrapper or a callback has to offer for its state to be in checkpoints.
+    Interface of a VecEnv, a wrapper or a callback whose state is stored in checkpoints.
 
-    States are plain data, for a layer or callback that was made with the same arguments. It may have a method
-    ``check_checkpoint_state(state)``, too, which raises ValueError for a state that it could not be in, naming the
-    first part that does not fit. All parts of a run are checked before the first one is loaded.
+    States are plain data, for a layer or callback with the same arguments. An optional method
+    ``check_checkpoint_state(state)`` raises ValueError for an invalid state, naming the first mismatch. All parts of a
+    run are checked before the first one is loaded.
     """
 
     def checkpoint_state(self) -> Mapping[str, Any]:
-        """All that the future depends on, as plain data."""
+        """Return the complete state as plain data."""
         ...
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state of :meth:`checkpoint_state`."""
         ...
 
 
 def environment_state(venv: VecEnv) -> list[Tree]:
-    """State of every layer, outermost first; a CheckpointError names one that gives none, and what to do."""
+    """Return the state of every layer, outermost first; a CheckpointError names a layer without one, and a fix."""
     return [{"class": type(layer).__name__, "state": _layer_state(layer)} for layer in layers(venv)]
 
 
@@ -58,13 +58,13 @@ def check_environment_state(venv: VecEnv, states: Tree) -> None:
         elif isinstance(layer, VecNormalize):
             _check_normalize_state(layer, state["state"])
         if isinstance(layer, Curriculum):
-            layer = layer.venv_in(state["state"])  # the saved stage, which need not be the present one
+            layer = layer.venv_in(state["state"])  # the saved stage may differ from the present one
         elif isinstance(layer, VecEnvWrapper):
             layer = layer.venv
 
 
 def load_environment_state(venv: VecEnv, states: list[Tree]) -> None:
-    """Go on from states that passed :func:`check_environment_state`."""
+    """Restore states that passed :func:`check_environment_state`."""
     for layer, state in zip(layers(venv), states, strict=True):
         if isinstance(layer, Stateful) and is_stateful(layer):
             layer.load_checkpoint_state(state["state"])
@@ -73,12 +73,12 @@ def load_environment_state(venv: VecEnv, states: list[Tree]) -> None:
 
 
 def is_stateful(part: object) -> bool:
-    """Whether a layer or a callback gives its state; asked of its class, since wrappers hand on attributes."""
+    """Return whether a part implements :class:`Stateful`; checked on its class, since wrappers forward attributes."""
     return issubclass(type(part), Stateful)
 
 
 def check_stateful(part: object, state: Tree, where: str) -> None:
-    """Let a layer or a callback check its own state, if it does; CheckpointError if it refuses."""
+    """Call the part's own check of its state, if any; raise CheckpointError if it fails."""
     check = getattr(type(part), "check_checkpoint_state", None)
     if not isinstance(state, dict):
         raise CheckpointError(f"the checkpoint does not fit {where}: expected a dict, got {type(state).__name__}")

@@ -1,4 +1,4 @@
-"""States of the random generators that a process draws from."""
+"""States of a process's random generators."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gymnasium import spaces
 from sb3_saf.checkpoints.checks import check_keys, check_like, check_list, check_real, check_whole, refused
 from sb3_saf.checkpoints.data import Tree
 
-#: Numbers that a Mersenne Twister draws before it is stirred; its position is at most this.
+#: State words of a Mersenne Twister; its position is at most this.
 _TWISTER_WORDS: Final = 624
 
 
 def generator_states(action_space: spaces.Space[Any]) -> dict[str, Tree]:
-    """States of Python's, NumPy's and torch's global generators and of the action space's own."""
+    """Return the states of Python's, NumPy's and torch's global generators and of the action space's generator."""
     version, words, gauss = random.getstate()
     return {
         "python": [version, np.array(words, dtype=np.uint32), gauss],
@@ -29,7 +29,7 @@ def generator_states(action_space: spaces.Space[Any]) -> dict[str, Tree]:
 
 
 def check_generator_states(states: Tree, action_space: spaces.Space[Any]) -> None:
-    """Check states of generators; a CheckpointError names the first that none could be in."""
+    """Check states of generators; a CheckpointError names the first invalid one."""
     own = generator_states(action_space)
     check_keys(states, own, "generators")
     check_list(states["python"], "the state of Python's generator", 3)
@@ -55,7 +55,7 @@ def check_generator_states(states: Tree, action_space: spaces.Space[Any]) -> Non
 
 
 def _try_torch(state: th.Tensor) -> None:
-    """Let torch itself look at a state: it knows which bytes are one."""
+    """Check a state by loading it into a torch generator."""
     try:
         th.Generator().set_state(state)
     except (RuntimeError, TypeError) as error:
@@ -63,7 +63,7 @@ def _try_torch(state: th.Tensor) -> None:
 
 
 def load_generator_states(states: Tree, action_space: spaces.Space[Any]) -> None:
-    """Let all of them go on from there."""
+    """Restore the states of all generators."""
     version, words, gauss = states["python"]
     random.setstate((version, tuple(words.tolist()), gauss))
     np.random.set_state(states["numpy"])  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""Going on from a checkpoint."""
+"""Resuming from a checkpoint."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from sb3_saf.envs.game_copies import ForeignGamesError, pickled_games, sign_game
 from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.errors import CheckpointError, NonFiniteError
 
-#: Torch's own words for distributions of actions that weights too large have made of NaN.
+#: Torch's error message for action distributions with NaN parameters.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)
 
 
@@ -47,21 +47,22 @@ def resume(
     trust_games: bool = False,
 ) -> Path:
     """
-    Load the newest good checkpoint into a model, its environment and its callbacks.
+    Load the newest valid checkpoint into a model, its environment and its callbacks.
 
-    They are made by the caller as for the first start, so nothing is unpickled. The checkpoint is compared with them,
-    and checked, before anything is touched. Then
-    ``model.learn(total_timesteps - model.num_timesteps, callback, reset_num_timesteps=False)`` goes on, with the
-    ``total_timesteps`` of the first start: schedules depend on it. Do nothing in between that draws random numbers.
+    These are made by the caller as for the first start, so nothing is unpickled. The checkpoint is compared with them,
+    and checked, before they are modified. Afterwards ``model.learn(total_timesteps - model.num_timesteps, callback,
+    reset_num_timesteps=False)`` continues, with the ``total_timesteps`` of the first start, on which schedules depend.
+    Draw no random numbers in between.
 
-    :param folder: of a TeamCheckpointCallback
+    :param folder: folder of a TeamCheckpointCallback
     :param model: made as for the first start, with its environment
-    :param callback: all callbacks, in the order of the first start; a TeamCheckpointCallback among them is left out
-    :param exact: True refuses a checkpoint whose games cannot go on; else they begin new episodes, with a warning
-    :param trust_games: whether to unpickle games that this user has not written: **this runs code from the file**
+    :param callback: all callbacks, in the order of the first start; a TeamCheckpointCallback among them is ignored
+    :param exact: True raises CheckpointError if the checkpoint lacks the games' state; otherwise they begin new
+        episodes, with a warning
+    :param trust_games: whether to unpickle games without this user's signature: **this runs code from the file**
     :return: the file that was loaded
-    :raises CheckpointError: if there is no good checkpoint, or model, environment, callbacks or seeds differ from those
-        of the first start, naming the first difference
+    :raises CheckpointError: if there is no valid checkpoint, or model, environment, callbacks or seeds differ from
+        those of the first start, naming the first difference
     """
     require_resumable(model)
     loaded = newest_checkpoint(CheckpointFolder(folder))
@@ -89,7 +90,7 @@ def resume(
 
 
 def _check(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
-    """Check everything before anything is touched; a CheckpointError names the first difference."""
+    """Check the whole checkpoint before loading any of it; a CheckpointError names the first difference."""
     assert model.env is not None
     check_descriptions(model, others, tree["description"], tree["callback_descriptions"])
     check_software(tree["software"])
@@ -110,12 +111,12 @@ def _load(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> N
         load_callback_states(others, tree["callbacks"])
         load_environment_state(model.env, tree["environment"])
     else:
-        # Other games than the first ones: those were played already.
+        # Not the seeds of the first start, whose games were played already.
         model.env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
         model._last_obs = None
     continue_logs(model, tree["logger"])
     enter_run(model, Run(tree["run"], tree["description"]))
-    load_generator_states(tree["generators"], model.action_space)  # last: nothing of the above shall draw from them
+    load_generator_states(tree["generators"], model.action_space)  # last: the calls above may draw from them
 
 
 def resumable_learn(
@@ -133,30 +134,30 @@ def resumable_learn(
     **learn_arguments: Any,
 ) -> BaseAlgorithm:
     """
-    ``model.learn`` with checkpoints: started again after whatever ended it, the same script goes on where it was.
+    Call ``model.learn`` with checkpoints: after an interruption, the same script continues the run.
 
-    Ctrl-C and SIGTERM write the last state between two rollouts before the process ends. So does NaN or infinity in
-    observations, rewards, losses or gradients, which ends training.
+    On Ctrl-C and SIGTERM the last state between two rollouts is written before the process ends; also on NaN or
+    infinity in observations, rewards, losses or gradients, which ends training.
 
     :param model: made the same way at every start
-    :param total_timesteps: agents' steps of the whole run, as SB3 counts them
-    :param folder: for the checkpoints of this run
+    :param total_timesteps: agent steps of the whole run, as SB3 counts them
+    :param folder: folder for the checkpoints of this run
     :param callback: callbacks, made the same way at every start
     :param every_game_steps: see :class:`TeamCheckpointCallback`
     :param keep: see :class:`TeamCheckpointCallback`
     :param exact: see :class:`TeamCheckpointCallback`
     :param trust_games: see :func:`resume`
-    :param finite: whether to look for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
-    :param again: what a message after Ctrl-C and SIGTERM tells to do
-    :param learn_arguments: of ``model.learn``
+    :param finite: whether to check for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
+    :param again: advice in the message after Ctrl-C and SIGTERM
+    :param learn_arguments: further arguments of ``model.learn``
     :return: the model
-    :raises CheckpointError: see :func:`resume`; also if another run is at work in the folder
-    :raises NonFiniteError: at NaN or infinity, naming the step, what it is in, and the last good checkpoint
+    :raises CheckpointError: see :func:`resume`; also if another run uses the folder
+    :raises NonFiniteError: at NaN or infinity, naming the step, the tensor, and the last valid checkpoint
     """
     others = list(all_callbacks(callback))
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
     checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, others, exact, verbose=model.verbose)
-    # First: what is written has been looked at.
+    # First, so that data are checked before they are written.
     before: list[BaseCallback] = [FiniteCallback(), GameStepsCallback()] if finite else [GameStepsCallback()]
     checkpoints.store.acquire()
     try:
@@ -176,10 +177,10 @@ def resumable_learn(
 @contextmanager
 def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, again: str) -> Iterator[None]:
     """
-    Save when something stops training.
+    Save when training is interrupted.
 
-    :param at_rollout: signals stop it at the start of the next rollout only, where its state can be taken
-    :param again: how to go on
+    :param at_rollout: whether signals stop it only at the start of the next rollout, where its state can be copied
+    :param again: advice on how to continue
     """
     signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
     with _handled(signals, _stopper(checkpoints, at_rollout)):
@@ -194,7 +195,7 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
         except ValueError as error:
             if not isinstance(error, NonFiniteError) and not _OF_TORCH.match(str(error)):
                 raise
-            checkpoints.write_last()  # of before this rollout
+            checkpoints.write_last()  # the state before this rollout
             newest = checkpoints.store.checkpoints()
             last = f"the last good checkpoint is {newest[0]}" if newest else "there is no checkpoint yet"
             what = str(error).partition("\n")[0].rstrip(":")
@@ -202,7 +203,7 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
 
 
 def _stopper(checkpoints: TeamCheckpointCallback, at_rollout: bool) -> Callable[[int, FrameType | None], None]:
-    """Return what a signal does: it stops at once or at the start of the next rollout; the second one at once."""
+    """Return a signal handler that stops training now or at the next rollout; a second signal always stops it now."""
     waits = at_rollout
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -223,7 +224,7 @@ def _stop(number: int) -> NoReturn:
 
 @contextmanager
 def _handled(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
+    if threading.current_thread() is not threading.main_thread():  # only it may set handlers
         yield
         return
     before = {number: signal.signal(number, handler) for number in numbers}

@@ -1,4 +1,4 @@
-"""Logs that go on where they were."""
+"""Continuation of logs on resuming."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sb3_saf.checkpoints.data import Tree
 
 
 def logger_state(logger: Logger) -> Tree:
-    """The name of the logs' folder, and the numbers that were recorded and not written yet."""
+    """Return the name of the log folder, and the recorded values not yet written."""
     numbers = {
         name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))
     }
     has_tensorboard = any(isinstance(output, TensorBoardOutputFormat) for output in logger.output_formats)
     return {
-        # Of a folder below the model's, which may have been moved when the run goes on.
+        # Relative to the model's log folder, which may have been moved on resuming.
         "tensorboard": os.path.basename(logger.get_dir() or "") if has_tensorboard else None,
         "numbers": [
             [name, value, list(logger.name_to_excluded[name] or ()), logger.name_to_count[name]]
@@ -31,7 +31,7 @@ def logger_state(logger: Logger) -> Tree:
 
 
 def check_logger_state(state: Tree) -> None:
-    """Check names and numbers; a CheckpointError names the first that is none."""
+    """Check names and values; a CheckpointError names the first invalid one."""
     check_keys(state, ("tensorboard", "numbers"), "logger")
     if state["tensorboard"] is not None:
         check_name(state["tensorboard"], "the folder of the logs")
@@ -49,7 +49,7 @@ def check_logger_state(state: Tree) -> None:
 
 
 def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
-    """Give the model a logger that goes on in the same folder; one that the caller has set stays."""
+    """Set a logger that continues in the same folder; a logger set by the caller is kept."""
     if not hasattr(model, "logger"):
         model.set_logger(_continued_logger(model, state["tensorboard"]))
     for name, value, excluded, count in state["numbers"]:
@@ -67,7 +67,7 @@ def _continued_logger(model: BaseAlgorithm, name: str | None) -> Logger:
     folder = os.path.join(model.tensorboard_log, name)
     logger = configure(folder, formats)
     board = TensorBoardOutputFormat(folder)
-    # TensorBoard hides what was written after the checkpoint: it comes again.
+    # TensorBoard hides entries written after the checkpoint, which are written again.
     start = SessionLog(status=SessionLog.START)
     file_writer: Any = board.writer.file_writer
     file_writer.add_event(Event(step=(game_steps(model) or 0) + 1, session_log=start))

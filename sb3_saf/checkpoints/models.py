@@ -1,8 +1,6 @@
 """
-State of an algorithm of SB3 between two rollouts.
-
-SB3 has no public way to set most of it: its own ``load`` writes the attributes, from a file that it unpickles, and
-``save`` leaves out parts of them. So they are read and set here, and only here.
+State of an SB3 algorithm between two rollouts. SB3 has no public interface to set most of it: its ``load`` sets the
+attributes from an unpickled file, and ``save`` omits some. Only this module reads and sets them.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ _INFO_BUFFERS: Final = ("ep_info_buffer", "ep_success_buffer")
 
 
 def require_resumable(model: BaseAlgorithm) -> None:
-    """Refuse algorithms whose state cannot be given completely, with a CheckpointError that names those that can."""
+    """Raise CheckpointError for algorithms whose complete state is not accessible, naming the supported ones."""
     if not isinstance(model, (OnPolicyAlgorithm, QPLEX)):
         raise CheckpointError(
             "exact resume is for PPO, A2C, TRPO, RecurrentPPO, MaskablePPO and QPLEX, got "
@@ -52,12 +50,12 @@ def require_resumable(model: BaseAlgorithm) -> None:
 
 
 def is_off_policy(model: BaseAlgorithm) -> bool:
-    """Whether a rollout is one step and the state holds a replay buffer, too large to copy at every rollout."""
+    """Return whether the algorithm is off-policy: its state has a replay buffer, too large to copy at every rollout."""
     return isinstance(model, QPLEX)
 
 
 def model_state(model: BaseAlgorithm) -> dict[str, Tree]:
-    """Weights, optimiser, counters, last observations, memories, averages, replay; at the start of a rollout."""
+    """Return weights, optimiser, counters, last observations, memories, averages and replay at a rollout's start."""
     replay = getattr(model, "replay_buffer", None)
     return {
         "weights": dict(model.policy.state_dict()),
@@ -77,13 +75,13 @@ def _counters(model: BaseAlgorithm) -> dict[str, Tree]:
 
 
 def _lstm_states(model: BaseAlgorithm) -> Tree:
-    """RecurrentPPO's hidden states: pairs for actor and critic."""
+    """Return RecurrentPPO's hidden states: pairs for actor and critic."""
     states = getattr(model, "_last_lstm_states", None)
     return None if states is None else [list(pair) for pair in states]
 
 
 def load_model_state(model: BaseAlgorithm, state: Tree) -> None:
-    """Go on from a state that passed :func:`check_model_state`."""
+    """Restore a state that passed :func:`check_model_state`."""
     model.policy.load_state_dict(state["weights"])
     model.policy.optimizer.load_state_dict(state["optimizer"])
     for name, value in (state["counters"] | state["last"]).items():
@@ -104,7 +102,7 @@ def load_model_state(model: BaseAlgorithm, state: Tree) -> None:
 
 
 def check_model_state(model: BaseAlgorithm, state: Tree) -> None:
-    """Check that the model could be in this state; a CheckpointError names the first part that does not fit."""
+    """Check that a state is valid for the model; a CheckpointError names the first mismatch."""
     names = ("weights", "optimizer", "counters", "last", "lstm", "agent_state", "replay", *_INFO_BUFFERS)
     check_keys(state, (*names, "info_buffer_size"), "model")
     check_like(state["weights"], dict(model.policy.state_dict()), "weights")
@@ -119,7 +117,7 @@ def check_model_state(model: BaseAlgorithm, state: Tree) -> None:
 
 
 def _check_optimizer(optimizer: th.optim.Optimizer, state: Tree) -> None:
-    """Settings are the model's own, but for the learning rate; statistics have the forms of their parameters."""
+    """Check that settings except the learning rate are the model's, and statistics have their parameters' shapes."""
     own = optimizer.state_dict()
     check_keys(state, own, "optimizer")
     check_list(state["param_groups"], "the optimizer's groups", len(own["param_groups"]))
@@ -142,7 +140,7 @@ def _check_optimizer(optimizer: th.optim.Optimizer, state: Tree) -> None:
 
 
 def _statistics(optimizer: th.optim.Optimizer) -> dict[str, bool]:
-    """What an optimizer keeps of each parameter, and whether it is a single number: found out with one of its kind."""
+    """Return the statistics per parameter and whether each is a scalar, from a trial optimizer of the same class."""
     parameter = th.zeros(2, requires_grad=True)
     parameter.grad = th.zeros(2)
     known = signature(type(optimizer)).parameters

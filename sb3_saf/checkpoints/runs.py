@@ -1,7 +1,6 @@
 """
-What makes a run another run: everything that is compared before a checkpoint is used, by name.
-
-Versions and hardware, which only the last bits of a run depend on, may differ.
+Description of a run, compared by name before a checkpoint is used. Versions and hardware, which affect only the last
+bits of a run, may differ.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from sb3_saf.checkpoints.data import Tree
 from sb3_saf.envs.teams import game_seeds_of
 from sb3_saf.errors import CheckpointError
 
-#: Arguments that have to be those of the first start. Schedules are compared by their values.
+#: Arguments that must equal those of the first start. Schedules are compared by their values.
 _ARGUMENTS: Final = (
     *("seed", "n_envs", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "normalize_advantage", "ent_coef"),
     *("vf_coef", "max_grad_norm", "target_kl", "use_sde", "sde_sample_freq"),
@@ -54,9 +53,8 @@ _OF_CALLBACKS: Final[dict[type[BaseCallback], tuple[str, ...]]] = {
 
 def description(model: BaseAlgorithm) -> dict[str, Tree]:
     """
-    How a model and its games were made.
-
-    Schedules are functions; they are described by their values at five points of training.
+    Describe how a model and its games were made. Schedules are functions, described by their values at five points of
+    training.
     """
     env = model.get_env()
     assert env is not None
@@ -78,7 +76,7 @@ def description(model: BaseAlgorithm) -> dict[str, Tree]:
 
 
 def callback_descriptions(callbacks: Iterable[BaseCallback]) -> list[Tree]:
-    """How callbacks and the games of evaluation were made."""
+    """Describe how callbacks and the games of evaluation were made."""
     return [{"class": type(one).__name__, "arguments": _callback_arguments(one)} for one in callbacks]
 
 
@@ -95,12 +93,12 @@ def check_descriptions(
     model: BaseAlgorithm, callbacks: Iterable[BaseCallback], saved: Tree, saved_callbacks: Tree
 ) -> None:
     """
-    Compare a run with the one that a checkpoint is of.
+    Compare a run with the run of a checkpoint.
 
-    :param model: with its environment
-    :param callbacks: of the run
-    :param saved: what :func:`description` gave at the first start
-    :param saved_callbacks: what :func:`callback_descriptions` gave
+    :param model: model with its environment
+    :param callbacks: callbacks of the run
+    :param saved: result of :func:`description` at the first start
+    :param saved_callbacks: result of :func:`callback_descriptions` at the first start
     :raises CheckpointError: naming the first difference
     """
     own = description(model)
@@ -147,7 +145,7 @@ def _class_name(value: object) -> str | None:
 
 
 def _plain(value: object) -> Tree:
-    """Data as JSON gives it back; classes and functions by their names."""
+    """Convert a value to what JSON gives back; classes and functions to their names."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (list, tuple)):
@@ -172,7 +170,7 @@ def software() -> dict[str, str]:
 
 
 def check_software(saved: Tree) -> None:
-    """Check that a checkpoint names versions as :func:`software` does."""
+    """Check that saved versions have the form of :func:`software`."""
     if not isinstance(saved, dict):
         raise refused("the versions of software", "a dict", repr(saved)[:80])
     for name, value in saved.items():
@@ -181,7 +179,7 @@ def check_software(saved: Tree) -> None:
 
 
 def warn_of_differences(saved: dict[str, str]) -> None:
-    """Say what may change the last bits of the weights."""
+    """Warn about differences that may change the last bits of the weights."""
     own = software()
     different = [f"{name} {saved.get(name)} there, {own[name]} here" for name in own if own[name] != saved.get(name)]
     if different:

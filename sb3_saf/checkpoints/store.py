@@ -1,4 +1,4 @@
-"""A folder of checkpoints: written whole or not at all, one run at a time, damaged files recognised."""
+"""Folder of checkpoints with atomic writes, a lock against other runs, and detection of damaged files."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Loaded(NamedTuple):
 
 class CheckpointFolder:
     """
-    Checkpoints of one run, named by the game steps that they were made at.
+    Checkpoints of one run, named by their game steps.
 
-    :param path: the folder, made when it is first written to
-    :param keep: newest checkpoints to keep
+    :param path: the folder, created at the first write
+    :param keep: number of newest checkpoints to keep
     """
 
     def __init__(self, path: str | os.PathLike[str], keep: int = 3) -> None:
@@ -53,11 +53,11 @@ class CheckpointFolder:
         """
         Add a checkpoint, then remove all but the newest ``keep``.
 
-        The content goes to a temporary file that takes its name when it is on the disk: a run that dies here leaves the
-        checkpoints of before and perhaps a temporary file, which the next write removes.
+        The content is written to a temporary file, which is renamed when it is on disk: a run killed here leaves the
+        previous checkpoints and perhaps a temporary file, which the next write removes.
 
         :param content: writes the content to a file
-        :param game_steps: the checkpoint's name
+        :param game_steps: game steps, for the file's name
         :raises CheckpointError: if it cannot be written, for instance because the disk is full
         """
         target = self.path / f"checkpoint-{game_steps:012d}.ckpt"
@@ -73,7 +73,7 @@ class CheckpointFolder:
                 f"cannot write the checkpoint {target}: {error}; {last}. Make room or choose another "
                 "folder, then resume"
             ) from error
-        # Newer ones are damaged, or this run would have begun there.
+        # Newer ones are damaged, otherwise this run would have resumed from them.
         own = [path for path in self.checkpoints() if path.name <= target.name]
         for path in own[self.keep :]:
             path.unlink(missing_ok=True)
@@ -81,7 +81,7 @@ class CheckpointFolder:
 
     def newest(self) -> Loaded | None:
         """
-        Read the newest checkpoint that is undamaged, with a warning for each newer one.
+        Read the newest undamaged checkpoint, with a warning for each newer one.
 
         :return: None if there is no checkpoint
         :raises CheckpointError: if all are damaged, or the newest undamaged one has an unknown format
@@ -107,9 +107,9 @@ class CheckpointFolder:
 
     def acquire(self) -> None:
         """
-        Keep other runs out until :meth:`release` or the end of this process, however it ends.
+        Lock the folder until :meth:`release` or the end of this process.
 
-        :raises CheckpointError: if the folder cannot be made, or another run is at work here, naming its process
+        :raises CheckpointError: if the folder cannot be created, or another run uses it, naming its process
         """
         if self._lock is not None or fcntl is None:
             return
@@ -121,7 +121,7 @@ class CheckpointFolder:
                 f"cannot keep checkpoints in {self.path}: {error}; give the run a folder that it may write to"
             ) from error
         try:
-            # The system gives it back when the process ends: no killed run leaves it behind.
+            # The system releases the lock when the process ends, also if it is killed.
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             owner = os.pread(lock, 20, 0).decode(errors="replace").strip() or "unknown"
@@ -135,7 +135,7 @@ class CheckpointFolder:
         self._lock = lock
 
     def release(self) -> None:
-        """Let other runs in."""
+        """Unlock the folder."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
@@ -156,8 +156,8 @@ def _write_atomically(target: Path, content: Callable[[BinaryIO], object]) -> No
 
 
 def _sync_folder(folder: Path) -> None:
-    """The new name is on the disk only when the folder is."""
-    if fcntl is None:  # Windows does not open folders
+    """Sync the folder, so that a new file name is on disk."""
+    if fcntl is None:  # Windows cannot open folders
         return
     handle = os.open(folder, os.O_RDONLY)
     try:

@@ -1,1 +1,1 @@
-"""QPLEX, QMIX and VDN: value factorisation, off-policy (arXiv 2008.01062, 1803.11485, 1706.05296)."""
+"""QPLEX, QMIX and VDN: off-policy value factorisation (arXiv 2008.01062, 1803.11485, 1706.05296)."""

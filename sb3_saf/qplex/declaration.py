@@ -1,4 +1,4 @@
-"""What QPLEX declares, see ``sb3_saf.policies.parts``."""
+"""Declaration of QPLEX, see ``sb3_saf.policies.parts``."""
 
 from __future__ import annotations
 

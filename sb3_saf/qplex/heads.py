@@ -1,5 +1,5 @@
 """
-Q values of each agent, from its own observations alone, so that agents act without each other.
+Q values of each agent from its own observations only, for decentralised execution.
 
 Letters: K rows, N agents, A actions, U heads of a pool, d features, H size of the memory.
 """
@@ -13,7 +13,7 @@ from torch import nn
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, draw_policy
 from sb3_saf.networks.distributions import policy_parameters
 
-#: Hidden and cell state of agents, each (K, H).
+#: Hidden and cell states of agents, each (K, H).
 Memory = tuple[th.Tensor, th.Tensor]
 
 
@@ -23,13 +23,13 @@ def q_values(
     """
     Compute Q_i of every action.
 
-    Of a pool, the favourite head's (highest q . k_u), or that of a head drawn with its weight: Gumbel noise on the
-    logits, a hard choice, the gradient straight through it. All actions of a row are one head's, so the best action of
-    Q_i is well defined either way.
+    A pool uses its favourite head (highest q . k_u), or a head drawn by its weight (Gumbel noise on the logits, hard
+    choice, straight-through gradient). All actions of a row are evaluated by one head, so the best action is well
+    defined.
 
     :param actor: one head for all agents, one for each, or a pool
-    :param latents: (K, d) what heads read
-    :param agent: (K,) indices of agents, where each has a head of its own
+    :param latents: (K, d) input of the heads
+    :param agent: (K,) indices of agents, needed with one head per agent
     :param masks: (K, A) bool, legal actions; others get -inf. None if all are legal
     :param draw: whether the head is drawn
     :return: (K, A)
@@ -59,20 +59,20 @@ class AgentMemory(nn.Module):
 
     def inputs(self, features: th.Tensor, last_actions: th.Tensor, agent: th.Tensor) -> th.Tensor:
         """
-        Join what the LSTM reads.
+        Concatenate the inputs of the LSTM.
 
         :param features: (K, d)
         :param last_actions: (K,) int64, -1 at the start of an episode
         :param agent: (K,) int64
         :return: (K, d + A + N)
         """
-        # One more class for "none", which is then cut off.
+        # One extra class for "none", which is then cut off.
         last = nn.functional.one_hot(last_actions + 1, self.n_actions + 1)[:, 1:]
         identity = nn.functional.one_hot(agent, self.n_agents)
         return th.cat([features, last.to(features.dtype), identity.to(features.dtype)], dim=1)
 
     def forward(self, inputs: th.Tensor, memory: Memory) -> Memory:
-        """Do one step: (K, d + A + N) inputs."""
+        """Run one step on inputs (K, d + A + N)."""
         result: Memory = self.cell(inputs, memory)
         return result
 
@@ -85,7 +85,7 @@ class AgentMemory(nn.Module):
         """
         Run over whole sequences.
 
-        :param inputs: (n, T, N, d + A + N) of n sequences of T steps
+        :param inputs: (n, T, N, d + A + N) inputs of n sequences of T steps
         :param resets: (n, T) bool, steps before which the memory is reset
         :return: hidden and cell state after every step, each (n * T * N, H)
         """

@@ -3,7 +3,7 @@ The loss of QPLEX: the temporal-difference error of Q_tot, with double Q-learnin
 
     y = r + gamma (1 - done) Q_tot_target(s', a'),   a'_i = the agent's own best legal action under the online networks
 
-Letters: G team steps, N agents, A actions, K distinct views, d features, H what heads read.
+Letters: G team steps, N agents, A actions, K unique own observations, d features, H inputs of the heads.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
 
 class TeamError(NamedTuple):
     """
-    The temporal-difference errors of G' team steps, those that the loss counts.
+    Temporal-difference errors of the G' team steps that enter the loss.
 
     :param td: (G',) Q_tot - y
     :param q_tot: (G',)
-    :param weights: (G', N) lambda_i, or None; zero for agents that take no part
+    :param weights: (G', N) lambda_i, or None; zero for inactive agents
     """
 
     td: th.Tensor
@@ -48,7 +48,7 @@ class Features(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """The distinct views (K, *shape), the ``n_now`` before steps first, and which each agent has, (G, N)."""
+    """Unique own observations (K, *shape), with the ``n_now`` before steps first, and each agent's index, (G, N)."""
 
     views: th.Tensor
     now: th.Tensor
@@ -57,7 +57,7 @@ class _Views(NamedTuple):
 
     @classmethod
     def of(cls, policy: QPLEXPolicy, samples: TeamReplaySamples) -> _Views:
-        """Find the distinct observations of a batch."""
+        """Find the unique observations of a batch."""
         shape = samples.now.own.shape[:2]
         both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
         found: UniqueRows = policy.row_encoder.find(both)
@@ -69,7 +69,7 @@ def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -
     """
     Compute temporal-difference errors; the gradient goes into the online networks.
 
-    :param policy: with its online and target networks
+    :param policy: the policy with its online and target networks
     :param samples: joint transitions
     :param gamma: discount per game step
     """
@@ -96,16 +96,16 @@ def _counted(error: TeamError, sequences: Sequences | None) -> TeamError:
 
 
 def _agents(actions: th.Tensor) -> th.Tensor:
-    """Return (G N,) indices of agents."""
+    """Return the agents' indices, (G N,)."""
     n_steps, n_agents = actions.shape
     return th.arange(n_agents, device=actions.device).repeat(n_steps)
 
 
-# --- encoding, each distinct view once per network --------------------------------------------------------------------
+# --- encoding, each unique observation once per network ---------------------------------------------------------------
 
 
 def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
-    """Encode with the online networks; observations that only occur after a step get no gradient."""
+    """Encode with the online networks; no gradient for observations that only occur after a step."""
     encoder = policy.online.encoder
     known = policy.encode_with(encoder, views.views[: views.n_now])
     with th.no_grad():
@@ -124,12 +124,12 @@ def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> t
         return features, _recall(networks, features, samples)
     seen, rows = views.after.unique(return_inverse=True)
     after = gather(policy.encode_with(networks.encoder, views.views[seen]), rows)
-    features = Features(after, after)  # the target's features before the step are not read
+    features = Features(after, after)  # the target's features before the step are unused
     return features, features
 
 
 def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples) -> Features:
-    """Return what heads read: the features, or the memory's output."""
+    """Return the inputs of the heads: the features, or the memory's output."""
     memory, sequences = networks.memory, samples.sequences
     if memory is None:
         return features
@@ -139,7 +139,7 @@ def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples)
     inputs = memory.inputs(features.now.flatten(0, 1), sequences.last_actions.flatten(), agent)
     in_time = inputs.view(sequences.n, sequences.length, shape[1], -1)
     hidden, cell = memory.unroll(in_time, sequences.resets.view(sequences.n, sequences.length))
-    # One step further from each step: exact also where the next step of the sequence is of another episode.
+    # One step from each step: also exact if the next step of the sequence belongs to another episode.
     with th.no_grad():
         further = memory.inputs(features.after.flatten(0, 1), samples.actions.flatten(), agent)
         after, _ = memory(further, (hidden, cell))
@@ -174,12 +174,12 @@ def _mix(
 
 def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tensor) -> th.Tensor:
     """
-    Compute Q_tot of the greedy joint action: each agent's own best one.
+    Compute Q_tot of the greedy joint action, in which each agent takes its own best action.
 
-    :param policy: with its online networks
+    :param policy: the policy
     :param obs: rows of whole teams, game-major
     :param values: (B, A) Q_i, -inf for illegal actions
-    :return: (B,) the same for all rows of a team
+    :return: (B,), equal for all rows of a team
     """
     n_agents = policy.team_spaces.n_agents
     of_teams = values.view(-1, n_agents, values.shape[1])

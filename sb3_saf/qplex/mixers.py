@@ -1,8 +1,8 @@
 """
-Mixers: from the value of each agent's action to the value of the team's joint action.
+Mixers: functions from the agents' action values to the value of the joint action.
 
-Each is a function of the state of the game, and each keeps the consistency that lets agents act alone: the joint
-action with the highest Q_tot is the one in which every agent takes its own best action. Only training uses them.
+Each depends on the state of the game and satisfies the individual-global-max (IGM) consistency: in the joint action
+with the highest Q_tot every agent takes its own best action. Mixers are used in training only.
 
 Letters: G team steps, N agents, A actions, S size of the state, K attention kernels.
 """
@@ -23,13 +23,13 @@ from sb3_saf.networks.layers import mlp
 MixerName = Literal["vdn", "qmix", "qplex"]
 MIXER_NAMES: Final[tuple[MixerName, ...]] = get_args(MixerName)
 
-#: Added to what must be positive and not only not negative.
+#: Added to non-negative values that must be positive.
 _EPSILON: Final = 1e-10
 
 
 class JointChoice(NamedTuple):
     """
-    Joint actions of a team at G steps, and each agent's values of its own part.
+    Joint actions of teams at G steps, and the agents' own values.
 
     :param chosen: (G, N) Q_i of the agents' actions
     :param best: (G, N) V_i = max of Q_i over legal actions
@@ -43,16 +43,16 @@ class JointChoice(NamedTuple):
     active: th.Tensor | None = None
 
     def only_active(self, values: th.Tensor) -> th.Tensor:
-        """(G, N) values, exactly zero for agents that take no part."""
+        """Return values (G, N), exactly zero for inactive agents."""
         return values if self.active is None else values.masked_fill(~self.active, 0.0)
 
 
 class Mixed(NamedTuple):
     """
-    The team's value.
+    Value of joint actions.
 
     :param q_tot: (G,)
-    :param weights: (G, N) lambda_i, the weight of each agent's advantage; None for mixers that have none
+    :param weights: (G, N) lambda_i, the weight of each agent's advantage; None for mixers without weights
     """
 
     q_tot: th.Tensor
@@ -60,20 +60,20 @@ class Mixed(NamedTuple):
 
 
 class Mixer(nn.Module, ABC):
-    """Base of all mixers. Agents that take no part are not in the sums."""
+    """Base of all mixers. Sums exclude inactive agents."""
 
     @abstractmethod
     def forward(self, state: th.Tensor, choice: JointChoice) -> Mixed:
         """
-        Value of joint actions.
+        Compute the value of joint actions.
 
         :param state: (G, S)
-        :param choice: of G steps
+        :param choice: joint actions of G steps
         """
 
 
 class VDNMixer(Mixer):
-    """VDN: Q_tot = sum_i Q_i, without state and without parameters."""
+    """VDN: Q_tot = sum_i Q_i, without state and parameters."""
 
     def forward(self, state: th.Tensor, choice: JointChoice) -> Mixed:
         """See :class:`Mixer`; the state is not read."""
@@ -82,9 +82,9 @@ class VDNMixer(Mixer):
 
 class QMIXMixer(Mixer):
     """
-    QMIX: Q_tot is a network of the Q_i whose weights come from the state and are not negative.
+    QMIX: Q_tot is a network of the Q_i with non-negative weights computed from the state.
 
-    h = ELU(sum_i |W1_i(s)| Q_i + b1(s)), Q_tot = |w2(s)| . h + b2(s). So Q_tot never falls when a Q_i rises.
+    h = ELU(sum_i |W1_i(s)| Q_i + b1(s)), Q_tot = |w2(s)| . h + b2(s). Q_tot is thus monotonic in every Q_i.
 
     :param state_dim: S
     :param n_agents: N
@@ -111,7 +111,7 @@ class QMIXMixer(Mixer):
 
 class ParallelMLPs(nn.Module):
     """
-    K networks of one shape, computed at once.
+    K networks of one shape, computed in parallel.
 
     :param count: K
     :param sizes: inputs, hidden layers, outputs of each; ReLU in between
@@ -121,7 +121,7 @@ class ParallelMLPs(nn.Module):
         super().__init__()
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for n_in, n_out in pairwise(sizes):
-            bound = n_in**-0.5  # as torch starts its linear layers
+            bound = n_in**-0.5  # torch's initialisation of linear layers
             self.weights.append(nn.Parameter(th.empty(count, n_in, n_out).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(th.empty(count, 1, n_out).uniform_(-bound, bound)))
 
@@ -159,11 +159,11 @@ class AttentionKernels(nn.Module):
     @th.no_grad()
     def _tell_joint_actions_apart(self, n_agents: int, n_inputs: int) -> None:
         """
-        He initialisation of the networks that read the joint action.
+        Apply He initialisation to the networks that read the joint action.
 
-        One-hot actions count as N inputs, those that are not zero. Counted together with a wide state they would hardly
-        reach the hidden layers, and lambda would start as a sum over agents of what each does. Where an advantage is
-        close to zero its lambda gets no gradient, so it would stay what that sum makes of the others (docs/qplex.md).
+        One-hot actions count as N inputs, the number of non-zero ones. Together with a wide state they would hardly
+        affect the hidden layers, and the initial lambda would be nearly additive over agents. Where an advantage is
+        close to zero, lambda gets no gradient, so it would keep the value extrapolated from that sum (docs/qplex.md).
         """
         first, *others = self.action.weights
         _he_uniform(first[:, -n_inputs:], n_agents)
@@ -171,7 +171,7 @@ class AttentionKernels(nn.Module):
             _he_uniform(weight, weight.shape[1])
 
     def forward(self, state: th.Tensor, state_and_actions: th.Tensor) -> th.Tensor:
-        """(G, N): (G, S) and (G, S + N A)."""
+        """Compute lambda (G, N) from states (G, S) and states with joint actions (G, S + N A)."""
         key = self.key(state).abs() + _EPSILON
         weights: th.Tensor = key * self.agents(state).sigmoid() * self.action(state_and_actions).sigmoid()
         return weights.sum(dim=0)
@@ -179,14 +179,14 @@ class AttentionKernels(nn.Module):
 
 class QPLEXMixer(Mixer):
     """
-    QPLEX: a duplex dueling mixer. Any function of the joint action that keeps the consistency can be written so.
+    QPLEX: a duplex dueling mixer, which can represent every function with IGM consistency.
 
     With w_i(s) > 0, Q'_i = w_i Q_i + b_i, V'_i = w_i V_i + b_i and A'_i = Q'_i - V'_i (never above zero)::
 
         Q_tot = sum_i V'_i + sum_i lambda_i(s, a) A'_i,   lambda_i > 0
 
-    computed as published: Q_tot = sum_i Q'_i + sum_i stopgrad(A'_i) (lambda_i - 1). The value is the same; in the
-    gradient, advantages train the weights lambda and not the agents.
+    computed as published: Q_tot = sum_i Q'_i + sum_i stopgrad(A'_i) (lambda_i - 1). The value is the same; advantages
+    train the weights lambda only, not the agents.
 
     :param state_dim: S
     :param n_agents: N
@@ -221,7 +221,7 @@ class QPLEXMixer(Mixer):
         return Mixed((chosen + advantages * (weights - 1.0)).sum(dim=1), weights)
 
     def advantage_weights(self, state: th.Tensor, choice: JointChoice) -> th.Tensor:
-        """Compute (G, N) lambda at states (G, S); of the choice, ``actions`` and ``active`` are read."""
+        """Compute lambda (G, N) at states (G, S); reads ``actions`` and ``active`` of ``choice``."""
         actions = nn.functional.one_hot(choice.actions, self.n_actions).to(state.dtype)
         if choice.active is not None:
             actions = actions * choice.active.unsqueeze(2)

@@ -19,7 +19,7 @@ from sb3_saf.qplex.mixers import MIXER_NAMES, Mixer, MixerName, QMIXMixer, QPLEX
 @dataclass(frozen=True)
 class QPLEXParts:
     """
-    The settings of a value-factorising algorithm.
+    Settings of a value-factorisation algorithm.
 
     :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``
     :param heads: ``"shared"`` for one Q head that all agents use, ``"per_agent"`` for one each; a pool is always shared
@@ -31,9 +31,9 @@ class QPLEXParts:
     :param kernel_arch: hidden sizes of each kernel's networks
     :param detach_state: whether the mixer's gradient stops before the agents' encoder
     :param lstm_hidden_size: size of each agent's memory; 0 for none
-    :param sequence_length: with memory, game steps of a training sequence that the loss counts
-    :param burn_in: with memory, game steps before them that only warm up the memory; as many as an episode has mean
-        from its start
+    :param sequence_length: with memory, game steps of a training sequence that enter the loss
+    :param burn_in: with memory, game steps before them that only warm up the memory; the length of an episode to always
+        start at its beginning
     """
 
     mixer: MixerName = "qplex"
@@ -58,7 +58,7 @@ class QPLEXParts:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:
                 raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
-        # Saved models may bring lists.
+        # Saved models may have lists.
         for name in ("projection_arch", "kernel_arch"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
@@ -102,7 +102,7 @@ class QPLEXParts:
 
 @dataclass(frozen=True)
 class QPLEXPoolParts(QPLEXParts):
-    """QPLEX with a pool of as many heads as SAF has policies."""
+    """QPLEX with as many heads in its pool as SAF has policies."""
 
     n_policies: int = 4
 

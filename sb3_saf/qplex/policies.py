@@ -1,4 +1,4 @@
-"""Policies of QPLEX: the agents' Q networks, the mixer that reads the whole team, and their target copies."""
+"""Policies of QPLEX: the agents' Q networks, the mixer, and their target networks."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class QNetworks(NamedTuple):
     """
     All networks of Q_tot.
 
-    :param encoder: own observations to features
+    :param encoder: encoder of own observations
     :param memory: LSTM of each agent, or None
     :param actor: Q heads
-    :param mixer: Q_i of all agents to Q_tot
-    :param state_encoder: states of games to what the mixer reads; None where it reads the agents' features
+    :param mixer: mixer from Q_i of all agents to Q_tot
+    :param state_encoder: encoder of the games' states for the mixer; None if it reads the agents' features
     """
 
     encoder: nn.Module
@@ -49,11 +49,11 @@ class QNetworks(NamedTuple):
 
 class Evaluated(NamedTuple):
     """
-    One step of the agents' networks.
+    Result of one step of the agents' networks.
 
     :param values: (B, A) Q_i of every action, -inf for illegal ones
-    :param latents: (B, H) what the heads read
-    :param state: what a policy with memory remembers if each agent takes its best action; None without memory
+    :param latents: (B, H) inputs of the heads
+    :param state: next recurrent state if each agent takes its best action; None without memory
     """
 
     values: th.Tensor
@@ -65,29 +65,29 @@ class QPLEXPolicy(TeamRowsPolicy):
     """
     Policy of QPLEX, QMIX and VDN.
 
-    Acting reads each agent's own observation alone (``obs``; ``agent`` with one head per agent or with memory;
-    ``action_mask`` where observations have it). The mixer reads features of all agents, or the state of the game where
-    observations have one; only training uses it.
+    Acting reads each agent's own observation only (``obs``; ``agent`` with one head per agent or with memory;
+    ``action_mask`` if observations have it). The mixer reads features of all agents, or the state of the game if
+    observations have one; it is used in training only.
 
-    Beside these arguments, it takes the fields of :class:`QPLEXParts` by keyword, ``mixer`` among them.
+    It also takes the fields of :class:`QPLEXParts` by keyword, including ``mixer``.
 
     :param observation_space: Dict observation space of ``CentralizedValueWrapper``
     :param action_space: Discrete, counting from 0
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of the Q heads
     :param activation_fn: activation of hidden layers
-    :param ortho_init: whether encoder and heads start orthogonal, as those of SAF
-    :param encode_once: False encodes every row, which gives the same numbers slowly
-    :param chunk_size: views encoded at once on the CPU; None for all
-    :param features_extractor_class: encoder, built on the space of ``obs``
+    :param ortho_init: whether encoder and heads have orthogonal initialisation, as in SAF
+    :param encode_once: False encodes every row, with the same result but slower
+    :param chunk_size: observations encoded at once on the CPU; None for all
+    :param features_extractor_class: encoder, built for the space of ``obs``
     :param features_extractor_kwargs: its further arguments
     :param normalize_images: whether pictures are divided by 255
     :param optimizer_class: optimizer; RMSprop as published
-    :param optimizer_kwargs: its arguments, but for the learning rate; None for the published ones of RMSprop
+    :param optimizer_kwargs: its arguments without the learning rate; None for the published ones of RMSprop
     :param kwargs: fields of :class:`QPLEXParts`
     """
 
-    #: What differs between the policies: their parts' defaults.
+    #: Parts with the defaults of the policy.
     parts_class: ClassVar[type[QPLEXParts]] = QPLEXParts
 
     action_space: spaces.Discrete
@@ -141,7 +141,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         if self.ortho_init:
             self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
             orthogonal_init(self.actor)
-        # The mixer comes last: policies of one seed that differ in it start with the same agents.
+        # The mixer is made last: with one seed, policies with different mixers have the same initial agents.
         state = self.team_spaces.state
         self.state_encoder = None if state is None else ObservationEncoder(state, self.features_dim)
         state_dim = self.features_dim * (n_agents if state is None else 1)
@@ -156,18 +156,18 @@ class QPLEXPolicy(TeamRowsPolicy):
 
     @property
     def online(self) -> QNetworks:
-        """The networks that learn and act."""
+        """The networks that are trained and act."""
         return QNetworks(self.features_extractor, self.memory, self.actor, self.mixer, self.state_encoder)
 
     @property
     def target(self) -> QNetworks:
-        """Their slower copies."""
+        """The target networks."""
         copies = iter(self.target_networks)
         parts = [None if module is None else next(copies) for module in self.online]
         return QNetworks(*parts)  # type: ignore[arg-type]
 
     def parameter_pairs(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-        """Parameters of the online networks, and of the target networks in the same order."""
+        """Return the parameters of the online networks, and of the target networks in the same order."""
         online = [parameter for module in self.online if module is not None for parameter in module.parameters()]
         return online, list(self.target_networks.parameters())
 
@@ -181,11 +181,11 @@ class QPLEXPolicy(TeamRowsPolicy):
     # --- encoding ---------------------------------------------------------------------------------------------------
 
     def encode_with(self, encoder: nn.Module, observations: th.Tensor) -> th.Tensor:
-        """(K, d) features of own observations (K, *shape), of the online or the target encoder."""
+        """Return features (K, d) of own observations (K, *shape), by the online or the target encoder."""
         return self._in_chunks(encoder, observations, self.team_spaces.own)
 
     def encode_states(self, encoder: nn.Module, states: th.Tensor) -> th.Tensor:
-        """(G, d) features of states (G, *state), each distinct one encoded once."""
+        """Return features (G, d) of states (G, *state), with each unique state encoded once."""
         assert self.team_spaces.state is not None
         found = self.row_encoder.find(states)
         return gather(self._in_chunks(encoder, states[found.index], self.team_spaces.state), found.inverse)
@@ -194,9 +194,9 @@ class QPLEXPolicy(TeamRowsPolicy):
 
     def own_q_values(self, obs: PyTorchObs) -> th.Tensor:
         """
-        Q_i of every action from own observations, without memory; -inf for illegal actions.
+        Compute Q_i of every action from own observations, without memory; -inf for illegal actions.
 
-        :param obs: rows, or own observations alone
+        :param obs: rows, or only own observations
         :return: (B, A)
         """
         own = self.encode_own(obs)
@@ -206,11 +206,11 @@ class QPLEXPolicy(TeamRowsPolicy):
         return values if masks is None else values.masked_fill(~masks, -th.inf)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = True) -> th.Tensor:
-        """(B,) greedy actions."""
+        """Return greedy actions, (B,)."""
         return self._predict(obs, deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
-        """(B,) greedy actions; exploration is the algorithm's."""
+        """Return greedy actions, (B,); exploration is done by the algorithm."""
         return self.own_q_values(observation).argmax(dim=1)
 
     def predict(
@@ -223,12 +223,11 @@ class QPLEXPolicy(TeamRowsPolicy):
         """
         Act greedily, as SB3's ``predict``.
 
-        :param observation: rows, or own observations alone (with ``"agent"`` beside them where the policy remembers or
-            every agent has a head of its own); one or a batch
-        :param state: what a policy with memory gave after the last step: hidden state, cell state, last action. None at
-            the start
-        :param episode_start: (B,) where an episode starts, which forgets the state
-        :param deterministic: not read
+        :param observation: rows, or only own observations (with ``"agent"`` for memory or one head per agent); one or a
+            batch
+        :param state: recurrent state after the last step: hidden state, cell state, last action. None at the start
+        :param episode_start: (B,) where an episode starts, which resets the state
+        :param deterministic: unused
         :return: actions (B,) and the next state
         """
         if self.memory is None:
@@ -244,9 +243,9 @@ class QPLEXPolicy(TeamRowsPolicy):
         self, obs: PyTorchObs, state: State | None = None, episode_start: np.ndarray | None = None
     ) -> Evaluated:
         """
-        Compute what the greedy actions of one step depend on; arguments as of :meth:`predict`, but tensors.
+        Evaluate the agents' networks for one step; arguments as in :meth:`predict`, but tensors.
 
-        :param obs: rows, or own observations alone
+        :param obs: rows, or only own observations
         """
         memory, own = self.memory, self.encode_own(obs)
         features = own.of_rows()
@@ -269,7 +268,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         return Evaluated(values, hidden, tuple(following))
 
     def team_steps(self, obs: dict[str, th.Tensor]) -> TeamSteps:
-        """Return what the mixer may read of rows of whole teams, game-major."""
+        """Return the mixer's inputs from rows of whole teams, game-major."""
         n_agents, active = self.team_spaces.n_agents, self._active(obs)
         own = self._own(obs).unflatten(0, (-1, n_agents))
         states = None if self.state_encoder is None else obs[STATE_KEY][::n_agents]
@@ -286,12 +285,11 @@ def _optimizer_kwargs(
 
 class QPLEXPoolPolicy(QPLEXPolicy):
     """
-    QPLEX with a pool: each agent's Q head is chosen from a shared pool by signature keys, as SAF's policies are.
+    QPLEX with a pool: each agent's Q head is selected from a shared pool by signature keys, as in SAF.
 
     Training draws the head (Gumbel noise, hard choice, straight-through gradient): heads learn in proportion to their
-    weights, none is starved, and Q_i, V_i and A_i of a row are always one head's, so the consistency of the mixer holds
-    for every draw. Acting and the targets of the loss take the favourite head: what is bootstrapped is the value of
-    what is executed. A mean of all heads would be consistent, too, but it is one larger head and not a choice.
+    weights, and Q_i, V_i and A_i of a row come from one head, so the mixer is consistent for every draw. Acting and the
+    targets of the loss use the favourite head, so that the bootstrapped value is that of the executed action.
     """
 
     parts_class: ClassVar[type[QPLEXParts]] = QPLEXPoolParts
@@ -299,9 +297,9 @@ class QPLEXPoolPolicy(QPLEXPolicy):
 
 class QPLEXLstmPolicy(QPLEXPolicy):
     """
-    QPLEX whose agents remember: an LSTM over features, last action and the agent's index.
+    QPLEX with memory: an LSTM over features, last action and the agent's index.
 
-    ``predict`` takes and gives the state, as SB3's recurrent policies do; it needs ``"agent"`` beside ``"obs"``.
+    ``predict`` takes and returns the state, as in SB3's recurrent policies; it needs ``"agent"`` besides ``"obs"``.
     """
 
     parts_class: ClassVar[type[QPLEXParts]] = QPLEXLstmParts

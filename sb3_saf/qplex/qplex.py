@@ -51,44 +51,43 @@ _STORED_KEYS: Final[tuple[str, ...]] = (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACT
 
 class QPLEX(OffPolicyAlgorithm):
     """
-    QPLEX, QMIX and VDN: each agent has values of its own actions, a mixer makes the team's value of them, and that
-    value learns from the sum of all agents' rewards.
+    QPLEX, QMIX and VDN: a mixer combines the agents' action values to the team's value, which is trained on the sum of
+    all agents' rewards.
 
-    It trains on the same environments as PPO with SAFPolicy (``make_team_env``), whose actions must be Discrete.
+    It trains on the same environments as PPO with SAFPolicy (``make_team_env``); actions must be Discrete.
 
     **Units**: ``buffer_size``, ``learning_starts``, ``batch_size``, ``train_freq`` and ``target_update_interval`` count
-    *game steps*, summed over all parallel games, however many games there are. ``total_timesteps`` counts rows (game
-    steps times N), as everywhere in SB3.
+    *game steps*, summed over all parallel games. ``total_timesteps`` counts rows (game steps times N), as in SB3.
 
-    **Exploration**: epsilon-greedy over legal actions, drawn for each agent independently;
-    ``predict(deterministic=False)`` explores, too.
+    **Exploration**: epsilon-greedy over legal actions, independently for each agent; ``predict(deterministic=False)``
+    also explores.
 
     :param policy: ``"QPLEXPolicy"``, ``"QPLEXPoolPolicy"`` (Q heads from a pool) or ``"QPLEXLstmPolicy"`` (memory)
     :param env: vector environment of teams
-    :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``; None leaves it to ``policy_kwargs`` (and there to QPLEX)
+    :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``; None uses ``policy_kwargs`` (QPLEX by default)
     :param learning_rate: learning rate, or a schedule of it
-    :param buffer_size: game steps that the replay buffer keeps
+    :param buffer_size: capacity of the replay buffer in game steps
     :param learning_starts: game steps before learning begins; until then actions are random
-    :param batch_size: game steps per update (with memory: those that the loss counts, in sequences)
-    :param tau: share of the online networks in an update of the target networks; 1 copies them
+    :param batch_size: game steps per update (with memory: those that enter the loss, in sequences)
+    :param tau: soft update coefficient of the target networks; 1 copies the online networks
     :param gamma: discount per game step
     :param train_freq: game steps between updates
     :param gradient_steps: gradient steps per update; -1 for as many as game steps in between
     :param replay_buffer_class: TeamReplayBuffer or a subclass of it
     :param replay_buffer_kwargs: its further arguments
     :param target_update_interval: game steps between updates of the target networks
-    :param exploration_fraction: part of training over which the probability of random actions falls
+    :param exploration_fraction: fraction of training over which the probability of random actions decreases
     :param exploration_initial_eps: probability at the start
-    :param exploration_final_eps: probability at its end
-    :param max_grad_norm: largest norm of the gradient
-    :param stats_window_size: team episodes over which ``rollout/ep_rew_mean`` is taken
+    :param exploration_final_eps: probability after that fraction
+    :param max_grad_norm: maximum norm of the gradient
+    :param stats_window_size: number of team episodes in ``rollout/ep_rew_mean``
     :param tensorboard_log: folder for TensorBoard; None for none
     :param policy_kwargs: arguments of the policy, see :class:`QPLEXPolicy` and :class:`QPLEXParts`
     :param verbose: 0 for silence, 1 for information, 2 for debugging
-    :param seed: of weights, exploration, sampling and games
-    :param device: where networks are
+    :param seed: seed of weights, exploration, sampling and games
+    :param device: device of the networks
     :param _init_setup_model: whether to build the networks now
-    :raises ValueError: for environments without teams, actions that are not Discrete, and numbers that do not fit
+    :raises ValueError: for environments without teams, actions that are not Discrete, and invalid numbers
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -212,7 +211,7 @@ class QPLEX(OffPolicyAlgorithm):
             )
 
     def _convert_train_freq(self) -> None:
-        """Play one step of all games at a time; :meth:`train` decides when updates are due."""
+        """Set rollouts to one step of all games; :meth:`train` decides when updates are due."""
         if not isinstance(self.train_freq, TrainFreq):
             self.update_interval = int(self.train_freq)  # type: ignore[arg-type]
         self.train_freq = TrainFreq(1, TrainFrequencyUnit.STEP)  # type: ignore[assignment]
@@ -223,11 +222,11 @@ class QPLEX(OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        Load a replay buffer from a pickle file. Unpickling runs code from the file: load only what you trust.
+        Load a replay buffer from a pickle file. Unpickling runs code from the file: load trusted files only.
 
-        :param path: of the file
-        :param truncate_last_traj: not read, see SB3
-        :raises ValueError: if it is of other teams
+        :param path: path of the file
+        :param truncate_last_traj: unused, see SB3
+        :raises ValueError: if the buffer belongs to other teams
         """
         warnings.warn(f"{path} is unpickled, which runs code from it; load what you trust", UserWarning, stacklevel=2)
         before = self.replay_buffer
@@ -245,12 +244,12 @@ class QPLEX(OffPolicyAlgorithm):
         return self.num_timesteps // self.n_agents
 
     def _crossed(self, interval: int) -> int:
-        """Count the multiples of ``interval`` game steps that the last step of all games has reached."""
+        """Count the multiples of ``interval`` game steps reached by the last step of all games."""
         steps = self._game_steps()
         return steps // interval - (steps - self.n_games) // interval
 
     def dump_logs(self) -> None:
-        """Write log data, game steps among them."""
+        """Write log data including game steps."""
         self.logger.record(GAME_STEPS_TAG, self._game_steps())
         super().dump_logs()
 
@@ -266,8 +265,8 @@ class QPLEX(OffPolicyAlgorithm):
         """
         Act from own observations.
 
-        :param observation: rows, or own observations alone; see :meth:`QPLEXPolicy.predict`
-        :param state: of policies with memory
+        :param observation: rows, or only own observations; see :meth:`QPLEXPolicy.predict`
+        :param state: state of policies with memory
         :param episode_start: (B,) where an episode starts
         :param deterministic: False explores with the current exploration rate, each agent independently
         :return: actions and the next state
@@ -282,8 +281,8 @@ class QPLEX(OffPolicyAlgorithm):
         return explored.reshape(actions.shape), state
 
     def _explore(self, actions: Array, rate: float, masks: Array | None) -> Array:
-        """Replace each of (B,) actions with the given probability by any legal action."""
-        # SB3 seeds NumPy's global generator, and no other, from the run's seed.
+        """Replace each of the actions (B,) with probability ``rate`` by a random legal action."""
+        # SB3 seeds only NumPy's global generator from the run's seed.
         explores = np.random.random(len(actions)) < rate  # noqa: NPY002
         if masks is None:
             others = np.random.randint(0, int(self.action_space.n), size=len(actions))  # noqa: NPY002
@@ -296,7 +295,7 @@ class QPLEX(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Choose (B,) actions of the next step; all random before ``learning_starts`` game steps."""
+        """Choose the actions (B,) of the next step; all random before ``learning_starts`` game steps."""
         assert isinstance(self._last_obs, dict)
         starts = self._last_episode_starts
         if self.agent_state is not None and len(self.agent_state[0]) != n_envs:
@@ -321,7 +320,7 @@ class QPLEX(OffPolicyAlgorithm):
         Play one step of all games, and count game steps and team episodes; see SB3.
 
         :param train_freq: always one step
-        :param action_noise: not used
+        :param action_noise: unused
         :param learning_starts: game steps of random actions
         """
         self.policy.set_training_mode(False)
@@ -389,7 +388,7 @@ class QPLEX(OffPolicyAlgorithm):
         """
         Do the updates that are due after one step of all games.
 
-        :param gradient_steps: not read: those of ``gradient_steps`` and ``train_freq``
+        :param gradient_steps: unused; determined by the attributes ``gradient_steps`` and ``train_freq``
         :param batch_size: game steps per gradient step
         """
         due = self._crossed(self.update_interval)
@@ -408,7 +407,7 @@ class QPLEX(OffPolicyAlgorithm):
         self._log(error)
 
     def _sample(self, batch_size: int) -> TeamReplaySamples:
-        """Sample a batch; of sequences for agents with memory."""
+        """Sample a batch; sequences for agents with memory."""
         parts = self.policy.parts
         if self.policy.memory is None:
             return self._buffer().sample(batch_size)
@@ -435,7 +434,7 @@ class QPLEX(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfQPLEX:
-        """Train as SB3 does; ``total_timesteps`` counts rows: game steps times N, ``log_interval`` team episodes."""
+        """Train as in SB3; ``total_timesteps`` counts rows (game steps times N), ``log_interval`` team episodes."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
