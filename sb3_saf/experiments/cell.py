@@ -1,4 +1,4 @@
-"""What happens in a worker: one cell is trained and tested in the folder of its job."""
+"""Worker code: training and testing of one cell in the folder of its job."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from sb3_saf.training.folders import software_versions
 from sb3_saf.training.run import CHECKPOINTS, RunOptions, load_parameters, train
 from sb3_saf.training.seeds import evaluation_seed
 
-#: Points of a learning curve at most.
+#: Maximum number of points of a learning curve.
 CURVE_POINTS: Final = 100
-#: Checkpoints of a training, from which another worker goes on if this one is killed.
+#: Checkpoints of a training, from which another worker continues if this one is killed.
 CHECKPOINTS_PER_CELL: Final = 20
 
 
 @dataclass(frozen=True)
 class Job:
     """
-    What a worker is to do.
+    Job of a worker.
 
-    :param cell: to train, unless the folder has its model, and to test
-    :param config: how
-    :param device: as SB3 takes it
-    :param threads: of torch
+    :param cell: cell to train, unless the folder has its model, and to test
+    :param config: configuration of the run
+    :param device: as in SB3
+    :param threads: threads of torch
     :param tensorboard: whether to keep TensorBoard logs of the training
     """
 
@@ -60,7 +60,7 @@ class Job:
 
     @classmethod
     def read(cls, folder: Path) -> Job:
-        """Return the job of a folder; a ValueError if there is none."""
+        """Read the job of a folder; ValueError if there is none."""
         content = read_json(folder / "job.json")
         if content is None:
             raise ValueError(f"there is no job.json in {folder}; expected an unfinished cell of `experiments run`")
@@ -71,11 +71,11 @@ class Job:
 
 def run_job(folder: Path) -> None:
     """
-    Do the job in ``FOLDER/job.json``: train, unless ``FOLDER/model.zip`` is there, and test.
+    Do the job in ``FOLDER/job.json``: train, unless ``FOLDER/model.zip`` exists, and test. A killed job continues on
+    the next call from the last checkpoint in ``FOLDER/training``.
 
-    What is killed goes on, called again, from the last checkpoint in ``FOLDER/training``.
-
-    :param folder: of the job; ``FOLDER/result`` gets the files of the finished cell, or its further tests alone
+    :param folder: folder of the job; the files of the finished cell, or only its further tests, are written to
+        ``FOLDER/result``
     """
     job = Job.read(folder)
     th.set_num_threads(job.threads)
@@ -94,7 +94,7 @@ def run_job(folder: Path) -> None:
 
 
 def _train(job: Job, folder: Path, result: Path) -> BaseAlgorithm:
-    """Return a trained model, which leaves its files in the result; one that was finished before is loaded."""
+    """Train a model and write its files to the result, or load it if it was finished before."""
     settings = job.config.settings(job.cell)
     status = folder / "status.json"
     if status.exists():
@@ -109,7 +109,7 @@ def _train(job: Job, folder: Path, result: Path) -> BaseAlgorithm:
             device=job.device,
         )
         model = train(settings, job.cell.seed, folder, options, [clock])
-        # Of monitor.csv, hundreds of thousands of lines at the paper's size, the curve is kept.
+        # Only the curve of monitor.csv is kept, which has hundreds of thousands of lines at the paper's size.
         (folder / "curve.csv").write_text(curve(folder / "monitor.csv", clock.points, settings.n_envs))
         _, processor, wall = clock.points[-1]
         seconds = {"wall_seconds": float(wall), "processor_seconds": float(processor)}
@@ -122,7 +122,7 @@ def _train(job: Job, folder: Path, result: Path) -> BaseAlgorithm:
 
 
 def _forget_unreadable(folder: Path) -> None:
-    """Begin anew if no checkpoint can be read, or not by this version."""
+    """Remove the training if this version cannot read any of its checkpoints."""
     try:
         CheckpointFolder(folder / CHECKPOINTS).newest()
     except CheckpointError as error:
@@ -131,7 +131,7 @@ def _forget_unreadable(folder: Path) -> None:
 
 
 def _load(job: Job, path: Path) -> BaseAlgorithm:
-    """Return the model that was trained before; only numbers are taken from its file."""
+    """Return the model that was trained before; only numbers are read from its file."""
     settings = job.config.settings(job.cell)
     env = settings.make_env(job.cell.seed)
     model = settings.make_model(env, job.cell.seed, device=job.device)
@@ -141,7 +141,7 @@ def _load(job: Job, path: Path) -> BaseAlgorithm:
 
 
 def _describe(job: Job, result: Path, model: BaseAlgorithm | None) -> None:
-    """Write what a cell is, what it was made with and, of a random team, that it cost nothing."""
+    """Write a cell's description, software versions and, for a random team, zero cost."""
     write_json(result / "cell.json", job.cell.as_dict())
     write_json(result / "config.json", job.config.describe(job.cell))
     write_json(result / "versions.json", versions(model))
@@ -153,9 +153,9 @@ def _describe(job: Job, result: Path, model: BaseAlgorithm | None) -> None:
 
 class TrainingClock(BaseCallback):
     """
-    Record processor time and wall time against game steps. A training that goes on from a checkpoint continues.
+    Record processor time and wall time against game steps, also over resumed trainings.
 
-    :param every_game_steps: game steps between two points at least
+    :param every_game_steps: minimum game steps between two points
     """
 
     def __init__(self, every_game_steps: float) -> None:
@@ -167,7 +167,7 @@ class TrainingClock(BaseCallback):
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
-        """Return (K, 3): game steps, processor seconds of this process, and wall seconds since the start."""
+        """Return game steps, processor seconds of this process, and wall seconds since the start, (K, 3)."""
         return np.array(self._points, dtype=np.float64).reshape(-1, 3)
 
     def _on_training_start(self) -> None:
@@ -200,19 +200,19 @@ class TrainingClock(BaseCallback):
         return {"points": self.points, "seconds": np.array(self._seconds())}
 
     def load_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state of :meth:`checkpoint_state`."""
         self._points = [(float(a), float(b), float(c)) for a, b, c in state["points"]]
         self._before = (float(state["seconds"][0]), float(state["seconds"][1]))
 
 
 def curve(monitor: Path, clock: npt.NDArray[np.float64], n_games: int) -> str:
     """
-    Condense the training episodes: the mean team return of equal stretches of game steps.
+    Condense the training episodes to mean team returns over equal intervals of game steps.
 
     :param monitor: a TeamMonitor's file, in the order in which episodes ended
     :param clock: points of a :class:`TrainingClock`
-    :param n_games: E; a stretch has at least so many episodes
-    :return: CSV of the game steps and the processor seconds at the end of each stretch, the mean return, and the
+    :param n_games: E, minimum episodes of an interval
+    :return: CSV of the game steps and the processor seconds at the end of each interval, the mean return, and the
         number of episodes
     """
     episodes = np.atleast_1d(np.genfromtxt(monitor, delimiter=",", skip_header=1, names=True))
@@ -229,7 +229,7 @@ def curve(monitor: Path, clock: npt.NDArray[np.float64], n_games: int) -> str:
 
 def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | None) -> dict[str, Any]:
     """
-    Test at a level; the games depend on the cell's seed and the level alone, so all methods play the same ones.
+    Test at a level; the games depend on the cell's seed and the level only, so all methods play the same ones.
 
     :param model: None for a random team
     :return: plain data
@@ -237,7 +237,7 @@ def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | Non
     settings = config.settings(cell, level)
     clock = time.perf_counter()
     env = settings.make_env(cell.seed, evaluation=True, n_envs=config.episodes)
-    # Sampled actions must depend neither on the training nor on other tests.
+    # Sampled actions must not depend on the training or on other tests.
     set_random_seed(cell.seed)
     player: Any = RandomPolicy(env.action_space, seed=cell.seed) if model is None else model
     deterministic = config.deterministic or not settings.spec.draws_actions
@@ -265,13 +265,13 @@ def command(cell: Cell, config: RunConfig) -> str:
 
 
 def versions(model: BaseAlgorithm | None) -> dict[str, str]:
-    """Return what a cell runs on."""
+    """Return the software versions and hardware of a cell."""
     device = {} if model is None else {"device": str(model.device)}
     return {**software_versions(), **device, "host": socket.gethostname(), "commit": _commit()}
 
 
 def _commit() -> str:
-    """Return the checkout's commit, if this runs from one."""
+    """Return the commit of the checkout, if there is one."""
     words = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         done = subprocess.run(words, cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=10)

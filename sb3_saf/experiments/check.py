@@ -1,4 +1,4 @@
-"""Run a finished cell again and compare: results that are not reproducible are no results."""
+"""Reproduction check: run a finished cell again and compare."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sb3_saf.export.weights import read_weights
 
 
 class Check(NamedTuple):
-    """What a second run has found equal, bit for bit, and different, and what differs in the versions."""
+    """Results equal bit for bit and different in a second run, and differing versions."""
 
     equal: list[str]
     different: list[str]
@@ -23,10 +23,10 @@ class Check(NamedTuple):
 
 def check_cell(folder: Path, device: str = "auto") -> Check:
     """
-    Train and test a cell again, elsewhere, and compare with what is there.
+    Train and test a cell again in a temporary folder, and compare with its results.
 
-    :param folder: of a finished cell, ``RESULTS/cells/TASK-LEVEL/METHOD/seed-N``
-    :param device: as SB3 takes it
+    :param folder: folder of a finished cell, ``RESULTS/cells/TASK-LEVEL/METHOD/seed-N``
+    :param device: as in SB3
     :raises ValueError: if there is no finished cell, or its settings have changed since
     """
     described = read_json(folder / "cell.json")

@@ -1,4 +1,4 @@
-"""The command line: ``list``, ``plan``, ``run``, ``report``, ``check``."""
+"""Command line: ``list``, ``plan``, ``run``, ``report``, ``check``."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from sb3_saf.training.seeds import check_seed
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
-#: Returns of reference teams, which reports draw if the file is there.
+#: Returns of reference teams, which reports draw if the file exists.
 DEFAULT_SCALE: Final = Path("results", "scale.csv")
-#: What a shell reports for a process that Ctrl-C has ended.
+#: Exit code of a process ended by Ctrl-C.
 _INTERRUPTED: Final = 128 + signal.SIGINT
 
 
@@ -41,11 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    :return: 0 if all went well, 1 if cells failed or differ, 130 if a run was interrupted
-    :raises SystemExit: with 2 if the command was wrong
+    :return: 0 for success, 1 if cells failed or differ, 130 if a run was interrupted
+    :raises SystemExit: with 2 if the command was invalid
     """
     options = _parser().parse_args(arguments)
-    if options.command == "cell":  # whose errors are for error.txt, with their traceback
+    if options.command == "cell":  # its errors go to error.txt with a traceback
         return _cell(options)
     return run_command(f"{PROGRAM} {options.command}", lambda: user_errors()(options.function)(options))
 
@@ -140,11 +140,11 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
     )
 
 
-# What the options mean
+# Interpretation of the options
 
 
 class _Asked(NamedTuple):
-    """What a command is about: an experiment, the folder of its results, and the part that was named."""
+    """Subject of a command: an experiment, the folder of its results, and the selected part."""
 
     experiment: Experiment
     results: Results
@@ -155,7 +155,7 @@ class _Asked(NamedTuple):
         """
         Read the options.
 
-        :raises ValueError: for names that do not exist
+        :raises ValueError: for unknown names
         """
         name = _name(options)
         results = Results(
@@ -177,14 +177,14 @@ class _Asked(NamedTuple):
 
 
 def _size(options: argparse.Namespace) -> Size:
-    """Return the size that was named, that of the folder, or the default."""
+    """Return the given size, that of the folder, or the default."""
     stored = None if options.folder is None else Results(options.folder).config()
     size: Size = options.size or (DEFAULT_SIZE if stored is None else stored.size)
     return size
 
 
 def _name(options: argparse.Namespace) -> str:
-    """Return the name of the experiment; a ValueError if there is none."""
+    """Return the name of the experiment; ValueError if there is none."""
     name: str | None = options.name
     if name is None and len(options.env) != 1:
         example = f"{PROGRAM} {options.command} coordination, or --env mpe2.simple_spread_v3"
@@ -194,7 +194,7 @@ def _name(options: argparse.Namespace) -> str:
 
 
 def _env(task: str, experiment: Experiment) -> str:
-    """Return the environment of a task; any of HECOGrid's will do for the paper's experiments."""
+    """Return the environment of a task; the paper's experiments accept any of HECOGrid's."""
     if task in experiment.envs:
         return task
     if experiment.name not in EXPERIMENTS:
@@ -203,7 +203,7 @@ def _env(task: str, experiment: Experiment) -> str:
 
 
 def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
-    """Return how cells are trained and tested."""
+    """Return the configuration of the run."""
     overrides = dict(options.hyperparams)
     if options.game_steps is not None:
         overrides["game_steps"] = options.game_steps
@@ -217,7 +217,7 @@ def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
 
 
 def _engine(options: argparse.Namespace) -> Engine:
-    """Return what runs cells; a ValueError if Ray is asked for and not installed, or not there."""
+    """Return the engine that runs cells; ValueError if Ray is requested and not installed, or not running."""
     if not (options.ray or options.address is not None):
         # A batch system may have limited the cores of this process.
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -281,7 +281,7 @@ def _run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _sigterm_like_control_c() -> Iterator[None]:
-    """Batch systems send SIGTERM before they kill: end as after Ctrl-C."""
+    """Treat SIGTERM, which batch systems send before they kill, like Ctrl-C."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -343,7 +343,7 @@ def _cell(options: argparse.Namespace) -> int:
 
 
 def _end_with_stdin() -> None:
-    """End at once when the process that started this one is gone, however it ended."""
+    """End this process when its parent has ended for any reason."""
     while os.read(0, 1024):
         pass
     os._exit(1)

@@ -1,4 +1,4 @@
-"""What experiments are: methods, environments and levels by name. No code here trains anything."""
+"""Definitions of experiments: methods, environments and levels by name."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from sb3_saf.training.names import unknown_name
 
 #: The command, as users type it.
 PROGRAM: Final = "python -m sb3_saf.experiments"
-#: Seeds of a run that names none: the paper's experiments have at least three.
+#: Default seeds of a run: the paper's experiments have at least three.
 DEFAULT_SEEDS: Final = (0, 1, 2)
 
-#: The untrained team that every experiment has beside its methods.
+#: The untrained team that every experiment includes.
 RANDOM: Final = "random"
 
-#: How levels abbreviate the names of parameters.
+#: Abbreviations of parameters in names of levels.
 _SHORT: Final = {"coordination": "c", "heterogeneity": "h", "n_agents": "n"}
-#: Values that may be part of a folder's name.
+#: Values allowed in a folder's name.
 _PLAIN: Final = re.compile(r"[\w.+-]+")
 
 
@@ -26,7 +26,7 @@ class Level(NamedTuple):
     """
     Parameters of the environment that an experiment varies.
 
-    :param parameters: names and values; empty for the environment as it is
+    :param parameters: names and values; empty for the defaults
     """
 
     parameters: tuple[tuple[str, Any], ...] = ()
@@ -38,7 +38,7 @@ class Level(NamedTuple):
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """The parameters as arguments of the environment."""
+        """Parameters as arguments of the environment."""
         return dict(self.parameters)
 
     @property
@@ -52,12 +52,12 @@ class Level(NamedTuple):
 
 class View(NamedTuple):
     """
-    A row of levels along one parameter: what a bar chart shows.
+    Levels along one parameter: the content of a bar chart.
 
-    :param parameter: that is varied; empty if there is one level only
-    :param levels: tested at
-    :param train: trained at; None where every level is trained at itself
-    :param label: of the axis; empty for the parameter's name
+    :param parameter: varied parameter; empty if there is one level only
+    :param levels: levels of the tests
+    :param train: level of the training; None to train at each test level
+    :param label: label of the axis; empty for the parameter's name
     """
 
     parameter: str
@@ -67,20 +67,20 @@ class View(NamedTuple):
 
     @property
     def axis(self) -> str:
-        """Return the axis as figures name it."""
+        """Return the name of the axis in figures."""
         return self.label or self.parameter or "level"
 
     @property
     def suffix(self) -> str:
-        """Return where it is trained, for titles; empty where every level is trained at itself."""
+        """Return the level of the training, for titles; empty if training is at each test level."""
         return "" if self.train is None else f", trained at {self.train}"
 
     def position(self, level: Level) -> Any:
-        """Return where a level is on the axis."""
+        """Return the position of a level on the axis."""
         return level.env_kwargs.get(self.parameter, "default")
 
     def at(self, positions: Collection[str]) -> View:
-        """Return the view with fewer levels to test at: those at the given positions."""
+        """Return the view with only the test levels at the given positions."""
         return self._replace(levels=tuple(level for level in self.levels if str(self.position(level)) in positions))
 
     def __str__(self) -> str:
@@ -92,10 +92,10 @@ class Experiment(NamedTuple):
     """
     A grid of methods, environments and levels.
 
-    :param name: as the commands know it
-    :param question: what it asks
-    :param envs: environments, as ``sb3_saf.train --env`` takes them
-    :param methods: algorithms, as ``sb3_saf.train --algo`` takes them
+    :param name: name in the commands
+    :param question: research question
+    :param envs: environments, as in ``sb3_saf.train --env``
+    :param methods: algorithms, as in ``sb3_saf.train --algo``
     :param views: levels
     """
 
@@ -107,11 +107,11 @@ class Experiment(NamedTuple):
 
     @property
     def is_grid(self) -> bool:
-        """Whether there is anything to train."""
+        """Whether the experiment has cells to train."""
         return bool(self.views)
 
     def tests(self) -> dict[Level, tuple[Level, ...]]:
-        """Return the levels to train at, each with the levels to test at."""
+        """Return the training levels, each with its test levels."""
         tests: dict[Level, dict[Level, None]] = {}
         for view in self.views:
             for level in view.levels:
@@ -120,9 +120,9 @@ class Experiment(NamedTuple):
 
     def at(self, positions: Collection[str]) -> Experiment:
         """
-        Return the part of it at some positions of its axes.
+        Return the part of the experiment at some positions of its axes.
 
-        :param positions: such as 1, 3, 5, as text; empty for all of it
+        :param positions: such as 1, 3, 5, as text; empty for all
         :raises ValueError: for a position that no axis has
         """
         if not positions:
@@ -139,10 +139,10 @@ def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[A
     """
     Return an experiment on any environment, with the paper's methods.
 
-    :param name: for the folder of its report
-    :param envs: environments, as ``sb3_saf.train --env`` takes them
+    :param name: name of the folder of its report
+    :param envs: environments, as in ``sb3_saf.train --env``
     :param vary: at most one parameter of the environment, with its values
-    :raises ValueError: for names or values that cannot name a folder
+    :raises ValueError: for names or values not allowed in folder names
     """
     if not _PLAIN.fullmatch(name) or name in EXPERIMENTS:
         raise ValueError(
@@ -172,7 +172,7 @@ def _level(coordination: int, heterogeneity: int) -> Level:
 
 
 _METHODS: Final = ("saf", "mappo", "ippo")
-#: Not all tasks that there are: one more must not enlarge the paper's experiments.
+#: The paper's tasks, written out, so that new tasks do not enlarge the paper's experiments.
 _THREE_TASKS: Final = ("TeamTogether-v0", "TeamSupport-v0", "KeyForTreasure-v0")
 _TWO_TASKS: Final = _THREE_TASKS[:2]
 _BY_COORDINATION: Final = View(COORDINATION, tuple(_level(c, 1) for c in (1, 2, 3)))
@@ -211,7 +211,7 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 
 
 def find_experiment(name: str) -> Experiment:
-    """Return an experiment of the paper; a ValueError says the nearest name that exists."""
+    """Return an experiment of the paper; the ValueError suggests the nearest known name."""
     if name not in EXPERIMENTS:
         raise unknown_name("experiment", name, EXPERIMENTS)
     return EXPERIMENTS[name]

@@ -1,9 +1,9 @@
 """
-Where cells run: in processes of this machine, or on Ray.
+Engines that run cells: in processes of this machine, or on Ray.
 
-An engine is given the folder of a job and returns a future of :mod:`concurrent.futures`. On this machine every cell has
-a process of its own, ``python -m sb3_saf.experiments cell FOLDER``: one that crashes or is killed ends no other cell. A
-``ProcessPoolExecutor`` would be broken by the death of one worker, and all that it runs lost.
+An engine takes the folder of a job and returns a future of :mod:`concurrent.futures`. On this machine every cell has
+its own process, ``python -m sb3_saf.experiments cell FOLDER``, so that a crash does not affect other cells. A
+``ProcessPoolExecutor`` would lose all running cells if one worker dies.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from typing import Any, Final
 
 from sb3_saf.experiments.files import pack, unpack
 
-#: Read by libraries when they are imported; sums of other numbers of threads come out in another order.
+#: Read by libraries at import; the number of threads changes the order of summation.
 THREAD_VARIABLES: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-#: Does the job of a folder, and ends when its parent does.
+#: Command that does the job of a folder, and ends with its parent.
 CELL_COMMAND: Final = (sys.executable, "-m", "sb3_saf.experiments", "cell", "--until-stdin-closes")
-#: Seconds that a process has to write its last checkpoint and end.
+#: Time limit in seconds for a process to write its last checkpoint and end.
 _PATIENCE: Final = 30.0
-#: Characters of a log that are kept of a failure.
+#: Maximum characters of a failed cell's log to keep.
 _LOG_TAIL: Final = 20_000
-#: Jobs handed to a Ray cluster for each that could run: enough for it to grow, too few to fill its memory.
+#: Jobs submitted to a Ray cluster per slot: enough for autoscaling, too few to fill its memory.
 _QUEUED_PER_SLOT: Final = 2
 _FEWEST_QUEUED: Final = 64
 
 
 class CellError(RuntimeError):
-    """A cell's process has failed; the text is its log, or how it died."""
+    """Raised if a cell's process has failed; the text is its log, or its exit status."""
 
 
 class Engine(ABC):
-    """Runs jobs elsewhere. A context manager; leaving it ends what is running."""
+    """Base of engines that run jobs. A context manager; leaving it ends running jobs."""
 
     @property
     @abstractmethod
@@ -54,13 +54,13 @@ class Engine(ABC):
         """
         Start a job.
 
-        :param folder: with ``job.json``
-        :return: done when ``FOLDER/result`` is there
+        :param folder: folder with ``job.json``
+        :return: future that is done when ``FOLDER/result`` exists
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End what is running."""
+        """End running jobs."""
 
     def __enter__(self) -> Engine:
         return self
@@ -73,11 +73,11 @@ class Engine(ABC):
 
 class LocalEngine(Engine):
     """
-    Processes of this machine.
+    Engine with processes of this machine.
 
-    :param workers: processes at the same time
-    :param threads: of each process
-    :param command: that is given the folder of a job
+    :param workers: maximum number of parallel processes
+    :param threads: threads of each process
+    :param command: command to which the folder of a job is appended
     """
 
     def __init__(self, workers: int, threads: int = 1, command: Sequence[str] = CELL_COMMAND) -> None:
@@ -95,7 +95,7 @@ class LocalEngine(Engine):
     def submit(self, folder: Path) -> Future[None]:
         """Start a job; see :meth:`Engine.submit`."""
         with (folder / "log.txt").open("wb") as log:
-            # A session of its own: Ctrl-C in a terminal reaches every process of ours, but is for us alone.
+            # A new session: Ctrl-C in a terminal must reach this process only.
             self._processes[folder] = subprocess.Popen(
                 [*self._command, str(folder)],
                 stdin=subprocess.PIPE,
@@ -136,14 +136,14 @@ def _death(code: int) -> str:
 
 class RayEngine(Engine):
     """
-    Tasks of a Ray cluster, or of a Ray started on this machine.
+    Engine with tasks of a Ray cluster, or of a Ray started on this machine.
 
-    A task that sees the folder of its job works in it, so that another one goes on from its checkpoints if it is lost.
-    Where nodes do not share a disk the job's files travel through Ray, and a lost cell starts over.
+    A task with access to its job's folder works in it, so that another task can continue from its checkpoints. Without
+    a shared disk the job's files are sent through Ray, and a lost cell starts over.
 
-    :param address: of a running cluster, ``"auto"`` to find it; None to start Ray on this machine
-    :param cpus: of each job
-    :param gpus: of each job; may be a fraction, so that several share one
+    :param address: address of a running cluster, ``"auto"`` to find it; None to start Ray on this machine
+    :param cpus: processors of each job
+    :param gpus: GPUs of each job; may be a fraction, so that several share one
     :param workers: processors of a Ray that is started here; None for all
     """
 
@@ -162,7 +162,7 @@ class RayEngine(Engine):
         except ValueError:
             self.close()
             raise
-        # Attempts are counted by the run, so that those of failures and of lost nodes are the same ones.
+        # The run counts attempts, so that failures and lost nodes count alike.
         self._task = self._ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_run_on_ray)
         self._references: list[Any] = []
 
@@ -179,7 +179,10 @@ class RayEngine(Engine):
             ) from None
 
     def _check_resources(self) -> None:
-        """Refuse jobs that fit on no node: they would wait for ever. A cluster may grow, so there it is only said."""
+        """
+        Raise ValueError for jobs that fit on no node, which would wait forever; on a cluster, which may grow, only
+        warn.
+        """
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         if any(node.get("CPU", 0) >= self.cpus and node.get("GPU", 0) >= self.gpus for node in nodes):
             return
@@ -208,7 +211,7 @@ class RayEngine(Engine):
         return done
 
     def _settle(self, done: Future[None], answer: Future[bytes | None], folder: Path) -> None:
-        """Give a task's result or error on."""
+        """Set the result or error of a task on the future."""
         try:
             if (error := answer.exception()) is not None:
                 is_lost = not isinstance(error, self._ray.exceptions.RayTaskError)
@@ -229,7 +232,7 @@ class RayEngine(Engine):
 
 
 def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
-    """Do a job on a node; return its result as an archive, or None if the node sees the folder and has put it there."""
+    """Do a job on a node; return its result as an archive, or None if it was written to the folder directly."""
     from sb3_saf.experiments.cell import run_job
 
     folder = Path(name)
@@ -251,12 +254,12 @@ def _first_line(error: BaseException) -> str:
 
 def require_ray(is_local: bool = False) -> ModuleType:
     """
-    Return Ray, quiet.
+    Import Ray with quiet settings.
 
-    :param is_local: whether it shall run on this machine alone; then it listens on localhost, and on nothing else
+    :param is_local: whether it runs on this machine only; it then listens on localhost only
     :raises ValueError: if it is not installed
     """
-    # Nothing is reported to anybody, and a future default is taken now, about which Ray would warn.
+    # No usage statistics are sent, and a future default is set now, about which Ray would warn.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     if is_local:  # Read when Ray is imported: 0 is its default on systems other than Linux.

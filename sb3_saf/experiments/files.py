@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, and folders as bytes."""
+"""Atomic writing of files, and folders as bytes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def unpack(archive: bytes, folder: Path) -> None:
     """
     Write the files of :func:`pack`.
 
-    :param folder: made if it is not there
+    :param folder: created if missing
     :raises ValueError: before anything is written, if a name leads out of the folder
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -37,12 +37,12 @@ def unpack(archive: bytes, folder: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON gives it back: tuples are lists."""
+    """Convert a value to what JSON gives back: tuples become lists."""
     return json.loads(json.dumps(value, default=str))
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """Return what a file holds, None if it is not there; a ValueError names a file without a JSON object."""
+    """Return the content of a file, None if it does not exist; ValueError for a file without a JSON object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -55,12 +55,12 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def write_json(path: Path, value: object) -> None:
-    """Write a value readably, as a whole."""
+    """Write a value atomically as indented JSON."""
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that is there as a whole, or as it was before."""
+    """Write a file atomically."""
     with tempfile.NamedTemporaryFile(
         "w", dir=path.parent, prefix=f".{path.name}-", delete=False, encoding="utf-8", newline=""
     ) as file:
@@ -69,7 +69,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], most: int = 3) -> str:
-    """Name what differs between two mappings, with dotted names, and ``most`` differences at most."""
+    """Describe the differences between two mappings with dotted names, at most ``most`` of them."""
     before, after = dict(_flat(old)), dict(_flat(new))
     changed = [key for key in {**before, **after} if before.get(key) != after.get(key)]
     named = [f"{key} was {before.get(key)!r}, now {after.get(key)!r}" for key in changed[:most]]

@@ -1,4 +1,4 @@
-"""From an experiment to its cells: what is trained, where it is tested, and what does not fit."""
+"""Cells of an experiment: trainings, their test levels, and levels that do not fit."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from sb3_saf.training.names import unknown_name
 from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.yaml_files import Size
 
-#: An algorithm whose settings give the random team its environment, which is the same for all.
+#: Algorithm whose settings define the environment of the random team; it is the same for all algorithms.
 _ANY_ALGORITHM = "ippo"
 
 
 @dataclass(frozen=True)
 class Cell:
     """
-    One training and its tests. The name of its folder says what is trained.
-
-    Cells do not know their experiment, so experiments in one folder share them.
+    One training and its tests. The name of its folder identifies the training. Cells are independent of experiments, so
+    experiments in one folder share them.
 
     :param method: name of the algorithm, or ``"random"`` for the untrained team
-    :param env: the environment, as ``sb3_saf.train --env`` takes it
-    :param level: trained at
-    :param seed: of the run
-    :param tests: levels to test at
+    :param env: the environment, as in ``sb3_saf.train --env``
+    :param level: level of the training
+    :param seed: seed of the run
+    :param tests: levels of the tests
     """
 
     method: str
@@ -41,7 +40,7 @@ class Cell:
 
     @property
     def task(self) -> str:
-        """The environment without its version."""
+        """Environment without its version."""
         return self.env.removesuffix("-v0")
 
     @property
@@ -51,7 +50,7 @@ class Cell:
 
     @property
     def is_trained(self) -> bool:
-        """Whether there is anything to learn."""
+        """Whether the method is trained, not random."""
         return self.method != RANDOM
 
     def as_dict(self) -> dict[str, Any]:
@@ -61,7 +60,7 @@ class Cell:
 
     @classmethod
     def from_dict(cls, saved: Mapping[str, Any]) -> Cell:
-        """Return the cell that :meth:`as_dict` has described."""
+        """Return the cell of a dict from :meth:`as_dict`."""
         tests = tuple(Level.of(**level) for level in saved["tests"])
         return cls(**{**saved, "level": Level.of(**saved["level"]), "tests": tests})
 
@@ -72,9 +71,9 @@ class Cell:
 @dataclass(frozen=True)
 class RunConfig:
     """
-    What is the same for all cells of a folder.
+    Configuration of all cells of a folder.
 
-    :param size: of the settings in ``zoo_configs``
+    :param size: size of the settings in ``zoo_configs``
     :param overrides: replace settings of ``zoo_configs``, with the same keys: ``{"game_steps": 1000, "n_envs": 8}``
     :param episodes: team episodes of each test
     :param deterministic: whether tests take the most likely actions
@@ -86,7 +85,7 @@ class RunConfig:
     deterministic: bool = False
 
     def words(self, level: Level = Level()) -> list[str]:  # noqa: B008 (immutable)
-        """Return the options of a command line that stand for the settings of a level."""
+        """Return the command line options for the settings of a level."""
         overrides = dict(self.overrides)
         words = ["--size", self.size]
         if "game_steps" in overrides:
@@ -98,12 +97,12 @@ class RunConfig:
         """
         Return the settings of a cell.
 
-        :param cell: for its method and environment
-        :param level: where it is tested; None for where it is trained
-        :raises ValueError: for what does not exist, levels that cannot be built, and ``normalize``
+        :param cell: cell with the method and environment
+        :param level: level of a test; None for the level of the training
+        :raises ValueError: for unknown names, levels that cannot be built, and ``normalize``
         """
         algo = cell.method if cell.is_trained else _ANY_ALGORITHM
-        # The environment is all that a random team needs.
+        # A random team needs the environment only.
         overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key == "env_kwargs"}
         level = cell.level if level is None else level
         overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
@@ -116,7 +115,7 @@ class RunConfig:
         return settings
 
     def describe(self, cell: Cell) -> dict[str, Any]:
-        """Return everything that decides a cell's result, as plain data."""
+        """Return everything that determines a cell's result, as plain data."""
         settings = self.settings(cell).as_dict()
         if not cell.is_trained:
             settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
@@ -126,7 +125,7 @@ class RunConfig:
 
 
 class LeftOut(NamedTuple):
-    """A level that does not fit the size, for training or for a test after training at a level, and the reason."""
+    """A level that does not fit the size, for training or for a test, and the reason."""
 
     task: str
     level: Level
@@ -139,7 +138,7 @@ class LeftOut(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """All cells of an experiment, in an order in which every stretch has all methods, and what does not fit."""
+    """All cells of an experiment, ordered so that every section has all methods, and the levels that do not fit."""
 
     cells: list[Cell]
     left_out: list[LeftOut]
@@ -148,13 +147,13 @@ class Grid(NamedTuple):
 @dataclass(frozen=True)
 class Selection:
     """
-    A part of an experiment.
+    Part of an experiment.
 
     :param seeds: seeds of the runs
-    :param methods: empty for the experiment's own
-    :param envs: empty for the experiment's own
+    :param methods: empty for the experiment's methods
+    :param envs: empty for the experiment's environments
     :param levels: positions on the experiment's axes, as text; empty for all of them
-    :raises ValueError: for methods that are no algorithms
+    :raises ValueError: for methods that are not algorithms
     """
 
     seeds: tuple[int, ...]
@@ -168,7 +167,7 @@ class Selection:
                 raise unknown_name("method", method, ALGOS)
 
     def has(self, cell: Cell, experiment: Experiment) -> bool:
-        """Whether a cell belongs to this part, where nothing named is everything. The random team always does."""
+        """Return whether a cell belongs to this part; empty fields select everything. The random team always does."""
         tests = experiment.at(self.levels).tests()
         levels = set(tests) if cell.is_trained else {level for group in tests.values() for level in group}
         return (
@@ -183,7 +182,7 @@ def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> G
     """
     Return the grid of an experiment: its methods and a random team, at every level that fits.
 
-    :raises ValueError: for levels that it does not have, or if nothing fits
+    :raises ValueError: for levels that the experiment lacks, or if none fits
     """
     methods = selection.methods or experiment.methods
     left_out: list[LeftOut] = []
@@ -205,7 +204,7 @@ def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> G
 
 
 def merge(cells: Iterable[Cell]) -> list[Cell]:
-    """Return each training once, with all tests that are asked of it."""
+    """Return each training once, with all its requested tests."""
     merged: dict[str, Cell] = {}
     for cell in cells:
         known = merged.setdefault(cell.id, cell)
@@ -223,14 +222,14 @@ def _misfits(env: str, levels: Iterable[Level], config: RunConfig) -> Iterator[t
 
 
 class Shard(NamedTuple):
-    """One of several parts of a grid, the first is 1, for machines that do not share a folder."""
+    """One of several parts of a grid, counted from 1, for machines that do not share a folder."""
 
     number: int = 1
     parts: int = 1
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Read ``3/8``; a ValueError for anything that is no part."""
+        """Parse text such as ``3/8``; ValueError for an invalid part."""
         number, slash, parts = text.partition("/")
         if not (slash and number.isdecimal() and parts.isdecimal() and 1 <= int(number) <= int(parts)):
             raise ValueError(f"expected a part such as 3/8 (the third of eight), got {text!r}")
@@ -238,9 +237,9 @@ class Shard(NamedTuple):
 
     def of(self, cells: Sequence[Cell]) -> list[Cell]:
         """
-        Return its cells: a stretch, so that each part has cheap and expensive methods alike.
+        Return the cells of this part: a section, so that each part has cheap and expensive methods.
 
-        :param cells: the whole grid; the same for all parts, whatever is finished
+        :param cells: the whole grid, finished cells included, the same for all parts
         """
         trained = [cell for cell in cells if cell.is_trained]
         others = [cell for cell in cells if not cell.is_trained]

@@ -1,4 +1,4 @@
-"""A report's Markdown page: means, losses, aggregates, comparisons, and how to make them again."""
+"""Markdown page of a report: means, losses, aggregates, comparisons, and the commands to reproduce them."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
-#: Missing cells that are named.
+#: Maximum number of missing cells to list.
 _MOST_NAMED: Final = 20
 _NOTHING: Final = "–"
 
 
 class Content(NamedTuple):
     """
-    What a page is about.
+    Content of a page.
 
     :param experiment: the experiment
-    :param config: how its cells were trained and tested
-    :param results: where they are
-    :param cells: all that were asked for
-    :param missing: those that are not finished
+    :param config: configuration of its cells
+    :param results: folder of results
+    :param cells: all requested cells
+    :param missing: unfinished cells
     :param left_out: levels that do not fit the size
-    :param table: of tests, see ``tables``
-    :param curves: of trainings, see ``tables``
-    :param figures: names of the pictures beside the page
+    :param table: table of tests, see ``tables``
+    :param curves: table of learning curves, see ``tables``
+    :param figures: file names of the figures
     """
 
     experiment: Experiment
@@ -91,7 +91,7 @@ def _head(content: Content) -> str:
 
 
 def _numbers(column: pd.Series) -> str:
-    """Return the different whole numbers of a column, in order."""
+    """Return the distinct integers of a column, in order."""
     return ", ".join(str(int(value)) for value in sorted(column.unique()))
 
 
@@ -132,7 +132,7 @@ def _show(estimate: Estimate, digits: int = 2) -> str:
 
 
 def means(table: pd.DataFrame, view: View) -> str:
-    """Return mean returns: a table for each task, a column for each level."""
+    """Return mean returns: one table per task, one column per level."""
     rows = of_view(table, view)
     if rows.empty:
         return ""
@@ -153,7 +153,7 @@ def _mean(values: pd.Series) -> str:
 
 
 def losses(table: pd.DataFrame, view: View) -> str:
-    """Return what harder levels cost: the share of the first level's return that is lost, seed by seed."""
+    """Return the loss at harder levels: the lost fraction of the first level's return, paired by seed."""
     rows = of_view(table, view)
     first, *harder = view.levels
     harder = [level for level in harder if level.slug in set(rows["level"])]
@@ -184,7 +184,7 @@ def _loss(easy: pd.DataFrame, hard: pd.DataFrame) -> str:
 
 
 def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
-    """Return interquartile means over the tasks, for each level and over everything."""
+    """Return interquartile means over the tasks, for each level and over all levels."""
     common = complete(strata(experiment, table))
     if common.empty:
         return "## Aggregates\n\nNone yet: the methods have no seed in common on the same settings."
@@ -205,7 +205,7 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
 
 
 def _of_level(common: pd.DataFrame, view: View, level: Level) -> dict[str, Estimate]:
-    """Return interquartile means at one level; empty if nothing is known of it."""
+    """Return interquartile means at one level; empty without results."""
     rows = of_view(common, view)
     rows = rows[rows["level"] == level.slug].drop_duplicates(["method", "seed", "task"])
     return {} if rows.empty else interquartile_means(score_matrices(rows, "task"))
@@ -217,7 +217,7 @@ def _estimates(head: Sequence[str], methods: Iterable[str], columns: Iterable[Ma
 
 
 def _comparisons(table: pd.DataFrame, view: View) -> str:
-    """Return the first method against each other one, seed by seed."""
+    """Return comparisons of the first method with each other one, paired by seed."""
     text = (
         "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
         f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than "
@@ -228,7 +228,7 @@ def _comparisons(table: pd.DataFrame, view: View) -> str:
 
 
 def _learning(curves: pd.DataFrame, view: View) -> str:
-    """Return the same of the returns while training."""
+    """Return a table of the returns in training."""
     if curves.empty:
         return ""
     of_runs = curves.groupby(["method", "task", "level", "seed"], sort=False, as_index=False)["score"].mean()
@@ -275,7 +275,7 @@ def _reproduction(content: Content) -> str:
 
 
 def experiment_words(experiment: Experiment) -> list[str]:
-    """Return the words of a command line that name an experiment."""
+    """Return the command line words for an experiment."""
     if experiment.name in EXPERIMENTS:
         return [experiment.name]
     words = [experiment.name, "--env", *experiment.envs]
@@ -286,13 +286,13 @@ def experiment_words(experiment: Experiment) -> list[str]:
 
 
 def config_words(config: RunConfig) -> list[str]:
-    """Return the options of a command line that make a configuration."""
+    """Return the command line options for a configuration."""
     episodes = [] if config.episodes == RunConfig.episodes else ["--episodes", str(config.episodes)]
     return [*config.words(), *episodes, *["--deterministic"] * config.deterministic]
 
 
 def _versions(content: Content) -> str:
-    """Return what the cells ran on; more than one line is worth a look."""
+    """Return the software and hardware of the cells, one line per variant."""
     found: dict[str, set[str]] = {}
     for cell in content.cells:
         for name, version in content.results.versions(cell).items():

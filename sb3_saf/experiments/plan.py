@@ -1,4 +1,4 @@
-"""What an experiment consists of, and what is left to do."""
+"""Plan of an experiment: its cells, and the remaining work."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sb3_saf.experiments.results import Results
 
 
 def make_plan(experiment: Experiment, selection: Selection, config: RunConfig, results: Results) -> str:
-    """Return the cells, the game steps and, once cells are finished, the time that is left, as text."""
+    """Return the cells, the game steps and, if cells are finished, the remaining time, as text."""
     grid = expand(experiment, selection, config)
     results.agree(config, grid.cells)
     trained = [cell for cell in grid.cells if cell.is_trained]
@@ -41,7 +41,7 @@ def make_plan(experiment: Experiment, selection: Selection, config: RunConfig, r
 
 
 def _settings(cells: Sequence[Cell]) -> Iterator[str]:
-    """Yield a line for each setting, with the methods and seeds that are trained in it."""
+    """Yield a line for each setting, with its methods and seeds."""
     for task, level, tests in dict.fromkeys((cell.task, cell.level, cell.tests) for cell in cells):
         here = [cell for cell in cells if (cell.task, cell.level) == (task, level)]
         methods = " ".join(dict.fromkeys(cell.method for cell in here))
@@ -51,7 +51,7 @@ def _settings(cells: Sequence[Cell]) -> Iterator[str]:
 
 
 def _factors(cells: Sequence[Cell]) -> str:
-    """Return what a number of cells is made of."""
+    """Return the factors of the number of cells as text."""
     counts: dict[str, set[object]] = {
         "methods": {cell.method for cell in cells},
         "settings": {(cell.task, cell.level) for cell in cells},

@@ -1,4 +1,4 @@
-"""An experiment's report: what is there, what is missing, the paper's figures, and a page of tables."""
+"""Report of an experiment: finished and missing cells, the paper's figures, and a page of tables."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _AGAINST_TIME: Final = "against processor time"
 
 
 class Report(NamedTuple):
-    """What was written: the Markdown page and its pictures; which of all cells asked for are not finished."""
+    """Paths of the Markdown page and its figures, and the requested cells with the unfinished ones."""
 
     page: Path
     figures: list[Path]
@@ -47,9 +47,9 @@ def write_report(
     experiment: Experiment, results: Results, wanted: Selection, scale: pd.DataFrame | None = None
 ) -> Report:
     """
-    Draw and write what is there of an experiment, complete or not. The old report stays until the new one is complete.
+    Write the report of an experiment, complete or not. The old report is replaced when the new one is complete.
 
-    :param wanted: the seeds, methods, environments and levels to show; empty ones for all that were run
+    :param wanted: the seeds, methods, environments and levels to show; empty for all that were run
     :param scale: returns of reference teams, from :func:`read_scale`
     :raises ValueError: if nothing is finished
     """
@@ -77,7 +77,7 @@ def write_report(
 
 
 def read_scale(path: Path) -> pd.DataFrame:
-    """Return reference teams: columns ``task``, ``name``, ``mean`` and parameters; a ValueError if there are others."""
+    """Read reference teams: columns ``task``, ``name``, ``mean`` and parameters; ValueError for missing columns."""
     try:
         scale = pd.read_csv(path)
         require_columns(scale, ("task", "name", "mean"))
@@ -102,7 +102,7 @@ def _references(scale: pd.DataFrame | None, cells: Iterable[Cell], config: RunCo
 
 
 class _Drawer:
-    """Figures of an experiment, by the names of their files."""
+    """Drawer of an experiment's figures, by file name."""
 
     def __init__(self, experiment: Experiment, table: pd.DataFrame, curves: pd.DataFrame, scale: pd.DataFrame) -> None:
         self._experiment, self._table, self._curves = experiment, table, curves
@@ -140,7 +140,7 @@ class _Drawer:
         return figures
 
     def aggregates(self) -> dict[str, Figure]:
-        """Return interquartile means and performance profiles over everything that all methods have."""
+        """Return interquartile means and performance profiles over the results that all methods have."""
         common = complete(strata(self._experiment, self._table))
         if common.empty:
             return {}
@@ -150,7 +150,7 @@ class _Drawer:
         return {"aggregates.png": draw_aggregates(score_matrices(common, "stratum"), title=title, x_label=label)}
 
     def curves(self) -> dict[str, Figure]:
-        """Return the learning curves of each setting that was trained at, against game steps and processor time."""
+        """Return the learning curves of each training setting, against game steps and processor time."""
         figures: dict[str, Figure] = {}
         if self._curves.empty:
             return figures
@@ -179,5 +179,5 @@ class _Drawer:
 
 
 def _together(*tables: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of all tables that have any: pandas warns of others."""
+    """Concatenate non-empty tables; pandas warns about empty ones."""
     return pd.concat([table for table in tables if not table.empty], ignore_index=True)

@@ -1,5 +1,5 @@
 """
-The folder of results. A finished cell is one folder, which appears at once and complete.
+Folder of results. A finished cell is one folder, which is created atomically.
 
     settings.json                    what is the same for every cell
     cells/TeamTogether-c2-h1/saf/seed-0/
@@ -35,7 +35,7 @@ from sb3_saf.experiments.grid import Cell, RunConfig, Selection
 
 Types = Mapping[str, type | tuple[type, ...]]
 
-#: What must be in files for them to be ours.
+#: Required entries of files with their types.
 _SETTINGS: Final[Types] = {"size": str, "overrides": dict, "episodes": int, "deterministic": bool}
 _STATUS: Final[Types] = {"wall_seconds": float, "processor_seconds": float}
 _SELECTION: Final[Types] = {"seeds": list, "methods": list, "envs": list, "levels": list}
@@ -47,18 +47,18 @@ _TEST: Final[Types] = {
 
 class Results:
     """
-    A folder of results. A file in it that is damaged counts as not there, and is noted.
+    Folder of results. Damaged files count as missing, and are recorded in :attr:`damaged`.
 
-    :param folder: made when something is written
+    :param folder: created at the first write
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        #: What is wrong with damaged files, by file.
+        #: Errors of damaged files, by file.
         self.damaged: dict[Path, str] = {}
 
     def _read(self, path: Path, types: Types) -> dict[str, Any] | None:
-        """Return what a file holds; None if it is not there or not ours."""
+        """Return the content of a file; None if it is missing or invalid."""
         try:
             content = read_json(path)
             wrong = [name for name, kind in types.items() if content and not isinstance(content.get(name), kind)]
@@ -72,12 +72,12 @@ class Results:
     # Settings
 
     def config(self) -> RunConfig | None:
-        """Return what the folder's cells have in common; None for a folder without results."""
+        """Return the configuration of the folder's cells; None for a folder without results."""
         stored = self._read(self.folder / "settings.json", _SETTINGS)
         return None if stored is None else RunConfig(**{name: stored[name] for name in _SETTINGS})
 
     def agree(self, config: RunConfig, cells: Iterable[Cell] = ()) -> None:
-        """Check that the folder and its finished cells have these settings; a ValueError says what differs."""
+        """Check that the folder and its finished cells have these settings; the ValueError contains the differences."""
         stored = self.config()
         if stored is not None and plain(asdict(stored)) != plain(asdict(config)):
             changed = differences(asdict(stored), plain(asdict(config)))
@@ -93,7 +93,7 @@ class Results:
                 )
 
     def save_config(self, config: RunConfig) -> None:
-        """Write down what the folder's cells have in common, unless it is there."""
+        """Write the configuration of the folder's cells, unless it exists."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.config() is None:
             write_json(self.folder / "settings.json", plain(asdict(config)))
@@ -101,27 +101,27 @@ class Results:
     # Finished cells
 
     def cell_folder(self, cell: Cell) -> Path:
-        """Return where a cell is, or will be."""
+        """Return the folder of a cell, which may not exist yet."""
         return self.folder / "cells" / cell.id
 
     def status(self, cell: Cell) -> dict[str, Any] | None:
-        """Return what a cell cost; None if it is not finished."""
+        """Return the cost of a cell; None if it is not finished."""
         return self._read(self.cell_folder(cell) / "status.json", _STATUS)
 
     def cell_config(self, cell: Cell) -> dict[str, Any]:
-        """Return what a cell was trained with; empty before."""
+        """Return the settings of a trained cell; empty before training."""
         return self._read(self.cell_folder(cell) / "config.json", {"algo": str}) or {}
 
     def versions(self, cell: Cell) -> dict[str, str]:
-        """Return what a cell ran on; empty before."""
+        """Return the software and hardware of a trained cell; empty before training."""
         return self._read(self.cell_folder(cell) / "versions.json", {"python": str}) or {}
 
     def is_finished(self, cell: Cell) -> bool:
-        """Whether a cell is trained."""
+        """Return whether a cell is trained."""
         return self.status(cell) is not None and bool(self.cell_config(cell))
 
     def test(self, cell: Cell, level: Level) -> dict[str, Any] | None:
-        """Return what a test has found; None before it."""
+        """Return the result of a test; None before it."""
         path = self.cell_folder(cell) / "tests" / f"{level.slug}.json"
         found = self._read(path, _TEST) if self.is_finished(cell) else None
         if found is not None and not (found["returns"] and all(isinstance(value, float) for value in found["returns"])):
@@ -130,22 +130,22 @@ class Results:
         return found
 
     def missing_tests(self, cell: Cell) -> tuple[Level, ...]:
-        """Return the levels that a cell has not been tested at; all of them if it is not trained."""
+        """Return the levels at which a cell has not been tested; all of them if it is not trained."""
         return tuple(level for level in cell.tests if self.test(cell, level) is None)
 
-    # Cells that are at work
+    # Running cells
 
     def unfinished(self, cell: Cell) -> Path:
-        """Return where a cell is trained and tested, and where its checkpoints stay if it is killed."""
+        """Return the working folder of a cell, which keeps its checkpoints if it is killed."""
         return self.folder / "unfinished" / cell.id
 
     def failure(self, cell: Cell) -> Path | None:
-        """Return the file that says why a cell has failed; None if it has not."""
+        """Return the file with the error of a failed cell; None if it has not failed."""
         path = self.unfinished(cell) / "error.txt"
         return path if path.exists() else None
 
     def lock(self, cell: Cell) -> filelock.BaseFileLock | None:
-        """Keep other runs away from a cell; None if another one is at it. The system releases it when we end."""
+        """Lock a cell against other runs; None if another run has the lock. It is released at the process's end."""
         folder = self.folder / ".locks"
         folder.mkdir(parents=True, exist_ok=True)
         lock = filelock.FileLock(folder / f"{cell.id.replace('/', '_')}.lock")
@@ -156,7 +156,7 @@ class Results:
         return lock
 
     def publish(self, cell: Cell) -> None:
-        """Move what an attempt has left into the cell's folder: a new folder, or further tests of a finished one."""
+        """Move the result of an attempt to the cell's folder: a new folder, or further tests of a finished one."""
         result, target = self.unfinished(cell) / "result", self.cell_folder(cell)
         if self.is_finished(cell):
             (target / "tests").mkdir(exist_ok=True)
@@ -164,23 +164,23 @@ class Results:
                 os.replace(path, target / "tests" / path.name)
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
-            if target.exists():  # damaged; cut off between these two lines, the cell is run again
+            if target.exists():  # damaged; if interrupted between these two lines, the cell is run again
                 shutil.rmtree(target)
             os.replace(result, target)
         self.forget(cell)
 
     def forget(self, cell: Cell) -> None:
-        """Remove what an unfinished cell has left."""
+        """Remove the working folder of an unfinished cell."""
         folder = self.unfinished(cell)
         shutil.rmtree(folder, ignore_errors=True)
         for parent in folder.parents[: len(Path(cell.id).parts)]:
-            with suppress(OSError):  # others are at work beside it
+            with suppress(OSError):  # not empty: other cells are running
                 parent.rmdir()
 
-    # What was asked for
+    # Requested selections
 
     def add_selection(self, experiment: Experiment, selection: Selection) -> None:
-        """Remember what was asked for."""
+        """Store a requested selection."""
         folder = self.folder / experiment.name / "selections"
         folder.mkdir(parents=True, exist_ok=True)
         if experiment.name not in EXPERIMENTS:
@@ -190,13 +190,13 @@ class Results:
         write_json(folder / f"{name}.json", content)
 
     def selections(self, experiment: str) -> list[Selection]:
-        """Return everything that was asked for."""
+        """Return all requested selections."""
         paths = sorted((self.folder / experiment / "selections").glob("*.json"))
         stored = [found for path in paths if (found := self._read(path, _SELECTION)) is not None]
         return sorted((Selection(**{name: tuple(entry[name]) for name in _SELECTION}) for entry in stored), key=astuple)
 
     def check_experiment(self, experiment: Experiment) -> None:
-        """Check that no other experiment has the same name here; a ValueError says what differs."""
+        """Check that no other experiment has the same name here; the ValueError contains the differences."""
         stored = self._read(self.folder / experiment.name / "experiment.json", {"envs": list, "vary": dict})
         if stored is not None and stored != _own(experiment):
             raise ValueError(
@@ -205,7 +205,7 @@ class Results:
             )
 
     def experiment(self, name: str) -> Experiment:
-        """Return an experiment of the paper, or one's own in this folder; a ValueError says the nearest name."""
+        """Return an experiment of the paper, or a user's one in this folder; ValueError names the nearest one."""
         if name in EXPERIMENTS:
             return EXPERIMENTS[name]
         path = self.folder / name / "experiment.json"
@@ -216,7 +216,7 @@ class Results:
 
 
 def _own(experiment: Experiment) -> dict[str, Any]:
-    """Return what makes an experiment of one's own, as plain data."""
+    """Return a user's experiment as plain data."""
     vary = {view.parameter: [view.position(level) for level in view.levels] for view in experiment.views}
     vary.pop("", None)
     content: dict[str, Any] = plain({"envs": experiment.envs, "vary": vary})

@@ -1,4 +1,4 @@
-"""Run what is missing of an experiment, on an engine, and keep the table up to date."""
+"""Run the missing cells of an experiment on an engine, and update the table."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from sb3_saf.experiments.tables import write_table
 @dataclass(frozen=True)
 class CellOptions:
     """
-    How cells are run, which changes nothing in their results but the last digits.
+    Options for running cells, which affect only the last digits of results.
 
-    :param device: as SB3 takes it
-    :param threads: of torch in each worker
+    :param device: as in SB3
+    :param threads: threads of torch in each worker
     :param retries: further attempts for a cell that failed or whose process died
     :param tensorboard: whether cells keep TensorBoard logs
-    :param resume: whether cells that were killed go on from their last checkpoint
+    :param resume: whether killed cells continue from their last checkpoint
     """
 
     device: str = "auto"
@@ -46,7 +46,7 @@ class CellOptions:
 
 
 class Summary(NamedTuple):
-    """How a run ended: cells that it finished, that failed for good, and that another run is at."""
+    """Result of a run: finished cells, cells that failed finally, and cells of other runs."""
 
     finished: int
     failed: list[Cell]
@@ -54,7 +54,7 @@ class Summary(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A cell that is at work, the attempt's number from 1, and the lock that keeps other runs away from it."""
+    """A running cell, the attempt's number from 1, and the lock against other runs."""
 
     cell: Cell
     number: int
@@ -71,10 +71,10 @@ def run(
     shard: Shard = Shard(),  # noqa: B008 (immutable)
 ) -> Summary:
     """
-    Run the cells that are not finished. Several runs may share a folder: each cell is run by one of them.
+    Run the unfinished cells. Several runs may share a folder: each cell is run by one of them.
 
     :param engine: closed at the end
-    :raises ValueError: if something is wrong before the first cell starts
+    :raises ValueError: for invalid arguments, before the first cell starts
     """
     grid = expand(experiment, selection, config)
     results.check_experiment(experiment)
@@ -93,7 +93,7 @@ def run(
         f"{results.folder}"
     )
     progress = _Progress(todo, config, results, engine, options or CellOptions())
-    # On a terminal a bar with the time that is left; in a log file a line per cell.
+    # On a terminal a bar with the remaining time; in a log file a line per cell.
     with tqdm(total=len(todo), unit="cell", disable=None, dynamic_ncols=True) as bar, progress, engine:
         for line in progress.lines():
             bar.update(progress.n_ended - bar.n)
@@ -106,7 +106,7 @@ def run(
 
 
 class _Progress:
-    """The cells of one run: waiting, at work, ended."""
+    """Cells of one run: waiting, running, ended."""
 
     def __init__(
         self, todo: Sequence[Cell], config: RunConfig, results: Results, engine: Engine, options: CellOptions
@@ -124,17 +124,17 @@ class _Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let other runs at the cells."""
+        """Release the locks of the cells."""
         for attempt in self._at_work.values():
             attempt.lock.release()
 
     @property
     def n_ended(self) -> int:
-        """Cells that will not be run again here."""
+        """Number of cells that this run will not run again."""
         return len(self._finished) + len(self._failed) + len(self._elsewhere)
 
     def summary(self) -> Summary:
-        """Return how the run has ended."""
+        """Return the result of the run."""
         return Summary(len(self._finished), self._failed, self._elsewhere)
 
     def lines(self) -> Iterator[str]:
@@ -155,7 +155,7 @@ class _Progress:
             cell, number = self._waiting.popleft()
             lock = self._results.lock(cell)
             tests = () if lock is None else self._results.missing_tests(cell)
-            if lock is None or not tests:  # another run is at it, or has finished it
+            if lock is None or not tests:  # another run has locked or finished it
                 self._elsewhere.append(cell)
                 if lock is not None:
                     lock.release()
@@ -163,7 +163,7 @@ class _Progress:
             self._at_work[self._start(replace(cell, tests=tests))] = Attempt(cell, number, lock)
 
     def _start(self, cell: Cell) -> Future[None]:
-        """Put everything into the cell's folder that a worker needs, and hand it over."""
+        """Write the worker's input to the cell's folder, and submit it."""
         results, options, folder = self._results, self._options, self._results.unfinished(cell)
         description = self._config.describe(cell)
         with suppress(ValueError):
@@ -180,7 +180,7 @@ class _Progress:
         return self._engine.submit(folder)
 
     def _end(self, attempt: Attempt, error: BaseException | None) -> str:
-        """Keep the result or the error of an attempt; return a line about it."""
+        """Store the result or the error of an attempt; return a line about it."""
         cell = attempt.cell
         if error is None:
             self._results.publish(cell)
@@ -201,7 +201,7 @@ class _Progress:
         return f"[{self.n_ended}/{self._n_cells}]"
 
     def _rate(self) -> str:
-        """Return how fast this run is, and how long it will take at that rate."""
+        """Return the rate of this run, and the remaining time at that rate."""
         ended = {cell.id for cell in (*self._finished, *self._failed, *self._elsewhere)}
         played = sum(self._game_steps.get(cell.id, 0) for cell in self._finished)
         left = sum(steps for cell_id, steps in self._game_steps.items() if cell_id not in ended)

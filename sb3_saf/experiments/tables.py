@@ -1,7 +1,7 @@
 """
-Results as tidy pandas tables, for reports and for figures of one's own.
+Results as tidy pandas tables, for reports and custom figures.
 
-Tables of tests have one row per cell and test level, made anew from the cells whenever they are needed:
+Tables of tests have one row per cell and test level, and are always computed from the cells:
 
 ``method``, ``task``                 name of the algorithm, or ``"random"``; the environment
 ``train_level``, ``level``           where it was trained and tested, such as ``"c2-h1"``
@@ -35,13 +35,13 @@ from sb3_saf.experiments.grid import Cell, Grid, expand, merge
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.statistics import Estimate, mean_over_seeds
 
-#: Two seeds may agree by chance, and an interval then has no width.
+#: Minimum seeds for a comparison: two may agree by chance, and the interval then has no width.
 FEWEST_SEEDS: Final = 3
 
 
 class Frames(NamedTuple):
     """
-    What is there of an experiment.
+    Results of an experiment.
 
     :param tests: see the module
     :param curves: one row for each point of a learning curve, columns ``method``, ``task``, ``level``, the level's
@@ -57,9 +57,9 @@ def read_results(folder: str | Path, name: str) -> Frames:
     """
     Return the results of an experiment, complete or not.
 
-    :param folder: of the results, as given to ``python -m sb3_saf.experiments run NAME -f FOLDER``
-    :param name: of the experiment
-    :raises ValueError: for an unknown name, or if nothing of it is finished
+    :param folder: folder of results, as in ``python -m sb3_saf.experiments run NAME -f FOLDER``
+    :param name: name of the experiment
+    :raises ValueError: for an unknown name, or if no cell is finished
     """
     results = Results(Path(folder))
     experiment = results.experiment(name)
@@ -74,7 +74,7 @@ def read_results(folder: str | Path, name: str) -> Frames:
 
 
 def requested(experiment: Experiment, results: Results) -> Grid:
-    """Return all cells that were ever asked for in a folder with settings, random teams last."""
+    """Return all cells ever requested in a folder with settings, random teams last."""
     config = results.config()
     assert config is not None
     grids = [expand(experiment, selection, config) for selection in results.selections(experiment.name)]
@@ -84,7 +84,7 @@ def requested(experiment: Experiment, results: Results) -> Grid:
 
 
 def frame_of_tests(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
-    """Return what is finished of some cells, in their order, then their tests'."""
+    """Return the finished tests of some cells, in the order of cells, then of tests."""
     table = pd.DataFrame([row for cell in cells for row in _rows(results, cell)])
     if not table.empty:
         table["score"] = _scores(table)
@@ -118,7 +118,7 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
 
 
 def _scores(table: pd.DataFrame) -> pd.Series:
-    """Return the share of the largest return, or of the range of returns on the same task and level."""
+    """Return the fraction of the largest return, or of the range of returns on the same task and level."""
     here = table.groupby(["task", "level"])["return_mean"]
     low, high = here.transform("min"), here.transform("max")
     of_range = ((table["return_mean"] - low) / (high - low).where(high > low, 1.0)).astype(float)
@@ -127,7 +127,7 @@ def _scores(table: pd.DataFrame) -> pd.Series:
 
 
 def write_table(experiment: Experiment, results: Results) -> None:
-    """Write ``table.csv`` from all that was ever asked for and is finished; floats come back as they were."""
+    """Write ``table.csv`` of all requested and finished cells; floats are stored exactly."""
     table = frame_of_tests(results, requested(experiment, results).cells)
     write_text(results.folder / experiment.name / "table.csv", table.to_csv(index=False, lineterminator="\n"))
 
@@ -152,11 +152,10 @@ def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
 
 def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
     """
-    Return the rows that a view shows, with their place on the axis in a column of the axis's name.
+    Return the rows of a view, with their position on the axis in a column with the axis's name. The random team belongs
+    to every view, since it does not depend on training levels.
 
-    The random team belongs to every view: it is the same whatever others were trained at.
-
-    :param table: of tests
+    :param table: table of tests
     """
     positions = {level.slug: view.position(level) for level in view.levels}
     trained_at = table["level"] if view.train is None else view.train.slug
@@ -166,9 +165,9 @@ def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
 
 def strata(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
     """
-    Return the rows of all views, each once, with a column ``stratum``: what aggregates count as one task.
+    Return the rows of all views, each once, with a column ``stratum``, the task of aggregates.
 
-    :param table: of tests
+    :param table: table of tests
     """
     parts = []
     for view in experiment.views:
@@ -179,10 +178,10 @@ def strata(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
 
 def complete(rows: pd.DataFrame) -> pd.DataFrame:
     """
-    Return the strata and seeds that every method has, so that aggregates compare like with like.
+    Return the strata and seeds that every method has, so that aggregates are comparable.
 
     :param rows: columns ``method``, ``seed``, ``stratum``, one row for each
-    :return: some of the rows; none if the methods have nothing in common
+    :return: subset of the rows; empty if the methods have none in common
     """
     n_methods = rows["method"].nunique()
     rows = rows[rows.groupby("stratum")["method"].transform("nunique") == n_methods]
@@ -192,12 +191,12 @@ def complete(rows: pd.DataFrame) -> pd.DataFrame:
 
 class Comparison(NamedTuple):
     """
-    Two methods on the same seeds and the same test games.
+    Comparison of two methods on the same seeds and the same test games.
 
-    :param seeds: that both have
+    :param seeds: common seeds
     :param first: mean return of the first, with its 95 % interval over these seeds
-    :param second: of the second
-    :param difference: mean of first - second, seed by seed
+    :param second: the same for the second
+    :param difference: mean of first - second, paired by seed
     """
 
     seeds: list[int]
@@ -207,7 +206,7 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Return whether the first is higher or lower, or why nothing can be said."""
+        """Return whether the first is higher or lower, or why there is no verdict."""
         if len(self.seeds) < FEWEST_SEEDS:
             return f"no winner: fewer than {FEWEST_SEEDS} seeds"
         if self.first.low > self.second.high and self.difference.low > 0:
@@ -218,7 +217,7 @@ class Comparison(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """The first method of a view beside another one, at a level of a task."""
+    """Comparison of a view's first method with another one, at a level of a task."""
 
     task: str
     level: Level
@@ -228,7 +227,7 @@ class Compared(NamedTuple):
 
 
 def comparisons(table: pd.DataFrame, view: View) -> list[Compared]:
-    """Compare SAF, or the first method where it is not there, with each other one, where they have common seeds."""
+    """Compare SAF, or the first method if SAF is missing, with each other one, if they have common seeds."""
     rows, levels = of_view(table, view), {level.slug: level for level in view.levels}
     methods = list(dict.fromkeys(rows["method"]))
     ours = "saf" if "saf" in methods else next(iter(methods), RANDOM)

@@ -1,4 +1,4 @@
-"""The algorithms by the names of the command line, the log folders and the YAML files."""
+"""Algorithms by their names on the command line, in log folders and YAML files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS, DECLARATIONS
 from sb3_saf.training.names import unknown_name
 
-#: What the files of the algorithms declare.
+#: All declared algorithms.
 ALGOS: Final[dict[str, AlgorithmSpec]] = COMMANDS
 
 
@@ -18,7 +18,7 @@ def find_algorithm(algo: str, trained_by: str | None = None) -> AlgorithmSpec:
     Return an algorithm.
 
     :param algo: name in ``ALGOS``
-    :param trained_by: name of a class that trains the policy in the place of the method's own: ``"MaskablePPO"``
+    :param trained_by: name of a class that trains the policy instead of the method's own, such as ``"MaskablePPO"``
     :raises ValueError: for an unknown name, with the nearest one
     """
     if algo not in ALGOS:

@@ -1,4 +1,4 @@
-"""Callbacks of a run: all count game steps, and none touches the generators of training."""
+"""Callbacks of a run: all count game steps and leave the random generators of training unchanged."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.randomness import own_randomness
 from sb3_saf.training.seeds import evaluation_seed
 
-#: The rate of training is measured from the end of the first rollout on, for at least so many seconds.
+#: Minimum seconds over which the rate of training is measured, from the end of the first rollout.
 _MEASURED_SECONDS: Final = 20.0
 _MEASURED_ROLLOUTS: Final = 2
 
 
 class SeededEvalCallback(TeamEvalCallback):
-    """Evaluate, the final policy, too, with a seed of its own: training stays as it would be without."""
+    """Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy."""
 
     def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -44,7 +44,7 @@ class SeededEvalCallback(TeamEvalCallback):
         return {"n_evaluations": self._n_evaluations, "evaluated_at": self._evaluated_at}
 
     def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
-        """Go on from there."""
+        """Restore the counters."""
         self._n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
 
     def _on_training_end(self) -> None:
@@ -53,7 +53,7 @@ class SeededEvalCallback(TeamEvalCallback):
 
 
 class GameStepsProgressBar(ProgressBarCallback):
-    """SB3's progress bar, which counts the steps of every agent, in game steps."""
+    """SB3's progress bar in game steps instead of agent steps."""
 
     def _on_training_start(self) -> None:
         n_agents = require_n_agents(self.training_env)
@@ -70,13 +70,13 @@ class GameStepsProgressBar(ProgressBarCallback):
         self.close()
 
     def close(self) -> None:
-        """Leave the bar as it is; also if training never began, or ended by an error."""
+        """Close the bar, also if training never began, or ended by an error."""
         if hasattr(self, "pbar"):
             self.pbar.close()
 
 
 class RemainingTime(BaseCallback):
-    """Print, once, how long the rest of the training will take, as soon as the first rollouts tell."""
+    """Print once the estimated remaining time, measured on the first rollouts."""
 
     def __init__(self, verbose: int = 1) -> None:
         super().__init__(verbose)

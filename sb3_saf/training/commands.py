@@ -1,4 +1,4 @@
-"""What the commands share: options as ``key:value``, and errors of one line that say what to do."""
+"""Helpers of the commands: options as ``key:value``, and one-line errors with a fix."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Result = TypeVar("Result")
 
 
 class CommandError(Exception):
-    """Something that the user can put right; commands print it in one line and end."""
+    """Raised for an error that the user can fix; commands print it in one line and exit."""
 
 
 @contextmanager
 def user_errors(*kinds: type[Exception]) -> Iterator[None]:
-    """Turn errors that the user can put right (ValueError by default) into :class:`CommandError`: no traceback."""
+    """Convert errors that the user can fix (ValueError by default) to :class:`CommandError`, without traceback."""
     caught = kinds or (ValueError,)
     try:
         yield
@@ -37,15 +37,15 @@ def user_errors(*kinds: type[Exception]) -> Iterator[None]:
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, without the page of usage above it."""
+    """Parser with one-line errors, without the usage text."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the error and where help is, and exit."""
+        """Print the error and a hint to ``--help``, and exit."""
         self.exit(USAGE_ERROR, f"{self.prog}: error: {' '.join(message.split())} (--help lists the options)\n")
 
 
 class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Help that tells defaults where there are any to tell."""
+    """Help formatter that shows defaults if there are any."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         if action.default in (None, "", False) or action.default == {}:
@@ -54,7 +54,7 @@ class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
 
 
 class KeyValues(argparse.Action):
-    """``--option a:1 b:rgb`` as a dict. Values are YAML, never Python."""
+    """Action that parses ``--option a:1 b:rgb`` to a dict. Values are YAML, never Python."""
 
     def __call__(
         self,
@@ -79,12 +79,12 @@ class KeyValues(argparse.Action):
 def add_key_values(
     parser: argparse._ActionsContainer, *flags: str, help: str, metavar: str = "KEY:VALUE"
 ) -> None:  # argparse's own name
-    """Add an option that gives a dict, see :class:`KeyValues`."""
+    """Add an option with a dict as value, see :class:`KeyValues`."""
     parser.add_argument(*flags, nargs="+", action=KeyValues, default={}, metavar=metavar, help=help)
 
 
 def at_least(lowest: int, default: int | None = None) -> Callable[[str], int]:
-    """Return a type for argparse: whole numbers from ``lowest`` on, and ``default``, which stands for no number."""
+    """Return a type for argparse: integers of at least ``lowest``, or ``default``, which means no number."""
 
     def whole_number(text: str) -> int:
         value = int(text)
@@ -97,17 +97,17 @@ def at_least(lowest: int, default: int | None = None) -> Callable[[str], int]:
 
 
 def option_words(option: str, pairs: Mapping[str, Any]) -> list[str]:
-    """Return the words that give pairs of plain data to an option of :class:`KeyValues`; none if there are no pairs."""
+    """Return the command line words for an option of :class:`KeyValues`; none if there are no pairs."""
     return [option, *(f"{key}:{json.dumps(value)}" for key, value in pairs.items())] if pairs else []
 
 
 def run_command(program: str, command: Callable[[], Result]) -> Result:
-    """Run a command; errors for the user, and of files, are one line on stderr and exit code 2."""
+    """Run a command; print user errors and file errors in one line on stderr and exit with code 2."""
     try:
         result = command()
         sys.stdout.flush()
         return result
-    except BrokenPipeError:  # whoever read along has seen enough
+    except BrokenPipeError:  # the reader of the pipe has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except (CommandError, OSError) as error:
@@ -118,7 +118,7 @@ def run_command(program: str, command: Callable[[], Result]) -> Result:
 
 
 def require(*modules: str) -> None:
-    """Check that optional packages are installed; else a :class:`CommandError` has the command that installs them."""
+    """Check that optional packages are installed; otherwise raise a :class:`CommandError` with the install command."""
     for module in modules:
         try:
             importlib.import_module(module)
@@ -148,10 +148,10 @@ def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -
 
 def check_device(device: str) -> str:
     """
-    Return a device's name if the device is there; Stable-Baselines3 would silently train on the CPU.
+    Return a device's name if the device is available; Stable-Baselines3 would silently train on the CPU.
 
-    :param device: as SB3 takes it: ``"auto"``, ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ...
-    :raises ValueError: with what is there
+    :param device: as in SB3: ``"auto"``, ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ...
+    :raises ValueError: with the available devices
     """
     if device == "auto":
         return device

@@ -1,4 +1,4 @@
-"""``python -m sb3_saf.enjoy``: the team return of a trained team, and one of its games to watch."""
+"""``python -m sb3_saf.enjoy``: measure the return of a trained team, and show one of its games."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ PROGRAM: Final = "python -m sb3_saf.enjoy"
 
 @dataclass(frozen=True)
 class TrainedTeam:
-    """A policy, the settings of the games that it plays, and the file that its weights came from."""
+    """A policy, the settings of its games, and the file of its weights."""
 
     settings: Settings
     policy: BasePolicy
     path: Path
 
     def measure(self, n_episodes: int, seed: int, deterministic: bool) -> EvaluationResult:
-        """Measure team returns over games that no run was trained on, each episode in a game of its own."""
+        """Measure team returns over games not used in training, each episode in a separate game."""
         set_random_seed(seed)
         with closing(self.settings.make_env(seed, evaluation=True, n_envs=n_episodes)) as games:
             load_normalization(games, self.path.parent)
@@ -82,7 +82,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
         team = load_team(options)
     from sb3_saf.training import watching
 
-    # The screen is opened before the measurement, which nobody should wait for in vain.
+    # The screen is opened before the measurement, so that display errors occur immediately.
     with user_errors(ValueError, RuntimeError, ImportError), watching.open_screen(team, options) as screen:
         result = team.measure(options.episodes, options.seed, options.deterministic)
         print(f"{options.algo} on {options.env}, weights of {team.path}")
@@ -92,7 +92,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
 
 
 def load_team(options: argparse.Namespace) -> TrainedTeam:
-    """Find a run, and make its policy. Weights are read as numbers: no code of a model's file is run."""
+    """Find a run, and make its policy. Weights are read as numbers: no code of the model's file is run."""
     find_algorithm(options.algo)
     environment = find_environment(options.env)
     which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
@@ -110,7 +110,7 @@ def load_team(options: argparse.Namespace) -> TrainedTeam:
 
 
 def make_policy(settings: Settings, path: Path) -> BasePolicy:
-    """Make the policy of the settings with the weights of a model's file, which are read as numbers."""
+    """Make the policy of the settings with the weights of a model's file, read as numbers only."""
     with closing(settings.make_env(0, n_envs=1)) as games:
         kwargs = settings.hyperparams.get("policy_kwargs", {})
         policy = settings.spec.policy_class(

@@ -1,4 +1,4 @@
-"""From the name of an environment to its games: HECOGrid tasks, suites, modules, functions, PettingZoo's registry."""
+"""Environments by name: HECOGrid tasks, suites, modules, functions, PettingZoo's registry."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sb3_saf.envs.vec_game import VecGame
 from sb3_saf.suites.registry import SuiteTask, find_task
 from sb3_saf.training.names import unknown_name
 
-#: HECOGrid's environments, as RL-Zoo3 and Gymnasium write names.
+#: HECOGrid's environments by names in the style of RL-Zoo3 and Gymnasium.
 TASK_OF_ENV: Final[dict[str, TaskName]] = {f"{task}-v0": task for task in TASK_NAMES}
 ENV_IDS: Final = tuple(TASK_OF_ENV)
 #: Entries of YAML files for all environments of a kind.
 HECOGRID: Final = "hecogrid"
-#: Here tile codes are the default: the same views as the paper's pictures in 49 bytes.
+#: Tile codes are the default: the same views as the paper's pictures in 49 bytes.
 _HECOGRID_DEFAULTS: Final = {"observation": "tiles"}
 HOW_TO_NAME: Final = (
     f"{', '.join(ENV_IDS)}, a task of a suite (lbf/Foraging-8x8-2p-3f-v3; python -m sb3_saf.suites lists them), a "
@@ -36,7 +36,7 @@ HOW_TO_NAME: Final = (
 @dataclass(frozen=True)
 class TeamEnvironment:
     """
-    An environment by name.
+    Named environment.
 
     :param id: its name
     :param make: makes a game from ``render_mode`` and parameters; None for HECOGrid
@@ -49,33 +49,33 @@ class TeamEnvironment:
 
     @property
     def task(self) -> TaskName | None:
-        """The HECOGrid task; None for other environments."""
+        """HECOGrid task; None for other environments."""
         return TASK_OF_ENV.get(self.id)
 
     @property
     def yaml_keys(self) -> tuple[str, ...]:
-        """Entries of YAML files that are for this environment, from general to specific."""
+        """Entries of YAML files for this environment, from general to specific."""
         if self.suite_task is not None:
             return ("default", self.suite_task.suite.name, self.id)
         return ("default", HECOGRID, self.id) if self.task else ("default", self.id)
 
     @property
     def training_params(self) -> tuple[str, ...]:
-        """Parameters of the games that only training is given."""
+        """Parameters of the games for training only."""
         return () if self.suite_task is None else self.suite_task.suite.training_params
 
     @property
     def folder_name(self) -> str:
-        """The id as a part of file names."""
+        """Name of the environment in file names."""
         return folder_name(self.id)
 
     @property
     def picture_mode(self) -> str | None:
-        """The render mode of pictures; None where games of other people may not have it."""
+        """Render mode of pictures; None if the game may not support it."""
         return "rgb_array" if self.task else None
 
     def complete(self, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """Check parameters of the game and add the defaults, where they are known."""
+        """Check parameters of the game and add the defaults, if known."""
         if self.task is None:
             return dict(env_kwargs)
         params = HECOGridParams.from_kwargs({**_HECOGRID_DEFAULTS, **env_kwargs})
@@ -94,7 +94,7 @@ class TeamEnvironment:
         return len(agents)
 
     def make_game(self, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> Any:
-        """Make one game of agents with equal spaces; a ValueError if it refuses its parameters or is no ParallelEnv."""
+        """Make one game of agents with equal spaces; ValueError for invalid parameters or if it is no ParallelEnv."""
         kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
         if self.make is None:
             assert self.task is not None
@@ -109,12 +109,12 @@ class TeamEnvironment:
 
 
 def folder_name(env_id: str) -> str:
-    """Return the name of an environment as a part of file names."""
+    """Return the name of an environment in file names."""
     return env_id.removeprefix(f"{HECOGRID}/").replace("/", "-").replace(":", "-")
 
 
 def find_environment(env_id: str) -> TeamEnvironment:
-    """Look up an environment by a name as in ``HOW_TO_NAME``. Modules that it names are imported."""
+    """Look up an environment by a name as in ``HOW_TO_NAME``. Modules in the name are imported."""
     name = env_id.removeprefix(f"{HECOGRID}/") if isinstance(env_id, str) else str(env_id)
     if name in TASK_OF_ENV:
         return TeamEnvironment(name)
@@ -130,7 +130,7 @@ def find_environment(env_id: str) -> TeamEnvironment:
 
 
 def _maker(one: SuiteTask) -> Callable[..., Any]:
-    """Return what makes one game of a suite's task."""
+    """Return a function that makes one game of a suite's task."""
     if one.suite.vec_env is None:
         assert one.suite.game is not None
         return partial(one.suite.game, one.task)
@@ -149,7 +149,7 @@ def _is_module(name: str) -> bool:
 
 
 def import_by_name(module: str, name: str, what: str) -> Any:
-    """Import something callable from a module; ``what`` says in errors who asks."""
+    """Import a callable from a module; ``what`` describes it in errors."""
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, TypeError, ValueError) as error:

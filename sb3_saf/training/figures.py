@@ -1,8 +1,8 @@
 """
 Figures of results, from tidy tables: learning curves, bars against a level, aggregates.
 
-Every function returns a matplotlib ``Figure`` and reads no files. Intervals are 95 % everywhere; where a single run
-says nothing about its spread, none is drawn.
+Every function returns a matplotlib ``Figure`` and reads no files. All intervals are 95 %; none is drawn for a single
+run.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sb3_saf.training.statistics import (
     require_columns,
 )
 
-#: Colours that colour-blind readers can tell apart (Okabe and Ito, and three darker ones).
+#: Colours distinguishable by colour-blind readers (Okabe and Ito, and three darker ones).
 _COLOURS: Final = {
     "saf": "#0072B2",
     "mappo": "#E69F00",
@@ -42,7 +42,7 @@ _COLOURS: Final = {
     "vdn": "#332288",
     "random": "#666666",
 }
-#: Line and hatch of variants of a method, which have its colour: with memory, with weights of each agent's own.
+#: Line and hatch of variants of a method, which share its colour: with memory, with separate weights per agent.
 _VARIANTS: Final = {"-lstm": ("--", "//"), "-separate": ("-.", "xx")}
 #: Horizontal lines of reference teams.
 _REFERENCE: Final = "#222222"
@@ -51,13 +51,13 @@ _REFERENCE_LINES: Final = ("-.", ":", (0, (1, 3)), (0, (5, 5)))
 _PANEL_WIDTH: Final = 4.6
 _MOST_IN_A_ROW: Final = 4
 _DPI: Final = 130
-#: Of a legend: inches of a line, and of a letter, and of what stands beside the text.
+#: Legend sizes in inches: of a line, of a letter, and of the handle beside the text.
 _LINE, _LETTER, _HANDLE = 0.24, 0.085, 0.65
 TEAM_RETURN: Final = "team return (treasures)"
 
 
 class Style(NamedTuple):
-    """How a method looks, the same in every figure."""
+    """Style of a method, the same in every figure."""
 
     colour: str
     line: str = "-"
@@ -65,7 +65,7 @@ class Style(NamedTuple):
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, Style]:
-    """Return one style per method. Known methods always have theirs, variants the colour of what they vary."""
+    """Return one style per method: fixed for known methods, the method's colour for variants."""
     styles = {method: _style(method) for method in methods}
     taken = {_COLOURS["random"], *(style.colour for style in styles.values() if style is not None)}
     free = [colour for colour in _COLOURS.values() if colour not in taken] or list(_COLOURS.values())
@@ -108,7 +108,7 @@ def _figure(n_panels: int, height: float = 3.6) -> tuple[Figure, list[Axes]]:
 
 
 def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
-    """Add the title on top, and one legend for all panels below, so that it covers no data."""
+    """Add the title on top, and one legend for all panels below them."""
     entries: dict[str, Artist] = {}
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
@@ -126,7 +126,7 @@ def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
 
 
 def _start_at_zero(axes: Axes, values: Floats) -> None:
-    """Begin at 0 where no score is negative, whatever the interval of two seeds says."""
+    """Start the axis at 0 if no score is negative, even if an interval is."""
     if len(values) and values.min() >= 0:
         axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
 
@@ -142,7 +142,7 @@ def draw_curves(
     Draw learning curves: mean and 95 % interval (Student's t) over seeds.
 
     :param runs: columns ``method``, ``seed``, ``game_steps``, ``score``
-    :param panel: column whose values get a panel each, for instance ``"task"``
+    :param panel: column with one panel per value, for instance ``"task"``
     :param references: names and scores of horizontal lines, for instance of scripted teams
     """
     require_columns(runs, CURVE_COLUMNS)
@@ -180,7 +180,7 @@ def draw_levels(
     :param results: columns ``method``, ``seed``, ``score`` and the column named by ``level``; several rows of a run
         (episodes) are averaged
     :param level: for instance ``"coordination"``
-    :param panel: column whose values get a panel each, for instance ``"task"``
+    :param panel: column with one panel per value, for instance ``"task"``
     :param references: horizontal lines over the bars of a level, for instance of scripted teams: columns ``name``,
         ``score`` and those named by ``level`` and ``panel``
     """
@@ -231,11 +231,10 @@ def draw_differences(
     compared: pd.DataFrame, title: str | None = None, panel: str | None = None, x_label: str = "difference"
 ) -> Figure:
     """
-    Draw paired differences with their intervals, a group of lines for each level, which favour one where they do not
-    touch 0.
+    Draw paired differences with their intervals, one group of lines per level.
 
-    :param compared: columns ``method``, ``level``, ``value``, ``low``, ``high`` (NaN where one run cannot tell)
-    :param panel: column whose values get a panel each, for instance ``"task"``
+    :param compared: columns ``method``, ``level``, ``value``, ``low``, ``high`` (NaN for a single run)
+    :param panel: column with one panel per value, for instance ``"task"``
     """
     require_columns(compared, ("method", "level", "value", "low", "high"))
     panels, styles = _panels(compared, panel), method_styles(_methods_of(compared))
@@ -262,7 +261,7 @@ def draw_aggregates(
     """
     Draw interquartile means and performance profiles, both with stratified bootstrap intervals (rliable).
 
-    :param scores: (S, K) scores of each method on S seeds and K tasks, normalised, 0 to 1
+    :param scores: (S, K) scores of each method on S seeds and K tasks, normalised to 0 to 1
     """
     methods = _methods_of(pd.DataFrame({"method": list(scores)}))
     styles = method_styles(methods)
@@ -275,7 +274,7 @@ def draw_aggregates(
     left.set_yticks(range(len(methods)), methods)
     left.invert_yaxis()
     left.margins(x=0.1)
-    left.use_sticky_edges = False  # bars end inside the axes
+    left.use_sticky_edges = False  # bars end within the axes
     left.autoscale_view()
     left.set(xlabel=x_label, title="interquartile mean")
     top = max(float(runs.max()) for runs in scores.values())

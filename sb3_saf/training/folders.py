@@ -1,8 +1,8 @@
 """
-Log folders as RL-Zoo3 lays them out, so that its plotting commands read them.
+Log folders in RL-Zoo3's layout, so that its plotting commands can read them.
 
-A run is ``FOLDER/ALGO/NAME_NUMBER``, FOLDER what ``-f`` gives and NAME the environment's in file names, with the model
-``NAME.zip`` and, in ``NAME/``, what it was made with.
+A run is ``FOLDER/ALGO/NAME_NUMBER``, where FOLDER is the option ``-f`` and NAME the environment's name in file names,
+with the model ``NAME.zip`` and its settings in ``NAME/``.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from sb3_saf.training.run import CHECKPOINTS
 from sb3_saf.training.settings import Settings
 from sb3_saf.training.yaml_files import read_plain_file
 
-#: Options that, beside the settings, decide what a run leaves; ``config.yml`` does not have them.
+#: Options that affect a run's results but are not in ``config.yml``.
 _DECIDING: Final = ("eval_freq", "eval_episodes", "n_eval_envs", "eval_env_kwargs", "deterministic_eval", "save_freq")
-#: Whose versions can change a result.
+#: Packages whose versions can change a result.
 _PACKAGES: Final = (
     *("sb3-saf", "stable-baselines3", "sb3-contrib", "rl_zoo3", "optuna", "torch"),
     *("numpy", "numba", "gymnasium", "pettingzoo", "supersuit"),
@@ -37,7 +37,7 @@ _SAVED_MODEL: Final = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
 def run_number(folder: Path, name: str) -> int | None:
-    """Read the number of a run from its folder's name; None if it is no run of that environment."""
+    """Return the number of a run from its folder's name; None if it is no run of that environment."""
     found = re.fullmatch(rf"{re.escape(name)}_(\d+)(?:_{_UUID})?", folder.name)
     return int(found[1]) if found else None
 
@@ -50,7 +50,7 @@ def runs_of(log_folder: Path, algo: str, name: str) -> list[tuple[int, Path]]:
 
 
 def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = False) -> Path:
-    """Make the folder of a new run, which no other process has; ``unique`` adds a unique id to its name."""
+    """Create the folder of a new run atomically; ``unique`` adds a unique id to its name."""
     ending = f"_{uuid.uuid4()}" if unique else ""
     while True:
         number = max((number for number, _ in runs_of(log_folder, algo, name)), default=0) + 1
@@ -65,7 +65,7 @@ def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = Fa
 
 
 def write_run(folder: Path, settings: Settings, seed: int, options: Mapping[str, Any], command: str) -> None:
-    """Write what a run is made with: ``config.yml``, ``args.yml``, ``versions.yml``, ``command.txt``."""
+    """Write the description of a run: ``config.yml``, ``args.yml``, ``versions.yml``, ``command.txt``."""
     place = folder / settings.environment.folder_name
     place.mkdir(exist_ok=True)
     contents = {
@@ -79,7 +79,7 @@ def write_run(folder: Path, settings: Settings, seed: int, options: Mapping[str,
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of Python, the system, and every installed package that can change a result."""
+    """Return the versions of Python, the system, and installed packages that can change a result."""
     versions = {"python": platform.python_version(), "system": platform.platform()}
     for package in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -88,7 +88,7 @@ def software_versions() -> dict[str, str]:
 
 
 def read_run(folder: Path, name: str) -> dict[str, Any]:
-    """Read the settings of a run, ``config.yml``; a ValueError says that the folder is not that of a run."""
+    """Read the settings of a run, ``config.yml``; ValueError if the folder is not that of a run."""
     path = folder / name / "config.yml"
     if not path.is_file():
         raise ValueError(f"{folder} is no run of sb3_saf.train: there is no {path}")
@@ -102,10 +102,9 @@ def find_unfinished(
     settings: Settings, seed: int | None, options: Mapping[str, Any], log_folder: Path
 ) -> tuple[Path, int] | None:
     """
-    Find the latest run of the same settings and options that another process is not at work on and that has checkpoints
-    left, as finished ones have not.
+    Find the latest unfinished run (one with checkpoints) of the same settings and options that no other process uses.
 
-    :param seed: of the run; None for any
+    :param seed: seed of the run; None for any
     :return: its folder and seed; None if there is none
     """
     name, wanted = settings.environment.folder_name, _plain(settings.as_dict())
@@ -122,7 +121,7 @@ def find_unfinished(
 
 
 def _plain(content: object) -> Any:
-    """Return content as YAML gives it back: tuples are lists."""
+    """Convert content to what YAML gives back: tuples become lists."""
     if isinstance(content, Mapping):
         return {str(key): _plain(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
@@ -136,7 +135,7 @@ def _can_go_on(folder: Path) -> bool:
         return False
     try:
         store.acquire()
-    except CheckpointError:  # another process is at it
+    except CheckpointError:  # another process uses it
         return False
     store.release()
     return True
@@ -148,10 +147,10 @@ def find_model(
     """
     Find a trained model.
 
-    :param number: of the run; 0 for the latest
-    :param which: None for the model at the end, "best", "last" for the last saved one, or the game steps of a saved one
+    :param number: number of the run; 0 for the latest
+    :param which: None for the final model, "best", "last" for the last saved one, or the game steps of a saved one
     :return: the run's folder, and the model's file
-    :raises ValueError: if there is none, with what to do
+    :raises ValueError: if there is none, with a fix
     """
     name = environment.folder_name
     how = f"train first: python -m sb3_saf.train --algo {algo} --env {environment.id} -f {log_folder}"

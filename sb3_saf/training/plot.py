@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PROGRAM: Final = "python -m sb3_saf.plot"
-#: Columns of :func:`describe` that are no parameters of the game.
+#: Columns of :func:`describe` that are not parameters of the game.
 _NO_LEVELS: Final = ("env", "size", "seed", "run", "changes", "method")
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """One command for each kind of figure."""
+    """Make the parser, with one command for each kind of figure."""
     parser = OneLineParser(prog=PROGRAM, description="Draw the runs in a log folder.")
     commands = parser.add_subparsers(dest="kind", required=True, parser_class=OneLineParser)
     kinds = {
@@ -54,7 +54,7 @@ def plot(arguments: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         raise CommandError(f"figures need {error.name}: pip install '.[render,zoo]' in the clone") from None
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    with user_errors():  # of formats
+    with user_errors():  # for invalid file formats
         figure.savefig(options.output)
     print(options.output)
 

@@ -1,4 +1,4 @@
-"""Arguments with which PPO learns well on teams, for scripts."""
+"""PPO hyperparameters for teams, for use in scripts."""
 
 from __future__ import annotations
 
@@ -10,30 +10,29 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.teams import TeamSpaces, require_n_agents
 
-#: What holds for scripts, too, of the numbers of ``sb3_saf.train --algo saf --size small``.
+#: Settings of ``sb3_saf.train --algo saf --size small`` that also apply to scripts.
 _TAKEN: Final = (
     *("learning_rate", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
     "rollout_buffer_class",
 )
-#: Of HECOGrid's games only.
+#: The same for HECOGrid's games only.
 _TAKEN_OF_HECOGRID: Final = (*_TAKEN, "gamma")
 
 
 def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
     """
-    Return arguments with which PPO learns well on an environment of teams::
+    Return PPO hyperparameters for an environment of teams::
 
         model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env))
 
-    They are those of ``sb3_saf.train --size small``: whole teams in ``TeamRolloutBuffer``, as many game steps in a
-    rollout however few games there are, in a few minibatches. HECOGrid, whose observations are tile codes, has numbers
-    of its own: the light encoder, its discount, and a learning rate that falls to 0. Widths
-    are left as they are: those of ``small`` train faster (``policy_kwargs={"net_arch": [64, 64]}``, for SAF also
-    ``"projection_arch": [64], "latent_dim": 32``).
+    They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
+    same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
+    its discount, and a learning rate that decreases to 0. Layer sizes are not set: those of ``small`` train faster
+    (``policy_kwargs={"net_arch": [64, 64]}``, for SAF also ``"projection_arch": [64], "latent_dim": 32``).
 
     :param env: from ``make_team_env``, with any number of games
-    :param overrides: arguments of PPO that win; ``policy_kwargs`` are merged
-    :raises ValueError: if ``env`` is not made of teams
+    :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
+    :raises ValueError: if ``env`` has no teams
     """
     from sb3_saf.training.environments import HECOGRID
     from sb3_saf.training.values import algorithm_arguments, resolve

@@ -1,4 +1,4 @@
-"""``python -m sb3_saf.replay``: one page in the browser that plays episodes of trained teams."""
+"""``python -m sb3_saf.replay``: write a browser page that plays episodes of trained teams."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
 
 
 def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
-    """Return the settings of the run that a model belongs to, or those of the command line."""
+    """Return the settings of a model's run, or those of the command line."""
     if not path.exists():
         raise CommandError(f"--model {path} is not there")
     configs = sorted(path.parent.glob("*/config.yml")) if path.is_file() else []
@@ -87,7 +87,7 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return names that tell models apart: of files, with their folders and numbers where need be."""
+    """Return distinct names of models: file names, with folders and numbers if necessary."""
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         names = [f"{path.parent.name}/{path.stem}" for path in paths]

@@ -1,8 +1,7 @@
 """
-The one way from settings to a trained model: make the games, make the model, learn, save.
-
-Commands, tuning, experiments and scripts call :func:`train`. :class:`Training` is the same in two steps, for callers
-that tell errors of the preparation from errors of the training.
+Training from settings: make the games, make the model, learn, save. Commands, tuning, experiments and scripts call
+:func:`train`. :class:`Training` has the same function in two steps, for callers that distinguish errors of preparation
+from errors of training.
 """
 
 from __future__ import annotations
@@ -34,39 +33,38 @@ CHECKPOINTS: Final = "checkpoints"
 EVALUATIONS_PER_RUN: Final = 20
 INSPECTIONS_PER_RUN: Final = 10
 CHECKPOINTS_PER_RUN: Final = 10
-#: Team episodes of an inspection, each in a game of its own.
+#: Team episodes of an inspection, each in a separate game.
 INSPECTED_EPISODES: Final = 16
 
 
 @dataclass(frozen=True)
 class RunOptions:
     """
-    How a run is carried out. None of this changes what is learned, except ``device``, ``num_threads`` (by rounding)
-    and ``initial_model``.
+    Options of a run. They do not change the learned model, except ``device``, ``num_threads`` (by rounding) and
+    ``initial_model``.
 
-    Frequencies are in game steps, summed over all parallel games: 0 or less for never, None for the default number of
-    times per run.
+    Frequencies are intervals in game steps, summed over all parallel games: 0 or less for never, None for the default
+    number of times per run.
 
     :param eval_freq: game steps between evaluations (None: 20 per run), and one after the last step
-    :param eval_episodes: team episodes of an evaluation
-    :param n_eval_envs: parallel games of an evaluation
+    :param eval_episodes: team episodes per evaluation
+    :param n_eval_envs: parallel games for evaluation
     :param eval_settings: settings of the evaluation games; None for those of training
     :param deterministic_eval: whether evaluation takes the most likely actions; value-based algorithms always do
     :param save_freq: game steps between saved models
-    :param inspect_freq: game steps between inspections of the policy, which are only made with ``tensorboard_log``
-        (None: 10 per run)
+    :param inspect_freq: game steps between inspections of the policy, only with ``tensorboard_log`` (None: 10 per run)
     :param checkpoint_freq: game steps between checkpoints in ``FOLDER/checkpoints``, from which a run of the same
-        settings goes on (None: 10 per run); they are removed at the end of the run
-    :param tensorboard_log: folder of the run's TensorBoard logs, which are named by algorithm; None for none
+        settings continues (None: 10 per run); they are removed at the end of the run
+    :param tensorboard_log: folder of TensorBoard logs, named by algorithm; None for none
     :param model_name: the trained model is saved as ``FOLDER/MODEL_NAME.zip``
-    :param initial_model: a saved model whose weights and optimiser the run begins with; None for fresh ones
+    :param initial_model: a saved model with the initial weights and optimiser state; None for new ones
     :param log_interval: rollouts between log entries; None for SB3's default, 0 for no log
-    :param device: as SB3 takes it
-    :param n_cpus: processes that step the training games; HECOGrid's compiled games need one
-    :param num_threads: of torch; None for its own choice
+    :param device: as in SB3
+    :param n_cpus: processes for the training games; HECOGrid's compiled games need one
+    :param num_threads: threads of torch; None for its default
     :param progress: whether to draw a progress bar in game steps
-    :param verbose: 0 or 1, as SB3 takes it
-    :param resume_hint: what a message after Ctrl-C or SIGTERM tells to do
+    :param verbose: 0 or 1, as in SB3
+    :param resume_hint: advice in the message after Ctrl-C or SIGTERM
     """
 
     eval_freq: int | None = 0
@@ -97,12 +95,12 @@ def train(
     callbacks: Sequence[BaseCallback] = (),
 ) -> BaseAlgorithm:
     """
-    Train a model; if the folder has checkpoints of the same run, go on from the newest.
+    Train a model; continue from the newest checkpoint if the folder has checkpoints of the same run.
 
-    :param settings: everything that decides the result but the seed
-    :param seed: of the run
-    :param folder: for ``monitor.csv``, models, evaluations and checkpoints; None writes none of them
-    :param options: how the run is carried out
+    :param settings: everything that determines the result except the seed
+    :param seed: seed of the run
+    :param folder: folder for ``monitor.csv``, models, evaluations and checkpoints; None writes none of them
+    :param options: options of the run
     :param callbacks: further callbacks, called before those of the options
     :return: the trained model; its games are closed
     :raises ValueError: if the games or the model cannot be made
@@ -115,7 +113,7 @@ def train(
 
 class Training:
     """
-    Games, model and callbacks of one run, ready to learn; arguments as of :func:`train`.
+    Games, model and callbacks of one run, ready to learn; arguments as in :func:`train`.
 
     A context manager that closes the games.
     """
@@ -134,7 +132,7 @@ class Training:
         self.options = options or RunOptions()
         if self.options.num_threads is not None:
             th.set_num_threads(self.options.num_threads)
-        with ExitStack() as self._open:  # which closes what is open already if the rest cannot be made
+        with ExitStack() as self._open:  # closes the parts already made if a later one fails
             self.games = self._games(settings, monitor_dir=folder, n_cpus=self.options.n_cpus)
             self.model = self._make_model()
             self.callbacks = [*callbacks, *self._make_callbacks()]
@@ -153,7 +151,7 @@ class Training:
         self._open.close()
 
     def learn(self) -> BaseAlgorithm:
-        """Train, save, and return the model. If Ctrl-C or SIGTERM end the training, the model is saved as it is."""
+        """Train, save, and return the model. It is also saved if Ctrl-C or SIGTERM ends training."""
         try:
             self._learn()
         except (KeyboardInterrupt, SystemExit):
@@ -245,7 +243,7 @@ class Training:
         )
 
     def _inspection(self, every_game_steps: int) -> InspectionCallback:
-        """Draw the inside of the policy for TensorBoard, on games that no run trains on."""
+        """Make the callback that inspects the policy for TensorBoard, on games not used in training."""
         settings = self.settings
         games = self._games(
             settings, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode=settings.environment.picture_mode
@@ -272,7 +270,7 @@ class Training:
 
 
 def _level(settings: Settings) -> str:
-    """The parameters of the games in words; of HECOGrid's, those that make its levels."""
+    """Return the parameters of the games as text; for HECOGrid, those that define its levels."""
     of_levels = ("coordination", "heterogeneity")
     kept = {
         key: value
@@ -284,14 +282,14 @@ def _level(settings: Settings) -> str:
 
 def load_parameters(model: BaseAlgorithm, path: Path) -> None:
     """
-    Take weights and optimiser of a saved model, a ``.zip``. Only tensors are read: nothing of the file is run as code.
+    Load weights and optimiser state of a saved model, a ``.zip``. Only tensors are read: no code of the file is run.
 
-    :param model: made with the policy and the ``policy_kwargs`` of the saved one
+    :param model: model with the policy and the ``policy_kwargs`` of the saved one
     :raises ValueError: if the file does not fit
     """
     try:
         model.set_parameters(str(path), device=model.device)
-    except Exception as error:  # zipfile's, the unpickler's and torch's errors have no common class
+    except Exception as error:  # errors of zipfile, the unpickler and torch have no common class
         reason = " ".join(str(error).split())[:300]
         raise ValueError(
             f"the parameters in {path} do not fit {model.policy.__class__.__name__} with these settings; give the "

@@ -1,4 +1,4 @@
-"""Runs in a log folder, ``FOLDER/ALGO/ENV_NUMBER``: what they were, and their results as tidy tables."""
+"""Runs in a log folder, ``FOLDER/ALGO/ENV_NUMBER``: their settings, and their results as tidy tables."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from sb3_saf.training.folders import read_run, run_number
 from sb3_saf.training.names import unknown_name
 from sb3_saf.training.settings import Settings, load_settings, saved_settings
 
-#: Where scores come from: evaluation games, or the games that were trained on.
+#: Source of scores: evaluation games, or training games.
 Source = Literal["evaluation", "training"]
 
 #: Points of a curve of training episodes.
 _N_POINTS: Final = 50
-#: Changed settings that a method's name spells out.
+#: Maximum number of changed settings in a method's name.
 _MOST_NAMED: Final = 2
-#: The part of training whose episodes count as its result.
+#: Last fraction of training whose episodes are its result.
 _FINAL_PART: Final = 0.1
 
 
 @dataclass(frozen=True)
 class Run:
-    """A folder that ``sb3_saf.train`` has left: its path, the environment's name in folders, and its number."""
+    """A run folder of ``sb3_saf.train``: its path, the environment's name in folders, and its number."""
 
     folder: Path
     name: str
@@ -38,16 +38,16 @@ class Run:
 
     @cached_property
     def config(self) -> Mapping[str, Any]:
-        """``config.yml``."""
+        """Content of ``config.yml``."""
         return read_run(self.folder, self.name)
 
     @cached_property
     def settings(self) -> Settings:
-        """What was trained."""
+        """Settings of the run."""
         return saved_settings(self.config)
 
     def curve(self, source: Source) -> pd.DataFrame:
-        """Return the team return along training, columns ``game_steps``, ``score``."""
+        """Return the learning curve of team returns, columns ``game_steps``, ``score``."""
         return self._evaluations() if source == "evaluation" else self._training()
 
     def final_score(self, source: Source) -> float:
@@ -77,10 +77,10 @@ class Run:
 
 def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFrame:
     """
-    Return the learning curve of the games that were trained on: ``game_steps``, and ``score``, the mean team return.
+    Return the learning curve of the training games: ``game_steps``, and ``score``, the mean team return.
 
-    :param monitor: a ``monitor.csv``, or the ``monitor_dir`` that ``make_team_env`` was given
-    :param n_points: means of about as many episodes each
+    :param monitor: a ``monitor.csv``, or the ``monitor_dir`` of ``make_team_env``
+    :param n_points: number of means, over about equal numbers of episodes
     :raises ValueError: if no episode has ended
     """
     path = Path(monitor)
@@ -99,7 +99,7 @@ def training_curve(monitor: str | Path, n_points: int = _N_POINTS) -> pd.DataFra
 
 
 def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
-    """Find the runs in a log folder, of some algorithms and environments, or of all where none are given."""
+    """Find the runs in a log folder, of the given algorithms and environments, or of all if none are given."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; give the -f that sb3_saf.train was given")
     names = {folder_name(env_id) for env_id in env_ids}
@@ -122,11 +122,11 @@ def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str
 
 def describe(runs: Sequence[Run]) -> pd.DataFrame:
     """
-    Tell runs apart.
+    Describe runs in a table.
 
     :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game. A
-        method's name says in what it differs from the zoo's settings and from other runs, or, where that is much, has a
-        number, and ``changes`` says it. Of runs that are alike but for their number only the latest is there.
+        method's name contains its differences from the zoo's settings and from other runs, or a number if these are too
+        many; ``changes`` lists them. Of runs that differ only in their number, the table has the latest
     """
     rows = []
     for run in runs:
@@ -141,7 +141,7 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def _changes(runs: Sequence[Run]) -> list[str]:
-    """Return what differs from the zoo's settings, and not in all runs of the algorithm at that size alike."""
+    """Return differences from the zoo's settings that not all runs of the algorithm at that size share."""
     own = [_different_from_the_zoo(run.settings) for run in runs]
     kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
     texts = []
@@ -153,7 +153,7 @@ def _changes(runs: Sequence[Run]) -> list[str]:
 
 
 def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
-    """Return settings other than what the zoo has for the same game today, as text."""
+    """Return settings that differ from the zoo's present ones for the same game, as text."""
     zoo = load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)
     ours, theirs = _flat(settings), _flat(zoo)
     keys = [key for key in {**theirs, **ours} if repr(ours.get(key)) != repr(theirs.get(key))]
@@ -171,7 +171,7 @@ def _short(value: object) -> str:
 
 
 def _method_names(algos: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """Name the algorithm with its changes, or with a number where these are more than a legend has room for."""
+    """Name methods by the algorithm with its changes, or with a number if these are too many for a legend."""
     numbers: dict[str, dict[str, int]] = {}
     names = []
     for algo, text in zip(algos, changes, strict=True):

@@ -1,9 +1,9 @@
 """
-Settings of a run, by name: ``load_settings("saf", "TeamTogether-v0", "small")`` says everything that decides a result
-but the seed, and makes the games and the model.
+Settings of a run, by name: ``load_settings("saf", "TeamTogether-v0", "small")`` contains everything that determines a
+result except the seed, and makes the games and the model.
 
-They come from ``zoo_configs``: ``levels.yml`` has the games of each size, the algorithm's file its hyperparameters.
-Only what differs from the constructors is written there. E games, N agents.
+They come from ``zoo_configs``: ``levels.yml`` has the games of each size, the algorithm's file its hyperparameters. The
+files have only differences from the constructors' defaults. E games, N agents.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sb3_saf.training.values import algorithm_arguments, policy_arguments, resol
 from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows, wraps_games
 from sb3_saf.training.yaml_files import DEFAULT, MERGED, SIZES, Size, entry_of, merge, read_config, read_file
 
-#: Types of the keys that are ours, beside the arguments of the algorithm's constructor.
+#: Types of this package's keys, in addition to the arguments of the algorithm's constructor.
 _OWN_KEYS: Final[dict[str, Any]] = {
     "n_envs": int,
     "game_steps": int,
@@ -39,7 +39,7 @@ _OWN_KEYS: Final[dict[str, Any]] = {
     "policy_kwargs": dict[str, Any],
     **WRAPPER_KEYS,
 }
-#: What files and command lines call ``algorithm``: a class that trains the method's policy, in the place of its own.
+#: Key of the method; ``algorithm`` is a class that trains the method's policy instead of its own.
 _ALGO: Final = "algo"
 #: RL-Zoo3's name for game steps.
 _N_TIMESTEPS: Final = "n_timesteps"
@@ -49,19 +49,19 @@ _SAVED_KEYS: Final = ("algo", "env", "size", "n_envs", "game_steps", "time_limit
 @dataclass(frozen=True)
 class Settings:
     """
-    Everything that decides a run but its seed.
+    Everything that determines a run except its seed.
 
     :param algo: name in ``ALGOS``
     :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
     :param size: one of ``SIZES``
     :param n_agents: N
-    :param env_kwargs: parameters of the game; of HECOGrid all of them
+    :param env_kwargs: parameters of the game; all of them for HECOGrid
     :param time_limit: whether a time limit counts as an end (see ``CentralizedValueWrapper``)
-    :param n_envs: E, games that are trained on in parallel
-    :param game_steps: steps of the game to train for, summed over all games
+    :param n_envs: E, parallel training games
+    :param game_steps: game steps to train for, summed over all games
     :param hyperparams: arguments of the algorithm's constructor, as objects
     :param plain: the same as plain data, for files
-    :param wrapping: those of RL-Zoo3's keys ``WRAPPER_KEYS`` that are given
+    :param wrapping: values of the given keys of ``WRAPPER_KEYS``
     """
 
     algo: str
@@ -88,12 +88,12 @@ class Settings:
 
     @property
     def environment(self) -> TeamEnvironment:
-        """How games are made."""
+        """Environment that makes the games."""
         return find_environment(self.env_id)
 
     @property
     def total_timesteps(self) -> int:
-        """What ``learn`` takes: SB3 counts the steps of every agent."""
+        """Argument of ``learn``: agent steps, as SB3 counts."""
         return self.game_steps * self.n_agents
 
     def make_env(
@@ -110,11 +110,11 @@ class Settings:
         Make the games.
 
         :param seed: the run's seed
-        :param evaluation: games for evaluation, whose seeds no training game of any run has
+        :param evaluation: whether the games are for evaluation, with seeds that no training game of any run has
         :param monitor_dir: folder for a ``monitor.csv``; None for none
         :param n_envs: E; None for the settings'
-        :param n_cpus: processes among which games are divided; HECOGrid's compiled games need one
-        :param render_mode: how games can be drawn; None for not at all
+        :param n_cpus: number of processes for the games; HECOGrid's compiled games need one
+        :param render_mode: render mode of the games; None for no rendering
         """
         task, params = self.environment.task, dict(self.env_kwargs)
         if evaluation:
@@ -144,7 +144,7 @@ class Settings:
         """
         Make one game, a PettingZoo ParallelEnv with the wrappers of the settings.
 
-        :param render_mode: how the game can be drawn; None for not at all
+        :param render_mode: render mode of the game; None for no rendering
         :param changes: parameters that differ from ``env_kwargs``
         """
         return wrap_game(self.environment.make_game({**self.env_kwargs, **changes}, render_mode), self.wrapping)
@@ -159,11 +159,11 @@ class Settings:
         verbose: int = 0,
     ) -> BaseAlgorithm:
         """
-        Make the algorithm, ready for ``learn(settings.total_timesteps)``; further arguments as SB3 takes them.
+        Make the algorithm, ready for ``learn(settings.total_timesteps)``; further arguments as in SB3.
 
         :param env: from :meth:`make_env`
         :param seed: the run's seed
-        :raises ValueError: if the algorithm refuses its arguments
+        :raises ValueError: if the algorithm rejects its arguments
         """
         try:
             return self.spec.algorithm(
@@ -175,11 +175,11 @@ class Settings:
                 verbose=verbose,
                 **self.hyperparams,
             )
-        except (AssertionError, TypeError) as error:  # SB3's checks of what it is given
+        except (AssertionError, TypeError) as error:  # SB3's checks of its arguments
             raise ValueError(str(error)) from error
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain data, for a file beside the results."""
+        """Return all settings as plain data, for a file with the results."""
         return {
             "algo": self.algo,
             "env": self.env_id,
@@ -205,15 +205,15 @@ def load_settings(
     config: Path | None = None,
 ) -> Settings:
     """
-    Load settings by name; whatever is given here wins over the files.
+    Load settings by name; the arguments take precedence over the files.
 
     :param algo: name in ``ALGOS``
     :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
     :param size: ``"paper"``, ``"small"`` or ``"smoke"``
     :param env_kwargs: parameters of the game
     :param overrides: keys as in the algorithm's file, such as ``{"n_envs": 8, "policy_kwargs": {"n_slots": 8}}``
-    :param config: a file to read in place of the algorithm's
-    :raises ValueError: for a name that does not exist, a value of the wrong type, games that cannot be made
+    :param config: a file to read instead of the algorithm's
+    :raises ValueError: for an unknown name, a value of the wrong type, games that cannot be made
     """
     spec = find_algorithm(algo)
     environment = find_environment(env_id)
@@ -231,11 +231,11 @@ def load_settings(
 
 def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | None = None) -> Settings:
     """
-    Read settings that :meth:`Settings.as_dict` has written; files that have changed since do not matter.
+    Read settings written by :meth:`Settings.as_dict`, independent of later changes of ``zoo_configs``.
 
     :param saved: plain data
-    :param env_kwargs: parameters of the game that shall be others now
-    :raises ValueError: if it is something else, or the games cannot be made
+    :param env_kwargs: parameters of the game to change
+    :raises ValueError: if ``saved`` is invalid, or the games cannot be made
     """
     missing = [key for key in _SAVED_KEYS if key not in saved]
     if missing:
@@ -245,7 +245,7 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
     spec = find_algorithm(saved["algo"])
     own = {key: saved[key] for key in _OWN_KEYS if key in saved and saved[key] != spec.algorithm.__name__}
     entry = merge(_checked_keys({**own, **saved["hyperparams"]}, spec, "the saved settings"))
-    # Whoever only draws results needs no package of the games.
+    # Reading N from the file avoids importing the games' package for plots.
     n_agents = None if env_kwargs else saved.get("n_agents")
     return _build(
         saved["algo"],
@@ -257,17 +257,17 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
 
 
 def _for_algorithm(algo: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """Take back what another algorithm than the method's own cannot take."""
+    """Remove entries that an algorithm other than the method's own does not support."""
     own, spec = ALGOS[algo], find_algorithm(algo, entry.get("algorithm"))
     if spec.algorithm is own.algorithm:
         return {key: value for key, value in entry.items() if key != "algorithm"}
-    if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):  # whose own buffers keep masks and sequences
+    if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):  # need their own buffers for masks and sequences
         entry = {key: value for key, value in entry.items() if key != "rollout_buffer_class"}
     return _checked_keys(entry, spec, f"the settings for {spec.algorithm.__name__}")
 
 
 def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment, source: str) -> None:
-    """Refuse entries that no environment would read."""
+    """Raise ValueError for entries that no environment reads."""
     known = (DEFAULT, HECOGRID, *ENV_IDS, *suites(), environment.id)
     for key in content:
         if key not in known and not {".", ":", "/"} & set(str(key)):
@@ -275,7 +275,7 @@ def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment
 
 
 def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> dict[str, Any]:
-    """Refuse names that nothing would read, and what would contradict the algorithm; give RL-Zoo3's names our own."""
+    """Rename RL-Zoo3's keys; raise ValueError for unknown keys, and for values that contradict the algorithm."""
     entry = dict(entry)
     known = [*_OWN_KEYS, *algorithm_arguments(spec.algorithm)]
     if _N_TIMESTEPS in entry:
@@ -305,7 +305,7 @@ def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) ->
 
 
 def _exclusive(given: dict[str, Any]) -> dict[str, Any]:
-    """Take the number of minibatches back where a batch size is given."""
+    """Remove the number of minibatches if a batch size is given."""
     if given.get("batch_size") is not None and given.get("n_minibatches") is not None:
         raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
     if given.get("batch_size") is not None:
@@ -366,7 +366,7 @@ def _check_wrapping(
 
 
 def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_envs: int) -> int:
-    """Return the whole teams of a minibatch: one team is the rows of one game at one step."""
+    """Return the number of teams in a minibatch: one team is the rows of one game at one step."""
     n_steps = plain.get("n_steps")
     if n_steps is None:
         raise ValueError(f"n_minibatches divides a rollout, which needs n_steps; {spec.algorithm.__name__} has none")

@@ -1,5 +1,5 @@
 """
-Numbers behind the figures: means with intervals over seeds, interquartile means and performance profiles by rliable.
+Statistics for the figures: means with intervals over seeds, interquartile means and performance profiles by rliable.
 
 Tables are tidy: one row per observation, the column ``method`` names the algorithm, ``seed`` the run. Letters: S seeds,
 K tasks, X thresholds.
@@ -20,7 +20,7 @@ from sb3_saf.randomness import own_randomness
 
 Floats = npt.NDArray[np.float64]
 
-#: Bootstrap samples, and the seed that makes intervals repeat.
+#: Bootstrap samples, and the seed that makes intervals reproducible.
 N_RESAMPLES: Final = 2_000
 BOOTSTRAP_SEED: Final = 0
 
@@ -28,7 +28,7 @@ CURVE_COLUMNS: Final = ("method", "seed", "game_steps", "score")
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval, NaN where one run cannot tell."""
+    """A value with its 95 % interval, NaN for a single run."""
 
     value: float
     low: float
@@ -36,7 +36,7 @@ class Estimate(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """Share of runs whose score is above each threshold, with its 95 % interval; (X,) each."""
+    """Fraction of runs with a score above each threshold, with its 95 % interval; (X,) each."""
 
     share: Floats
     low: Floats
@@ -51,7 +51,7 @@ def mean_over_seeds(values: Sequence[float] | Floats) -> Estimate:
 
 
 def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
-    """Check that a table has columns, and rows; else a ValueError with those that are missing."""
+    """Check that a table has columns and rows; otherwise raise ValueError with the missing columns."""
     missing = [column for column in columns if column not in table.columns]
     if missing:
         raise ValueError(f"expected a table with the columns {', '.join(columns)}; {', '.join(missing)} is missing")
@@ -63,8 +63,8 @@ def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
     """
     Return mean and interval over the seeds of one method at each point of training.
 
-    Seeds that were measured at different points are interpolated, and only where all of them were measured: a curve
-    that goes on with fewer seeds would jump.
+    Seeds measured at different points are interpolated, within the range that all of them cover: a curve over fewer
+    seeds would jump.
 
     :param runs: columns ``seed``, ``game_steps``, ``score``
     :return: columns ``game_steps``, ``value``, ``low``, ``high``
@@ -83,7 +83,7 @@ def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
 
 def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Floats]:
     """
-    Return scores by method, (S, K) each, as rliable takes them.
+    Return scores by method, (S, K) each, for rliable.
 
     :param results: columns ``method``, ``seed``, the column named by ``task``, ``score``; several rows of a run
         (episodes) are averaged
@@ -122,14 +122,14 @@ def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
 
 
 def _interquartile_mean(runs: Floats) -> float:
-    """Return ``aggregate_iqm`` of rliable without scipy's checks, which cost all its time in ten thousand calls."""
+    """Return rliable's ``aggregate_iqm`` without scipy's checks, which take most of its time."""
     scores = np.sort(runs, axis=None)
     cut = len(scores) // 4
     return float(scores[cut : len(scores) - cut].mean())
 
 
 def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> dict[str, Profile]:
-    """Return the share of each method's (S, K) scores above thresholds (X,), with stratified bootstrap intervals."""
+    """Return the fraction of each method's (S, K) scores above thresholds (X,), with stratified bootstrap intervals."""
     shares, intervals = _bootstrap(scores, lambda runs: (runs[..., None] > thresholds).mean(axis=(0, 1)))
     return {method: Profile(shares[method], *intervals[method]) for method in scores}
 
@@ -137,10 +137,10 @@ def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> di
 def _bootstrap(
     scores: Mapping[str, Floats], statistic: Callable[[Floats], Floats]
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """Return point estimates and 95 % intervals of rliable; with a single seed nothing is known of the spread: NaN."""
+    """Return rliable's point estimates and 95 % intervals; the intervals are NaN for a single seed."""
     from rliable.library import get_interval_estimates
 
-    # rliable draws from NumPy's global generator, whatever ``random_state`` it gets.
+    # rliable uses NumPy's global generator even if ``random_state`` is given.
     with own_randomness(BOOTSTRAP_SEED, th.device("cpu")):
         values, intervals = get_interval_estimates(dict(scores), statistic, reps=N_RESAMPLES)
     for method, runs in scores.items():

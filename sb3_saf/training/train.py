@@ -41,7 +41,7 @@ from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
 
 PROGRAM: Final = "python -m sb3_saf.train"
-#: Options that RunOptions has by the same name, with the same values.
+#: Options with the same name and value in RunOptions.
 _SAME_NAMES: Final = (
     *("eval_freq", "eval_episodes", "n_eval_envs", "deterministic_eval", "save_freq"),
     *("inspect_freq", "checkpoint_freq", "device", "progress"),
@@ -49,7 +49,7 @@ _SAME_NAMES: Final = (
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Make the parser: RL-Zoo3's options, where steps are game steps."""
+    """Make the parser: RL-Zoo3's options, with steps in game steps."""
     parser = OneLineParser(
         prog=PROGRAM,
         description="Train or tune a team by name. All steps are game steps, summed over all parallel games; agent "
@@ -161,7 +161,7 @@ def _add_tuning(group: argparse._ArgumentGroup) -> None:
 
 
 def train(arguments: Sequence[str] | None = None) -> None:
-    """Train or tune; what the user can put right is a :class:`CommandError`."""
+    """Train or tune; raise :class:`CommandError` for errors that the user can fix."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = make_parser().parse_args(given)
     _check(options)
@@ -177,7 +177,7 @@ def train(arguments: Sequence[str] | None = None) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Say what can be said before anything is made, and fill in the defaults that depend on where we are."""
+    """Check the options before anything is made, and fill in the defaults that depend on the platform."""
     with user_errors():
         if options.seed != -1:
             check_seed(options.seed)
@@ -210,9 +210,8 @@ def _settings(
     options: argparse.Namespace, sampled: Mapping[str, Any] | None = None
 ) -> tuple[Settings, Settings | None]:
     """
-    Return the settings of training and, where they are others, of evaluation.
-
-    What the user gave wins over what was sampled for a trial.
+    Return the settings of training and, if they differ, of evaluation. The user's options take precedence over those
+    sampled for a trial.
     """
     overrides = merge(sampled or {}, _fixed(options))
 
@@ -294,7 +293,7 @@ def _find_unfinished(options: argparse.Namespace, settings: Settings, seed: int 
 
 
 def _remove_unbegun(folder: Path) -> None:
-    """Remove the folder of a run that has not begun to play: it would pass for the latest run."""
+    """Remove the folder of a run that has not begun, which would count as the latest run."""
     if not (folder / "monitor.csv").exists():
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -312,7 +311,7 @@ def _announce(training: Training, folder: Path) -> None:
 
 
 def _track(options: argparse.Namespace, settings: Settings, seed: int) -> None:
-    """Let Weights and Biases follow the run's TensorBoard logs."""
+    """Start Weights and Biases, synchronised with the run's TensorBoard logs."""
     try:
         wandb = importlib.import_module("wandb")
     except ImportError:
@@ -334,7 +333,7 @@ def _track(options: argparse.Namespace, settings: Settings, seed: int) -> None:
 
 
 def _tune(options: argparse.Namespace, command: str) -> None:
-    """Run trials, print the best, and write ``report_*.csv`` of all of them."""
+    """Run trials, print the best one, and write all of them to ``report_*.csv``."""
     require("optuna", "pandas")
     from sb3_saf.training.tune import Tuning, optimize, sample_overrides
 

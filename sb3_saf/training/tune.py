@@ -1,4 +1,4 @@
-"""Tuning with Optuna: what is searched, how a trial is trained, and studies that several processes share."""
+"""Tuning with Optuna: search spaces, trials, and studies shared by several processes."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from sb3_saf.training.seeds import MAX_SEED
 from sb3_saf.training.settings import Settings
 from sb3_saf.training.values import algorithm_arguments, policy_arguments
 
-#: Trials that count for ``max_total_trials``; those at work, too, or workers would exceed it.
+#: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.
 _COUNTED: Final = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
 _SQLITE: Final = "sqlite:///"
 _JOURNAL: Final = ".log"
 _ATTEMPTS: Final = 10
 
-# --- what is searched -------------------------------------------------------------------------------------------------
+# --- search spaces ----------------------------------------------------------------------------------------------------
 
 _Suggest = Callable[[optuna.Trial, str], Any]
 
@@ -48,7 +48,7 @@ def _count(low: int, high: int) -> _Suggest:
     return lambda trial, name: trial.suggest_int(name, low, high)
 
 
-#: Arguments of algorithms; those that an algorithm does not have are left out.
+#: Arguments of algorithms; those that an algorithm lacks are skipped.
 _SEARCH: Final[dict[str, _Suggest]] = {
     "learning_rate": _log(1e-4, 3e-3),
     "gamma": _choice(0.95, 0.98, 0.99, 0.995),
@@ -68,7 +68,7 @@ _POLICY_SEARCH: Final[dict[str, _Suggest]] = {
 
 
 def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """Ask a trial for settings, as overrides for ``load_settings``; what the user has ``fixed`` is not searched."""
+    """Sample settings of a trial, as overrides for ``load_settings``, except those that the user has ``fixed``."""
     known = set(algorithm_arguments(spec.algorithm))
     if {"n_steps", "batch_size"} <= known and "batch_size" not in fixed:
         known.add("n_minibatches")
@@ -76,7 +76,7 @@ def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[st
         _SEARCH[name](trial, name)
     settled = {**spec.policy_kwargs, **fixed.get("policy_kwargs", {})}
     if settled.get("knowledge_source") is False:
-        settled["n_slots"] = None  # there are none
+        settled["n_slots"] = None  # no slots without a knowledge source
     for name in _open(_POLICY_SEARCH, policy_arguments(spec.policy_class), settled):
         _POLICY_SEARCH[name](trial, name)
     return to_overrides(trial.params)
@@ -97,7 +97,7 @@ def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class TrialCallback(SeededEvalCallback):
-    """Evaluation of a trial: report every evaluation, and stop what the pruner gives up."""
+    """Evaluation callback of a trial: reports every evaluation, and stops the trial if the pruner does."""
 
     def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -118,14 +118,14 @@ class TrialCallback(SeededEvalCallback):
 @dataclass(frozen=True)
 class Tuning:
     """
-    How a study is carried out; see the options of the same names of ``sb3_saf.train``.
+    Options of a study, as those of the same names of ``sb3_saf.train``.
 
-    :param seed: of the trials' games and models, and of the sampler unless the storage is shared
-    :param options: of the trials' runs: device, threads, evaluation
+    :param seed: seed of the trials' games and models, and of the sampler unless the storage is shared
+    :param options: options of the trials' runs: device, threads, evaluation
     :param storage: see :func:`open_storage`; None keeps the study in memory
-    :param study_name: None lets Optuna draw one
+    :param study_name: None for a name chosen by Optuna
     :param n_trials: trials of this process
-    :param max_total_trials: trials of all processes together, in place of ``n_trials``
+    :param max_total_trials: trials of all processes together, instead of ``n_trials``
     :param log_path: folder for the evaluations and the best model of every trial; None for none
     """
 
@@ -144,7 +144,7 @@ class Tuning:
 
 
 def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str) -> optuna.Study:
-    """Run trials, whose settings ``settings_of`` gives, and return the study, with which ``command`` is kept."""
+    """Run trials with settings from ``settings_of``, and return the study, in which ``command`` is stored."""
     study = optuna.create_study(
         sampler=_make_sampler(tuning),
         pruner=_make_pruner(tuning),
@@ -173,10 +173,9 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
 
 def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
     """
-    Train and evaluate a trial with a seed of its own, and return the mean team return of the last evaluation.
+    Train and evaluate a trial with its own seed, and return the mean team return of the last evaluation.
 
-    :raises optuna.TrialPruned: if the pruner gives it up, training fails, or there is no finite value, which would pass
-        for a result
+    :raises optuna.TrialPruned: if the pruner stops it, training fails, or the value is not finite
     """
     seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
     options = tuning.options
@@ -208,7 +207,7 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
 
 
 def _make_sampler(tuning: Tuning) -> optuna.samplers.BaseSampler:
-    # Workers of one storage with one seed would all propose the same.
+    # Workers of one storage with equal seeds would all propose the same trials.
     seed = tuning.seed if tuning.storage is None else None
     if tuning.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
@@ -235,10 +234,10 @@ def _make_pruner(tuning: Tuning) -> optuna.pruners.BasePruner:
 
 def open_storage(storage: str, *, must_exist: bool = False) -> BaseStorage:
     """
-    Open a storage, which several processes may share.
+    Open a storage that several processes may share.
 
     :param storage: ``sqlite:///study.db``, a journal file ``study.log``, or a database's URL
-    :param must_exist: whether a file that is not there is an error, rather than made
+    :param must_exist: whether a missing file is an error; otherwise it is created
     """
     path = _file_of(storage)
     if path is not None:
@@ -254,8 +253,8 @@ def open_storage(storage: str, *, must_exist: bool = False) -> BaseStorage:
     for attempt in range(_ATTEMPTS):
         try:
             return RDBStorage(storage)
-        except Exception as error:  # SQLAlchemy's, which differ by database
-            # Two processes that make the tables at once: one of them finds them there the next time.
+        except Exception as error:  # SQLAlchemy's errors differ by database
+            # Two processes create the tables at the same time: the next attempt finds them.
             if attempt == _ATTEMPTS - 1:
                 raise ValueError(f"cannot open the storage {storage!r}: {error}") from error
             time.sleep(0.1 * (attempt + 1))

@@ -1,4 +1,4 @@
-"""From the plain values of YAML to constructor arguments: numbers, schedules, and classes by registered names."""
+"""Conversion of plain YAML values to constructor arguments: numbers, schedules, and classes by registered names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.training.names import unknown_name
 
-#: What may be named under each key that takes a class. Names are looked up here; nothing is imported or evaluated.
+#: Classes by name for each key that takes a class. Names are looked up here only; nothing is imported or evaluated.
 CLASSES: Final[dict[str, dict[str, type]]] = {
     "rollout_buffer_class": {"TeamRolloutBuffer": TeamRolloutBuffer},
     "features_extractor_class": {
@@ -37,7 +37,7 @@ CLASSES: Final[dict[str, dict[str, type]]] = {
     "optimizer_class": {"Adam": th.optim.Adam, "AdamW": th.optim.AdamW, "RMSprop": th.optim.RMSprop},
 }
 
-#: Constructor arguments that a run decides, not its settings.
+#: Constructor arguments that are set by the run, not by its settings.
 _RUN_ARGUMENTS: Final = {
     "self",
     "policy",
@@ -53,7 +53,7 @@ _POLICY_RUN_ARGUMENTS: Final = {"self", "observation_space", "action_space", "lr
 
 
 class Range(NamedTuple):
-    """Values that an argument may have; ``above``: larger than ``low``, not equal to it; ``high`` None: no limit."""
+    """Valid range of an argument; ``above`` excludes ``low`` itself; ``high`` None means no limit."""
 
     low: float
     high: float | None = None
@@ -69,7 +69,7 @@ class Range(NamedTuple):
         return f"larger than {self.low}" if self.above else f"at least {self.low}"
 
 
-#: Ranges that the algorithms would not check, or only after the first rollout.
+#: Ranges that the algorithms do not check, or only after the first rollout.
 RANGES: Final[dict[str, Range]] = {
     **dict.fromkeys(("gamma", "gae_lambda", "tau"), Range(0, 1)),
     **dict.fromkeys(("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), Range(0, 1)),
@@ -84,8 +84,8 @@ RANGES: Final[dict[str, Range]] = {
 
 class Kind(NamedTuple):
     """
-    A kind of value that an argument may have: whether a type hint asks for it, the conversion (``_NO`` for values of
-    another kind), and words for the error.
+    Kind of value of an argument: whether a type hint allows it, the conversion (``_NO`` for values of another kind),
+    and its description in errors.
     """
 
     accepts: Callable[[Any], bool]
@@ -97,7 +97,7 @@ _NO: Final = object()
 
 
 def _number(value: object) -> Any:
-    """Return a float; YAML 1.1 takes ``7e-4`` for a string."""
+    """Return a float; YAML 1.1 reads ``7e-4`` as a string."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return _NO
     try:
@@ -113,7 +113,7 @@ def _whole_number(value: object) -> Any:
 
 
 def _schedule(value: object) -> Any:
-    """Return RL-Zoo3's ``lin_0.001``: from 0.001 down to 0."""
+    """Return the schedule of RL-Zoo3's ``lin_0.001``: linear from 0.001 to 0."""
     if not isinstance(value, str) or not value.startswith("lin_"):
         return _NO
     start = _number(value.removeprefix("lin_"))
@@ -143,10 +143,10 @@ _KINDS: Final = (
 
 def resolve(name: str, value: object, hint: object) -> Any:
     """
-    Convert a plain value to what a constructor takes; a ValueError says what is of the wrong type or out of range.
+    Convert a plain value to a constructor argument; raise ValueError for a wrong type or range.
 
-    :param name: the argument, which decides what a class may be called
-    :param value: from YAML or a command line; objects that are no plain data stay as they are
+    :param name: the argument's name, which selects the table of classes
+    :param value: value from YAML or a command line; objects that are not plain data are returned unchanged
     :param hint: the argument's type
     """
     resolved = _resolve_type(name, value, hint)
@@ -177,14 +177,14 @@ def _resolve_type(name: str, value: object, hint: object) -> Any:
 
 
 def algorithm_arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """Return what an algorithm's settings may name, with types: its constructor's arguments without those of a run."""
+    """Return the valid settings of an algorithm with types: its constructor's arguments without those of a run."""
     return _init_hints(algorithm, _RUN_ARGUMENTS)
 
 
 def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
     """
-    Return what ``policy_kwargs`` may name, with types: the arguments of the policy's constructor, of those that it
-    passes further arguments to, and the fields of its parts.
+    Return the valid ``policy_kwargs`` with types: the arguments of the constructors of the policy and of its base
+    classes, and the fields of its parts.
     """
     arguments: dict[str, Any] = {}
     for base in reversed(policy.__mro__):
@@ -200,7 +200,7 @@ def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
 def _init_hints(owner: type, without: set[str]) -> dict[str, Any]:
     init = vars(owner).get("__init__") or owner.__init__  # type: ignore[misc]
     annotations = {name: parameter.annotation for name, parameter in inspect.signature(init).parameters.items()}
-    # One by one: SB3's type of environments, which no settings hold, has a forward reference that cannot be resolved.
+    # One by one: SB3's type of environments, never used in settings, has an unresolvable forward reference.
     return {name: _hint(annotations[name], init.__globals__) for name in annotations if name not in without}
 
 

@@ -1,4 +1,4 @@
-"""One game of a team, in a window, as GIF or MP4, or as text. N agents."""
+"""Display of one game of a team in a window, as GIF or MP4, or as text. N agents."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Frame = npt.NDArray[np.uint8]
 
 #: Game steps per second.
 FPS: Final = 8
-#: Variables of which one is set where windows can be opened.
+#: Environment variables of which one is set if windows can be opened.
 _DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 
 
@@ -42,7 +42,7 @@ class Screen(NamedTuple):
 
 @contextmanager
 def open_screen(team: TrainedTeam, options: argparse.Namespace) -> Iterator[Screen]:
-    """Open what the options ask for, the window included: it fails at once where there is no display."""
+    """Open the screen of the options; a window fails immediately without a display."""
     if options.no_render:
         yield Screen(None, None)
         return
@@ -69,7 +69,7 @@ def _checked_file(options: argparse.Namespace) -> Path | None:
 
 def _open_window(env: Any) -> None:
     try:
-        # Asked, SDL would print complaints of its own.
+        # Checked here, because SDL would print its own errors.
         if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in _DISPLAYS):
             raise RuntimeError("no window can be opened (there is no display)")
         env.reset(seed=0)
@@ -79,11 +79,11 @@ def _open_window(env: Any) -> None:
 
 
 def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool) -> None:
-    """Play the first of the measured games on a screen; each agent is given its own observation only."""
+    """Play the first of the measured games on a screen, with decentralised execution."""
     if screen.env is None:
         return
     if screen.file is not None:
-        # A game of now: some packages (mpe2) end pygame for all games when one is closed, as those measured on were.
+        # A new game: some packages (mpe2) quit pygame for all games when one is closed, as after the measurement.
         with closing(team.settings.make_game(screen.env.render_mode)) as env:
             frames = list(play(env, team, seed, deterministic))
         metadata = getattr(screen.env, "metadata", None) or {}
@@ -97,7 +97,7 @@ def show_game(screen: Screen, team: TrainedTeam, seed: int, deterministic: bool)
 
 
 def play(env: Any, team: TrainedTeam, seed: int, deterministic: bool) -> Iterator[Any]:
-    """Play a game, a ParallelEnv; yield what ``env.render()`` gives, at the start and after every step."""
+    """Play a game, a ParallelEnv; yield ``env.render()`` at the start and after every step."""
     set_random_seed(seed)
     read = _Reader(team, env)
     observations, infos = env.reset(seed=game_seeds(evaluation_seed(seed), 1)[0])
@@ -121,7 +121,7 @@ def _normalization_of(team: TrainedTeam) -> VecNormalize | None:
 
 
 class _Reader:
-    """Make rows for the policy of what a ParallelEnv gives its agents: one row for each agent, absent ones included."""
+    """Converter from a ParallelEnv's results to rows for the policy: one row per agent, absent ones included."""
 
     def __init__(self, team: TrainedTeam, env: Any) -> None:
         space = env.observation_space(env.possible_agents[0])
@@ -131,7 +131,7 @@ class _Reader:
         self._normalization = _normalization_of(team) if team.settings.wrapping.get("normalize") else None
 
     def rows(self, agents: Sequence[Any], observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> dict[str, Any]:
-        """Stack the own observations of all agents in order, and their masks where there are any."""
+        """Stack the own observations of all agents in order, and their masks if there are any."""
         space, n_actions = self._spaces.own, self._spaces.action_mask
         own = np.zeros((len(agents), *(space.shape or ())), dtype=space.dtype)
         masks = np.ones((len(agents), *(() if n_actions is None else n_actions.shape)), dtype=np.int8)
@@ -171,7 +171,7 @@ def write_video(path: Path, frames: list[Frame], fps: int = FPS) -> None:
         imageio.imwrite(path, pictures, duration=1000 // fps, loop=0)
         return
     height, width = pictures.shape[1:3]
-    even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)))  # H.264 halves the colours' resolution
+    even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)))  # H.264 needs even sizes
     imageio.imwrite(path, even, plugin="FFMPEG", fps=fps, macro_block_size=1)
 
 

@@ -2,8 +2,8 @@
 RL-Zoo3's ``env_wrapper``, ``vec_env_wrapper``, ``frame_stack``, ``normalize`` and ``callback``, for teams, and
 ``curriculum``.
 
-Wrappers are imported by name, so a file of settings that has them can run code: take such files from people whom you
-trust. Wrappers of games are PettingZoo's and SuperSuit's, those of vector environments SB3's; the latter sit between
+Wrappers are imported by name, so a settings file with them can run code: use such files from trusted sources only.
+Wrappers of games are PettingZoo's and SuperSuit's, those of vector environments SB3's; the latter are placed between
 the monitor and the joint observation, where each row is one agent's own observation.
 """
 
@@ -29,7 +29,7 @@ from sb3_saf.envs.teams import OBS_KEY
 from sb3_saf.training.environments import import_by_name
 
 _NAMES = str | list[Any] | dict[str, Any] | None
-#: Keys of settings that say how games are wrapped and what trains, with their types; each may be left out.
+#: Optional settings for wrappers and callbacks, with their types.
 WRAPPER_KEYS: Final[dict[str, Any]] = {
     "env_wrapper": _NAMES,
     "vec_env_wrapper": _NAMES,
@@ -45,7 +45,7 @@ NORMALIZATION_FILE: Final = "vecnormalize.npz"
 
 
 def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
-    """Import what a key names in RL-Zoo3's format: a dotted name, a mapping from one to its arguments, or a list."""
+    """Import the objects of a key in RL-Zoo3's format: a dotted name, a mapping of it to arguments, or a list."""
     for item in value if isinstance(value, list) else [value] if value is not None else []:
         name, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
         module, _, function = name.rpartition(".") if isinstance(name, str) else ("", "", "")
@@ -57,7 +57,7 @@ def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[st
 
 
 def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
-    """Wrap one game, a ParallelEnv, as ``env_wrapper`` and ``frame_stack`` say."""
+    """Wrap one game, a ParallelEnv, by ``env_wrapper`` and ``frame_stack``."""
     for wrapper, arguments in named(wrapping.get("env_wrapper"), "env_wrapper"):
         try:
             game = wrapper(game, **arguments)
@@ -73,7 +73,7 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
 
 
 def wraps_games(wrapping: Mapping[str, Any]) -> bool:
-    """Return whether single games are wrapped, which those of HECOGrid's compiled core cannot be."""
+    """Return whether single games are wrapped, which HECOGrid's compiled core does not support."""
     return "env_wrapper" in wrapping or "frame_stack" in wrapping
 
 
@@ -81,11 +81,11 @@ def wrap_rows(
     env: CentralizedValueWrapper, wrapping: Mapping[str, Any], gamma: float, is_training: bool
 ) -> CentralizedValueWrapper:
     """
-    Wrap vector environments as ``vec_env_wrapper`` and ``normalize`` say.
+    Wrap vector environments by ``vec_env_wrapper`` and ``normalize``.
 
     :param env: from ``make_team_env``
     :param gamma: discount of the algorithm, for the normalisation of rewards
-    :param is_training: whether statistics are learned and rewards normalised
+    :param is_training: whether statistics are updated and rewards normalised
     :return: ``env`` itself if there is nothing to do
     """
     normalize = wrapping.get("normalize") or None
@@ -105,7 +105,7 @@ def wrap_rows(
 
 
 def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_training: bool) -> VecNormalize:
-    """Add VecNormalize; pictures and tile codes stay as they are, since encoders scale them."""
+    """Add VecNormalize; pictures and tile codes are not normalised, since encoders scale them."""
     space = rows.observation_space
     own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
     norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
@@ -122,11 +122,11 @@ def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_traini
 
 def stages_of(wrapping: Mapping[str, Any], game_steps: int) -> list[Stage]:
     """
-    Read ``curriculum``: a list of levels to train on first, each a mapping of ``share``, its share of the run, and of
-    the parameters of the game that differ, ``[{share: 0.2, coordination: 1}, {share: 0.4, coordination: 2}]``.
+    Read ``curriculum``: a list of stages, each a mapping of ``share``, its fraction of the run, and of the differing
+    parameters of the game, ``[{share: 0.2, coordination: 1}, {share: 0.4, coordination: 2}]``.
 
-    :param game_steps: of the run
-    :raises ValueError: for anything else
+    :param game_steps: game steps of the run
+    :raises ValueError: for any other value
     """
     stages, total = [], 0.0
     for entry in wrapping.get("curriculum") or []:
@@ -147,7 +147,7 @@ def stages_of(wrapping: Mapping[str, Any], game_steps: int) -> list[Stage]:
 
 
 def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
-    """Make the callbacks that ``callback`` names."""
+    """Make the callbacks of the key ``callback``."""
     callbacks = []
     for kind, arguments in named(wrapping.get("callback"), "callback"):
         if not isinstance(kind, type) or not issubclass(kind, BaseCallback):
@@ -159,11 +159,11 @@ def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
     return callbacks
 
 
-# --- statistics of VecNormalize, as numbers instead of SB3's pickle ---------------------------------------------------
+# --- statistics of VecNormalize as arrays instead of SB3's pickle -----------------------------------------------------
 
 
 def save_normalization(env: VecEnv, folder: Path) -> None:
-    """Write the statistics of a VecNormalize, if there is one, to ``vecnormalize.npz`` in a folder."""
+    """Write the statistics of a VecNormalize, if any, to ``vecnormalize.npz`` in a folder."""
     layer = unwrap_vec_normalize(env)
     if layer is not None:
         arrays: dict[str, Any] = {key: np.array([one.count, *_flat(one)]) for key, one in _statistics(layer).items()}

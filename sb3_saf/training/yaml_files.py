@@ -1,4 +1,4 @@
-"""Settings as YAML: safe loading, and how a file, the file it refines, environments and sizes become one mapping."""
+"""Settings as YAML: safe loading, and merging of base files, environments and sizes to one mapping."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import yaml
 
 from sb3_saf.training.names import unknown_name
 
-#: The paper's experiments, what a laptop trains in an hour, and what a test trains in seconds.
+#: Sizes from the paper's experiments to a test that trains in seconds.
 Size = Literal["paper", "medium", "small", "smoke"]
 SIZES: Final[tuple[Size, ...]] = get_args(Size)
 
-#: The entry for all environments, and the key that names the file to refine.
+#: The entry for all environments, and the key of the base file.
 DEFAULT: Final = "default"
 BASE: Final = "base"
 SIZES_KEY: Final = "sizes"
 #: Keys whose mappings are merged key by key; all other values are replaced.
 MERGED: Final = ("env_kwargs", "policy_kwargs")
-#: Limits on files: of bytes, and of values after all aliases are unfolded.
+#: Limits on files: bytes, and values after expanding all aliases.
 _MAX_BYTES: Final = 200_000
 _MAX_VALUES: Final = 100_000
 _MERGE_TAG: Final = "tag:yaml.org,2002:merge"
@@ -29,8 +29,8 @@ _MERGE_TAG: Final = "tag:yaml.org,2002:merge"
 
 class _StrictLoader(yaml.SafeLoader):
     """
-    PyYAML's safe loader without merge keys, which may unfold to more than the memory holds, and without equal keys, of
-    which it would silently take the last.
+    PyYAML's safe loader without merge keys, whose expansion may exceed the memory, and without duplicate keys, of which
+    it would silently use the last.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
@@ -47,9 +47,9 @@ class _StrictLoader(yaml.SafeLoader):
 
 def load_yaml(text: str, source: str) -> Any:
     """
-    Read plain data from YAML; ``source`` says in errors where it came from.
+    Read plain data from YAML; ``source`` names the origin in errors.
 
-    :raises ValueError: for invalid YAML, and for what is no plain data or unfolds to more than a person would write
+    :raises ValueError: for invalid YAML, data that are not plain, or too many values after expanding aliases
     """
     try:
         content = yaml.load(text, Loader=_StrictLoader)
@@ -68,7 +68,7 @@ def load_yaml(text: str, source: str) -> Any:
 
 def _size(content: object, known: dict[int, int]) -> int:
     """
-    Count the values when all aliases are unfolded; ``known`` has the sizes of containers by identity.
+    Count the values after expanding all aliases; ``known`` has the sizes of containers by identity.
 
     :raises ValueError: for dates, sets and other values that settings do not have
     """
@@ -88,7 +88,7 @@ def parse_value(text: str) -> Any:
 
 
 def read_plain_file(path: Path) -> Any:
-    """Read the plain data in a YAML file; a ValueError says that it cannot be read or is too large."""
+    """Read the plain data in a YAML file; ValueError if it cannot be read or is too large."""
     try:
         with path.open("rb") as file:
             data = file.read(_MAX_BYTES + 1)
@@ -101,16 +101,16 @@ def read_plain_file(path: Path) -> Any:
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """Read a file of settings, and the files that it refines."""
+    """Read a settings file and its base files."""
     return _with_base(read_plain_file(path), str(path), ())
 
 
 def read_config(name: str, refined_by: Sequence[str] = ()) -> dict[str, Any]:
     """
-    Read a file of the package ``zoo_configs``, and the files that it refines.
+    Read a file of the package ``zoo_configs`` and its base files.
 
-    :param name: without ``.yml``
-    :param refined_by: files that have led here
+    :param name: file name without ``.yml``
+    :param refined_by: files that refine this one
     """
     source = f"zoo_configs/{name}.yml"
     text = files("zoo_configs").joinpath(f"{name}.yml").read_text(encoding="utf-8")
@@ -123,7 +123,7 @@ def config_names() -> list[str]:
 
 
 def _with_base(content: object, source: str, refined_by: Sequence[str]) -> dict[str, Any]:
-    """Return a mapping from environment ids to settings, merged into that of its base."""
+    """Return a mapping from environment ids to settings, merged into that of its base file."""
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{source} must map 'default' and environment ids to settings, got {_short(content)}")
     base = content.pop(BASE, None)
@@ -160,7 +160,7 @@ def _short(value: object) -> str:
 
 
 def _refined(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry of a base with what a file adds, inside its sizes, too."""
+    """Return an entry of a base file merged with a file's own entry, also within sizes."""
     result = merge(entry, own)
     sections = [one.get(SIZES_KEY, {}) for one in (entry, own)]
     if any(sections):
@@ -170,9 +170,8 @@ def _refined(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dict[str, Any]:
     """
-    Merge entries of a file, the most general first, then their sections of the size; entries may be missing.
-
-    Sections of sizes come last because they are the most specific; ``paper`` is what stands outside of them.
+    Merge entries of a file, the most general first, then their sections of the size; entries may be missing. Sections
+    of sizes are merged last because they are the most specific; ``paper`` is the content outside of them.
     """
     entries = [dict(content.get(key) or {}) for key in keys]
     sections = [entry.pop(SIZES_KEY, {}).get(size, {}) for entry in entries]
@@ -180,7 +179,7 @@ def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dic
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge mappings; later values win, and mappings under the keys of ``MERGED`` are merged in turn."""
+    """Merge mappings; later values take precedence, mappings under the keys of ``MERGED`` are merged in turn."""
     result: dict[str, Any] = {}
     for layer in layers:
         for key, value in layer.items():
