@@ -1,1 +1,1 @@
-"""Trained actors as files: written beside the training code, run without it, loaded without unpickling."""
+"""Export of trained actors to files that run without the training code and load without unpickling."""

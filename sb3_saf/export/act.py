@@ -1,5 +1,5 @@
 """
-Act with an exported actor. Needs Python, NumPy and onnxruntime, nothing else.
+Act with an exported actor. Needs only Python, NumPy and onnxruntime.
 
     python act.py observation.npy [--agent 3] [--action-mask mask.npy] [--sample] [--seed 0]
 
@@ -9,8 +9,8 @@ or, from a program beside this file:
     actor = OnnxActor("folder of actor.json and actor.onnx")
     action = actor.act(observation)
 
-An actor with a memory takes ``memory=Memory()``, made anew at the start of each episode; to the command line, the
-observations of such an actor are the steps of one episode.
+An actor with memory takes ``memory=Memory()``, a new one for each episode; on the command line, the observations of
+such an actor are the steps of one episode.
 
 Letters: K rows (a batch of observations), M choices of all action dimensions, H size of a memory.
 """
@@ -30,9 +30,8 @@ Array = npt.NDArray[Any]
 
 class Memory:
     """
-    What an actor remembers of an episode: hidden and cell state of its LSTM, (layers, K, H), zeros at first.
-
-    Make a new one for each episode.
+    Memory of an actor in an episode: hidden and cell state of its LSTM, (layers, K, H), initially zeros. Make a new one
+    for each episode.
     """
 
     def __init__(self, hidden: Array | None = None, cell: Array | None = None):
@@ -53,11 +52,11 @@ class Memory:
 
 def as_batch(observation: Any, space: dict[str, Any]) -> tuple[Array, bool]:
     """
-    Bring observations into the network's layout.
+    Convert observations to the network's layout.
 
     :param observation: one own observation or a batch of them; pictures with channels first or last
     :param space: the observation space, as in ``actor.json``
-    :return: (K, *shape) of the space's dtype, and whether a batch came
+    :return: (K, *shape) of the space's dtype, and whether ``observation`` was a batch
     """
     array, shape = np.asarray(observation), tuple(space["shape"])
     if space.get("picture") and array.shape != shape and array.shape[1:] != shape and array.ndim >= 3:
@@ -72,7 +71,7 @@ def as_batch(observation: Any, space: dict[str, Any]) -> tuple[Array, bool]:
 
 def as_masks(action_mask: Any, manifest: dict[str, Any], n_rows: int) -> Array | None:
     """
-    Check masks of actions; a ValueError says if they are missing, not wanted, of another shape, or allow nothing.
+    Check action masks; ValueError if they are missing, not supported, of a wrong shape, or allow nothing.
 
     :param action_mask: (M,) for one observation, (K, M) for a batch; or None
     :param manifest: ``"action"`` and ``"action_mask"`` as in ``actor.json``
@@ -103,11 +102,11 @@ def as_masks(action_mask: Any, manifest: dict[str, Any], n_rows: int) -> Array |
 
 def feeds(session: Any, known: dict[str, Array], rng: np.random.Generator | None) -> dict[str, Array]:
     """
-    Give every input of the graph a value: those that are known, noise, everything allowed, and zeros.
+    Return a value for every input of the graph: known values, noise, masks that allow all actions, and zeros.
 
-    :param session: onnxruntime's
-    :param known: inputs by name, ``"observation"`` among them
-    :param rng: where noise comes from, by the method that an input's name begins with, as ``gumbel_policy`` or
+    :param session: session of onnxruntime
+    :param known: inputs by name, including ``"observation"``
+    :param rng: generator of noise; its method is the prefix of the input's name, as in ``gumbel_policy`` or
         ``normal_action``; None for zeros
     """
     rows, values = len(known["observation"]), dict(known)
@@ -128,10 +127,10 @@ def feeds(session: Any, known: dict[str, Array], rng: np.random.Generator | None
 
 class OnnxActor:
     """
-    Run ``actor.onnx``. Trusts its folder; ``sb3_saf.Actor`` checks it first.
+    Run ``actor.onnx``. The folder is trusted; ``sb3_saf.Actor`` checks it first.
 
-    :param folder: of ``actor.json`` and ``actor.onnx``
-    :param agent: index of the agent, where what is done depends on who acts
+    :param folder: folder of ``actor.json`` and ``actor.onnx``
+    :param agent: index of the agent, if the actor depends on it
     """
 
     def __init__(self, folder: str | Path, agent: int | None = None):
@@ -154,9 +153,9 @@ class OnnxActor:
         Choose an action.
 
         :param observation: one own observation, or a batch
-        :param rng: to sample with; None takes the most likely action
-        :param action_mask: which actions are legal, where the actor was trained with masks
-        :param memory: of the episode, where the actor has one; it is brought up to date
+        :param rng: generator for sampling; None takes the most likely action
+        :param action_mask: legal actions, if the actor was trained with masks
+        :param memory: memory of the episode, if the actor has one; it is updated
         """
         batch, is_batch = as_batch(observation, self.manifest["observation"])
         known = {"observation": batch}

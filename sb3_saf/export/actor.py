@@ -1,7 +1,6 @@
 """
-An actor from files: one agent's part of a trained team.
-
-This module and what it imports use neither Stable-Baselines3 nor Gymnasium: ``sb3_saf.Actor`` works without them.
+Actor from files: one agent's part of a trained team. This module and its imports use neither Stable-Baselines3 nor
+Gymnasium: ``sb3_saf.Actor`` works without them.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ class Actor:
     """
     One agent's part of a trained team, read from the files of ``sb3_saf.export_actors``.
 
-    It sees the agent's own observation and nothing else, and acts as the trained model's ``predict`` does. Nothing is
-    unpickled, no code is imported by a name from the files, and the training environment is not needed.
+    It reads the agent's own observation only, and acts as the trained model's ``predict``. Nothing is unpickled, no
+    code is imported by a name from the files, and the training environment is not needed.
 
-    Make one with :meth:`load`. An actor that was trained with masks of actions is told each time which are legal, and
-    one that remembers gets a memory for each episode::
+    Make one with :meth:`load`. An actor trained with action masks needs a mask in each call, and one with memory a new
+    memory for each episode::
 
         actor = sb3_saf.Actor.load("actor", agent=3)
         memory = actor.new_memory()  # at the start of each episode, where has_memory
         action = actor.act(own_observation, action_mask=legal, memory=memory)
 
-    :param manifest: what the export says of itself
+    :param manifest: manifest of the export
     :param runtime: computes the network
     :param agent: index of the agent in its team, if known
     """
@@ -51,11 +50,11 @@ class Actor:
     @classmethod
     def load(cls, folder: str | PathLike[str], agent: int | None = None, runtime: RuntimeName = "torch") -> Actor:
         """
-        Read an export. Files may come from strangers: whatever is wrong with them is an :class:`ExportError`.
+        Read an export. Files may be untrusted: any fault in them raises :class:`ExportError`.
 
         :param folder: written by ``sb3_saf.export_actors``
-        :param agent: index of the agent in its team; needed where what is done depends on who acts
-        :param runtime: ``"torch"``, or ``"onnx"`` which needs onnxruntime and no torch
+        :param agent: index of the agent in its team; needed if the actor depends on it
+        :param runtime: ``"torch"``, or ``"onnx"``, which needs onnxruntime but not torch
         :raises ExportError: if the files are damaged, malformed or of an unknown format
         """
         if runtime not in get_args(RuntimeName):
@@ -67,16 +66,16 @@ class Actor:
 
     @property
     def n_agents(self) -> int:
-        """N, the size of the team that was trained."""
+        """N, the size of the trained team."""
         return self.manifest.n_agents
 
     @property
     def has_memory(self) -> bool:
-        """Whether it remembers what it has seen in an episode."""
+        """Whether the actor has memory."""
         return self.manifest.memory is not None
 
     def new_memory(self) -> Memory:
-        """Make what an agent remembers at the start of an episode: nothing. :meth:`act` keeps it up to date."""
+        """Make the empty memory for the start of an episode, which :meth:`act` updates."""
         if not self.has_memory:
             raise ValueError(f"{self.manifest.policy} acts on single observations and has no memory; leave memory out")
         return Memory()
@@ -90,22 +89,22 @@ class Actor:
         memory: Memory | None = None,
     ) -> Array:
         """
-        Choose an action: by default what ``model.predict(observation, deterministic=True)`` chooses. ``predict`` itself
-        draws unless told otherwise.
+        Choose an action, by default that of ``model.predict(observation, deterministic=True)``. The default of
+        ``predict`` itself is to sample.
 
-        :param observation: one own observation as the environment gives it (pictures with channels first or last), or
-            a batch of them with one more axis. An actor of tile codes also takes the game's pixels
-        :param deterministic: whether to take the most likely action instead of drawing one
-        :param rng: where draws come from: a seed, or a NumPy generator. None goes on where the last call ended; with
-            torch that is torch's global generator, and the draws are those of the trained model's ``predict`` (for a
-            seed, those of ``predict`` after ``torch.manual_seed``)
-        :param action_mask: (M,) zeros and ones, or one more axis for a batch: which choices are legal, in the form in
-            which the model was trained with them. Needed where the training environment's observations had masks
-        :param memory: of the episode, from :meth:`new_memory`, where the actor has one; it is brought up to date. For a
-            batch of K observations it holds what K agents remember
-        :return: the action, or a batch of actions, as ``predict`` gives them
-        :raises ValueError: for observations that are not of the observation space's shape and kind, or not finite, and
-            for masks or memories that do not fit
+        :param observation: one own observation of the environment (pictures with channels first or last), or a batch of
+            them with one more axis. An actor of tile codes also takes the game's pixels
+        :param deterministic: whether to take the most likely action instead of sampling
+        :param rng: seed or NumPy generator for sampling. None continues from the last call; with torch that is torch's
+            global generator, and samples equal those of the trained model's ``predict`` (for a seed, those of
+            ``predict`` after ``torch.manual_seed``)
+        :param action_mask: (M,) zeros and ones, or one more axis for a batch: legal choices, in the form of the
+            training masks. Required if the training environment's observations had masks
+        :param memory: memory of the episode, from :meth:`new_memory`, if the actor has one; it is updated. For a batch
+            of K observations it holds K memories
+        :return: the action, or a batch of actions, as from ``predict``
+        :raises ValueError: for observations with a shape or dtype other than the observation space's, or not finite,
+            and for invalid masks or memories
         """
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         actions, states = self._runtime.act(inputs, deterministic, _checked_rng(rng))
@@ -117,9 +116,8 @@ class Actor:
 
     def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Return the probability of every action, (A,) or (K, A) for a batch, for discrete actions.
-
-        Arguments as of :meth:`act`; the memory stays as it is.
+        Return the probability of every discrete action, (A,) or (K, A) for a batch. Arguments as in :meth:`act`; the
+        memory is not updated.
         """
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()
@@ -130,10 +128,9 @@ class Actor:
 
     def log_prob(self, observation: Any, action: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Return the log-likelihood of actions, () or (K,) for a batch: of drawing a policy of the pool by its weight, and
-        the action from it.
+        Return the log-likelihood of actions under the mixture of the pool's policies, () or (K,) for a batch.
 
-        Arguments as of :meth:`act`; the memory stays as it is.
+        Arguments as in :meth:`act`; the memory is not updated.
         """
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()
@@ -149,7 +146,7 @@ class Actor:
             raise ValueError(f"{self.manifest.policy} has values of actions and takes the best: no action is drawn")
 
     def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[Inputs, bool]:
-        """Return what the runtime reads, checked, and whether a batch came."""
+        """Return the checked inputs of the runtime, and whether they are a batch."""
         batch, is_batch = self._batch(observation)
         mask = as_masks(action_mask, self._masks, len(batch))
         return Inputs(batch, mask, self._states(memory, len(batch))), is_batch
@@ -158,7 +155,7 @@ class Actor:
         net = self.manifest.memory
         if net is None:
             if memory is not None:
-                self.new_memory()  # says that there is none
+                self.new_memory()  # raises an error: the actor has no memory
             return ()
         if not isinstance(memory, Memory):
             raise ValueError(
@@ -182,7 +179,7 @@ class Actor:
 
 
 def _is_picture(array: Array, codes: SpaceSpec) -> bool:
-    """Return whether an array is pixels, one picture or a batch, where tile codes are expected."""
+    """Return whether an array holds pixels (one picture or a batch) instead of tile codes."""
     channels, height, width = codes.picture_shape
     return array.ndim in (3, 4) and array.shape[-3:] in ((height, width, channels), (channels, height, width))
 
@@ -196,7 +193,7 @@ def _checked_rng(rng: object) -> Rng:
 
 
 def _make_runtime(name: RuntimeName, folder: Path, manifest: Manifest, agent: int | None) -> Runtime:
-    # Imported here: each needs a library that the other does without.
+    # Imported here: each needs a library that the other does not.
     if name == "onnx":
         from sb3_saf.export.onnx_runtime import make_onnx_runtime
 
@@ -220,12 +217,12 @@ def _checked_agent(manifest: Manifest, agent: int | None) -> int | None:
 
 
 def _plain(space: SpaceSpec) -> dict[str, Any]:
-    """Return a space as ``act.py`` finds it in the file."""
+    """Return a space as ``act.py`` reads it from the file."""
     return {"shape": space.shape, "dtype": space.dtype, "choices": space.choices, "picture": space.picture}
 
 
 def _can_become(array: Array, dtype: np.dtype[Any]) -> bool:
-    """Return whether numbers keep their meaning: any number may become a float, others must stay the same."""
+    """Return whether conversion to ``dtype`` is valid: any number to float, otherwise without change of value."""
     if array.dtype.kind not in "biuf":
         return False
     if dtype.kind == "f" or np.can_cast(array.dtype, dtype):
@@ -235,7 +232,7 @@ def _can_become(array: Array, dtype: np.dtype[Any]) -> bool:
 
 
 def _check_codes(batch: Array, space: SpaceSpec) -> None:
-    """Refuse codes and choices that do not exist."""
+    """Raise ValueError for codes and choices that do not exist."""
     if space.atlas is not None:
         limit = np.asarray(space.atlas[0])
     elif space.is_one_hot:

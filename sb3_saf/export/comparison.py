@@ -1,4 +1,4 @@
-"""Check that an exported network gives the model's numbers."""
+"""Check that an exported network reproduces the model's outputs."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
 
-#: Policies whose actors read one agent's own observation, index, mask and memory, and nothing else.
+#: Policies whose actors read only one agent's own observation, index, mask and memory.
 ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy
 
-#: Largest difference between the model's and the exported network's outputs, beside the outputs' own size.
+#: Maximum relative difference between the model's and the exported network's outputs.
 _TOLERANCE: Final = 1e-4
 _N_CHECKED: Final = 16
 
 
 def some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str, th.Tensor]:
-    """Make random inputs of the network, by name; the space's own generator and torch's are left alone."""
+    """Make random inputs of the network, by name, without using the space's generator or torch's."""
     space = copy.deepcopy(policy.team_spaces.own)
     space.seed(0)
     inputs = {"observation": th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))}
@@ -38,7 +38,7 @@ def some_inputs(policy: ExportablePolicy, memory: MemoryNet | None) -> dict[str,
 
 
 def check_network(policy: ExportablePolicy, network: AgentNetwork, inputs: dict[str, th.Tensor]) -> None:
-    """Compare the exported network with the model; an ExportError if they differ by more than rounding does."""
+    """Compare the exported network with the model; ExportError if they differ by more than rounding."""
     was_training = policy.training
     policy.set_training_mode(False)
     with th.no_grad():
@@ -51,7 +51,7 @@ def check_network(policy: ExportablePolicy, network: AgentNetwork, inputs: dict[
 
 
 def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> States:
-    """Return what the model's own actor gives, and what it remembers then."""
+    """Return the outputs of the model's actor, and its next memory."""
     latent = policy.extract_features(inputs["observation"])
     states: States = ()
     if isinstance(policy, TeamRecurrentPolicy):
@@ -60,6 +60,6 @@ def _of_model(policy: ExportablePolicy, inputs: dict[str, th.Tensor]) -> States:
 
 
 def check_close(found: th.Tensor, expected: th.Tensor, otherwise: str) -> None:
-    """Compare outputs; an ExportError if they differ by more than rounding does."""
+    """Compare outputs; ExportError if they differ by more than rounding."""
     if found.shape != expected.shape or not th.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
         raise ExportError(f"the exported network does not give the model's numbers: {otherwise}")

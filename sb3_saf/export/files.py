@@ -1,4 +1,4 @@
-"""Files and folders of exports: read with limits, written whole or not at all."""
+"""Files and folders of exports: reading with limits, atomic writing."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from typing import Final
 from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import DATA_FILES, FORMAT, MANIFEST_FILE, SCRIPT_FILE, DataFile
 
-#: All that a folder of an export holds. Python leaves the cache where ``act.py`` was imported.
+#: All names in a folder of an export. The cache is created by importing ``act.py``.
 _KNOWN: Final = frozenset({MANIFEST_FILE, SCRIPT_FILE, "__pycache__", *DATA_FILES})
 
 
 def read_limited(path: Path, limit: int) -> bytes:
     """
-    Read a file that may be anything.
+    Read an untrusted file.
 
-    :raises ExportError: if it is missing, no regular file (reading a pipe would wait for ever) or longer than the limit
+    :raises ExportError: if it is missing, no regular file (reading a pipe would block) or longer than the limit
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise ExportError(f"{path} is not a regular file")
         with path.open("rb") as file:
             data = file.read(limit + 1)
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
         raise ExportError(f"cannot read {path}: {error}; expected a file of sb3_saf.export_actors") from error
     if len(data) > limit:
         raise ExportError(f"{path} has more than the {limit} bytes expected")
@@ -48,10 +48,10 @@ def read_checked(path: Path, expected: DataFile) -> bytes:
 
 def write_folder(folder: Path, files: Mapping[str, bytes], overwrite: bool) -> None:
     """
-    Write a folder of files by name, whole or not at all.
+    Write a folder of files by name, atomically.
 
-    Files go to a new folder beside it, which then takes its name. What was there before is removed last; ``overwrite``
-    replaces a folder that is not an export, with everything in it.
+    Files are written to a new sibling folder, which is then renamed. A previous folder is removed last; ``overwrite``
+    also replaces a folder that is not an export, with all its content.
     """
     target = folder.expanduser().resolve()
     _check_replaceable(target, overwrite)
@@ -60,7 +60,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes], overwrite: bool) -> N
     try:
         for name, data in files.items():
             _write_durably(fresh / name, data)
-        fresh.chmod(0o777 & ~_umask())  # as a new folder has; mkdtemp's own are for one user alone
+        fresh.chmod(0o777 & ~_umask())  # default permissions; mkdtemp's are for one user only
         _put_in_place(fresh, target)
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)
@@ -109,7 +109,7 @@ def _put_in_place(fresh: Path, target: Path) -> None:
         fresh.rename(target)
         return
     old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-    old.rmdir()  # only its name was wanted; some systems do not rename onto a folder
+    old.rmdir()  # only its name is needed; some systems cannot rename onto a folder
     target.rename(old)
     try:
         fresh.rename(target)

@@ -1,8 +1,6 @@
 """
-``actor.json``: what an exported actor is, in plain words and numbers.
-
-A manifest may come from anywhere: msgspec checks the kind and size of every entry before anything is built from it,
-names are looked up in closed lists, and unknown entries are refused.
+``actor.json``: the manifest that describes an exported actor. It may be untrusted: msgspec checks the type and size of
+every entry before use, names are looked up in closed lists, and unknown entries are refused.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from sb3_saf.errors import ExportError
 from sb3_saf.networks.spaces import MAX_SIZE, Size, SpaceSpec
 
 FORMAT: Final = "sb3_saf.actor"
-#: Version 2 had no actor_identity and no one_hot_codes, and graphs that left decisions to act.py.
+#: Version 2 had no actor_identity and one_hot_codes, and its graphs did not choose actions.
 FORMAT_VERSION: Final = 3
 READABLE_VERSIONS: Final = (2, 3)
 
@@ -26,13 +24,13 @@ MANIFEST_FILE: Final = "actor.json"
 WEIGHTS_FILE: Final = "actor.safetensors"
 ONNX_FILE: Final = "actor.onnx"
 SCRIPT_FILE: Final = "act.py"
-#: Files whose checksums a manifest states.
+#: Files with checksums in the manifest.
 DATA_FILES: Final = (WEIGHTS_FILE, ONNX_FILE)
 
-#: Least side of a picture, in pixels, that the convolutions of an encoder need.
+#: Minimum side of a picture in pixels for the convolutions of an encoder.
 _LEAST_SIDE: Final = {"PaperCNN": 8, "NatureEncoder": 36}
 
-#: Limits, far above what is ever trained.
+#: Limits, far above the sizes of real models.
 MAX_MANIFEST_BYTES: Final = 1 << 24
 
 EncoderName: TypeAlias = Literal["LightEncoder", "MLPEncoder", "NatureEncoder", "PaperCNN"]
@@ -47,15 +45,15 @@ Sizes: TypeAlias = Annotated[tuple[Size, ...], Meta(max_length=1 << 12)]
 
 class EncoderNet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
-    Which encoder, and its sizes.
+    Encoder and its sizes.
 
     :param name: class in ``sb3_saf.networks.encoders``
     :param features_dim: d
-    :param divide_by_255: whether pictures of bytes are scaled to [0, 1]
-    :param tile_size: of LightEncoder, else 1
-    :param embedding_dim: of LightEncoder, else 1
-    :param hidden: of LightEncoder and MLPEncoder, else 1
-    :param one_hot_codes: of LightEncoder
+    :param divide_by_255: whether uint8 pictures are scaled to [0, 1]
+    :param tile_size: for LightEncoder, else 1
+    :param embedding_dim: for LightEncoder, else 1
+    :param hidden: for LightEncoder and MLPEncoder, else 1
+    :param one_hot_codes: for LightEncoder
     """
 
     name: EncoderName
@@ -69,15 +67,15 @@ class EncoderNet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class ActorNet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
-    Which policies, and their sizes.
+    Actor and its sizes.
 
     :param name: one policy for all, one for each agent, or a pool
     :param hidden: hidden layers of every policy
     :param activation: of hidden layers, a class in ``torch.nn``
-    :param n_policies: U, 1 but for the pool
-    :param latent_dim: of the pool, else 1
-    :param projection_hidden: of the pool, else empty
-    :param agent_identity: whether the policies read who acts
+    :param n_policies: U, 1 without pool
+    :param latent_dim: for the pool, else 1
+    :param projection_hidden: for the pool, else empty
+    :param agent_identity: whether the policies read the agent's index
     """
 
     name: ActorName
@@ -96,16 +94,16 @@ class ActorNet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def reads_agent(self) -> bool:
-        """Whether it matters who acts."""
+        """Whether the actor depends on the agent's index."""
         return self.name == "AgentPolicies" or self.agent_identity
 
 
 class MemoryNet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
-    The LSTM between encoder and policies.
+    LSTM between encoder and policies.
 
     :param hidden_size: H
-    :param n_layers: layers, one on top of the other
+    :param n_layers: number of stacked layers
     :param bias: whether it has biases
     """
 
@@ -132,21 +130,21 @@ class DataFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
-    What an exported actor is.
+    Description of an exported actor.
 
-    :param sb3_saf_version: which version wrote it
-    :param policy: name of the policy class it was trained with, for people
+    :param sb3_saf_version: version that wrote it
+    :param policy: name of the trained policy class, for information
     :param n_agents: N
-    :param reads_agent: whether it matters who acts
-    :param action_mask: whether an actor may, or must, be told which actions are legal
-    :param selection: ``"greedy"`` if parameters are values of actions, of which the best is taken
+    :param reads_agent: whether the actor depends on the agent's index
+    :param action_mask: whether action masks are optional, required or not supported
+    :param selection: ``"greedy"`` if parameters are action values, of which the best is taken
     :param observation: space of one own observation
     :param action: action space
-    :param encoder: the encoder; None if only the ONNX file knows
-    :param actor: the policies; None if only the ONNX file knows
+    :param encoder: the encoder; None if it is in the ONNX file only
+    :param actor: the policies; None if they are in the ONNX file only
     :param memory: the LSTM; None without memory
-    :param files: what lies beside the manifest
-    :param format_version: which version of this format
+    :param files: data files of the export
+    :param format_version: version of this format
     """
 
     sb3_saf_version: Text
@@ -160,13 +158,13 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     encoder: EncoderNet | None
     actor: ActorNet | None
     memory: MemoryNet | None
-    #: A closed list: no name in a file decides what is opened.
+    #: A closed list: names in the manifest cannot refer to other files.
     files: dict[Literal["actor.safetensors", "actor.onnx"], DataFile]
     format_version: Literal[2, 3] = FORMAT_VERSION
 
     @property
     def gives_log_probs(self) -> bool:
-        """Whether every action has a probability."""
+        """Whether the actor has probabilities of single actions."""
         return self.action.kind == "discrete" and self.selection != "greedy"
 
     def to_json(self) -> str:
@@ -176,7 +174,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def from_json(cls, text: bytes) -> Manifest:
-        """Read and check; whatever :meth:`to_json` would not have written is an ExportError."""
+        """Read and check a manifest; ExportError for anything that :meth:`to_json` would not write."""
         try:
             entries = msgspec.json.decode(text)
             stated = _checked_format(entries).pop("checksum", None)
@@ -203,12 +201,12 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def refuse(message: str, cause: Exception | None = None) -> NoReturn:
-    """Say what is wrong with a manifest, in one line."""
+    """Raise ExportError for an invalid manifest, with a one-line message."""
     raise ExportError(f"{MANIFEST_FILE} {message}") from cause
 
 
 def checksum(entries: Any) -> str:
-    """Return the SHA-256 of a manifest's entries, however they are laid out in the file."""
+    """Return the SHA-256 of a manifest's entries, independent of their layout in the file."""
     try:
         return hashlib.sha256(json.dumps(entries, sort_keys=True).encode("utf-8")).hexdigest()
     except (ValueError, TypeError, RecursionError) as error:

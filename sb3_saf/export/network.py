@@ -1,5 +1,5 @@
 """
-The network of one agent: the encoder, memory and actor of ``sb3_saf.networks``, from raw own observations to decisions.
+Network of one agent: the encoder, memory and actor of ``sb3_saf.networks``, from raw own observations to actions.
 
 Letters: K rows, d features, N agents, U policies, P parameters of one policy's distribution, D action dimensions.
 """
@@ -42,14 +42,14 @@ from sb3_saf.networks.spaces import ObservationSpec, SpaceSpec
 Array = npt.NDArray[Any]
 States = tuple[th.Tensor, ...]
 
-#: Activations that a file may name.
+#: Activations allowed in files.
 ACTIVATIONS: Final[dict[str, type[nn.Module]]] = {name: getattr(nn, name) for name in get_args(Activation)}
-#: Where files have the pixels of tile codes.
+#: Name of the pixels of tile codes in files.
 ATLAS: Final = "encoder.pixels.atlas"
 
 
 class RawEncoder(nn.Module):
-    """An encoder that reads raw observations of a space; pictures of bytes may be scaled to [0, 1]."""
+    """Encoder of raw observations of a space; uint8 pictures may be scaled to [0, 1]."""
 
     def __init__(self, encoder: nn.Module, space: SpaceSpec, divide_by_255: bool):
         super().__init__()
@@ -62,7 +62,7 @@ class RawEncoder(nn.Module):
 
 
 def make_encoder(net: EncoderNet, observation: ObservationSpec) -> nn.Module:
-    """Make the encoder that a manifest describes, with weights yet to be loaded."""
+    """Make the encoder of a manifest, without loading weights."""
     if net.name == "PaperCNN":
         return encoders.PaperCNN(observation, net.features_dim)
     if net.name == "NatureEncoder":
@@ -77,7 +77,7 @@ def make_encoder(net: EncoderNet, observation: ObservationSpec) -> nn.Module:
 def make_actor(
     net: ActorNet, features_dim: int, action: SpaceSpec, n_agents: int, activation_fn: type[nn.Module]
 ) -> ActorNetwork:
-    """Make the actor that a manifest describes, with weights yet to be loaded."""
+    """Make the actor of a manifest, without loading weights."""
     n_identities = n_agents if net.agent_identity else 0
     if net.name == "PolicyPool":
         return PolicyPool(
@@ -96,16 +96,16 @@ def make_actor(
 
 
 def make_memory(net: MemoryNet | None, features_dim: int) -> nn.LSTM | None:
-    """Make the LSTM that a manifest describes, with weights yet to be loaded; None without memory."""
+    """Make the LSTM of a manifest, without loading weights; None without memory."""
     return None if net is None else nn.LSTM(features_dim, net.hidden_size, net.n_layers, bias=net.bias)
 
 
 class AgentNetwork(nn.Module):
     """
-    All that an agent needs to act.
+    Complete network of an agent.
 
     :param encoder: (K, *shape) raw own observations to (K, d)
-    :param memory: LSTM over the features of one step after the other, (K, d) to (K, H); None without memory
+    :param memory: LSTM over the features of successive steps, (K, d) to (K, H); None without memory
     :param actor: (K, d), or (K, H), and agents to weights and parameters of policies
     """
 
@@ -115,7 +115,7 @@ class AgentNetwork(nn.Module):
 
     @classmethod
     def of(cls, manifest: Manifest, atlas: Array | None) -> AgentNetwork:
-        """Make the network of a manifest, with weights yet to be loaded; ``atlas`` has the pixels of tile codes."""
+        """Make the network of a manifest, without loading weights; ``atlas`` has the pixels of tile codes."""
         encoder, actor, memory = manifest.encoder, manifest.actor, manifest.memory
         assert encoder is not None and actor is not None
         latent_dim = encoder.features_dim if memory is None else memory.hidden_size
@@ -130,11 +130,11 @@ class AgentNetwork(nn.Module):
         self, observation: th.Tensor, agent: th.Tensor | None = None, states: States = ()
     ) -> tuple[PoolOutput, States]:
         """
-        Compute everything that the action depends on.
+        Compute the selection weights and action parameters.
 
         :param observation: (K, *shape) raw own observations
-        :param agent: (K,) indices of agents, where it matters who acts
-        :param states: hidden and cell state of the memory, (layers, K, H) each, where there is one
+        :param agent: (K,) indices of agents, if the actor depends on them
+        :param states: hidden and cell state of the memory, (layers, K, H) each, if there is one
         :return: log weights (K, U) and parameters (K, U, P), and the next states
         """
         latent = self.encoder(observation)
@@ -145,22 +145,22 @@ class AgentNetwork(nn.Module):
         return self.actor.evaluate(latent, agent), states
 
     def tensors(self) -> dict[str, th.Tensor]:
-        """Return the weights under the names that files have."""
+        """Return the weights by their names in files."""
         return {_name_in_file(name): tensor for name, tensor in self.state_dict().items()}
 
 
 def _name_in_file(name: str) -> str:
-    """Return the name of format version 2, which is shorter than that of the module."""
+    """Return the name in files (format version 2), which is shorter than that of the module."""
     return name.replace("encoder.encoder.", "encoder.").replace("actor.head.heads.", "actor.heads.")
 
 
 def decide(space: SpaceSpec, selection: str, output: PoolOutput, deterministic: bool) -> th.Tensor:
     """
-    Choose actions as the trained model's ``predict`` does, with the same random numbers.
+    Choose actions as the trained model's ``predict``, with the same random numbers.
 
     :param space: the action space
-    :param selection: ``"mixture"``, ``"gumbel"``, or ``"greedy"`` if parameters are values of actions
-    :param output: of the network, with forbidden actions taken out
+    :param selection: ``"mixture"``, ``"gumbel"``, or ``"greedy"`` if parameters are action values
+    :param output: output of the network, with illegal actions masked
     :param deterministic: whether to take the most likely action
     :return: (K, D)
     """
@@ -168,7 +168,7 @@ def decide(space: SpaceSpec, selection: str, output: PoolOutput, deterministic: 
     is_pool = log_weights.shape[1] > 1
     favourite = policy_parameters(parameters, log_weights.argmax(dim=1)) if is_pool else parameters[:, 0]
     if selection == "greedy":
-        # Values, not logits: there is nothing to draw.
+        # Values, not logits: no sampling.
         return favourite.argmax(dim=1, keepdim=True)
     if deterministic:
         mixed = is_pool and selection == "mixture"
@@ -187,12 +187,11 @@ def decide(space: SpaceSpec, selection: str, output: PoolOutput, deterministic: 
 
 def load_network(manifest: Manifest, weights: bytes) -> tuple[AgentNetwork, Array | None]:
     """
-    Make the network that a manifest describes from the content of a safetensors file.
+    Make the network of a manifest from the content of a safetensors file. Sizes are compared with the file's before
+    memory is allocated.
 
-    Sizes are compared with the file's before anything of these sizes is made.
-
-    :return: the network, and the pixels of tile codes if observations are such
-    :raises ExportError: if they do not fit each other
+    :return: the network, and the pixels of tile codes if observations are tile codes
+    :raises ExportError: if manifest and weights do not match
     """
     try:
         tensors = load(weights)
@@ -218,7 +217,7 @@ def _taken_atlas(manifest: Manifest, tensors: dict[str, th.Tensor]) -> Array | N
 
 
 def _check_layers(manifest: Manifest, n_tensors: int) -> None:
-    """Refuse before millions of modules are made."""
+    """Raise ExportError if the manifest has more layers than the file, before modules are made."""
     actor = manifest.actor
     assert actor is not None
     n_heads = manifest.n_agents if actor.name == "AgentPolicies" else actor.n_policies
@@ -232,7 +231,7 @@ def _check_layers(manifest: Manifest, n_tensors: int) -> None:
 def check_tensors(
     expected: Mapping[str, th.Tensor], found: Mapping[Any, Any], source: str, remedy: str = "", subset: bool = False
 ) -> None:
-    """Compare tensors of a file, ``source``, with a network's; an ExportError says what is wrong, and the remedy."""
+    """Compare tensors of a file, ``source``, with a network's; the ExportError has the difference and the remedy."""
     if missing := sorted(expected.keys() - found.keys()):
         raise ExportError(f"{source} lacks the tensor {missing[0]!r}{remedy}")
     if not subset and (unknown := sorted(map(str, found.keys() - expected.keys()))):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def make_session(data: bytes) -> Any:
-    """Return onnxruntime's session of a graph, on one thread of the CPU."""
+    """Return an onnxruntime session of a graph, on one thread of the CPU."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -30,13 +30,13 @@ def make_session(data: bytes) -> Any:
 
 
 def make_onnx_runtime(folder: Path, manifest: Manifest, agent: int | None) -> Runtime:
-    """Make what runs the graph of an export."""
+    """Make the runtime for the graph of an export."""
     graph = Graph(folder, manifest, agent)
     return OnnxRuntime(graph) if manifest.format_version > 2 else _version_2(graph)
 
 
 class Graph:
-    """A graph in onnxruntime, whose outputs are checked; ``agent`` where it matters who acts."""
+    """A graph in onnxruntime with checked outputs; ``agent`` is needed if the actor depends on it."""
 
     def __init__(self, folder: Path, manifest: Manifest, agent: int | None):
         try:
@@ -48,7 +48,7 @@ class Graph:
         data = read_checked(folder / ONNX_FILE, manifest.files[ONNX_FILE])
         try:
             self.session = make_session(data)
-        except Exception as error:  # its errors have no common class but this
+        except Exception as error:  # its errors have no other common class
             raise ExportError(f"{ONNX_FILE} is not a valid ONNX file: {str(error)[:200]}") from error
         sizes = [size for entry in self.session.get_inputs() for size in entry.shape[1:] if isinstance(size, int)]
         if any(not 1 <= size <= MAX_SIZE for size in sizes):
@@ -56,7 +56,7 @@ class Graph:
         self.manifest, self.agent = manifest, agent
 
     def known(self, inputs: Inputs) -> dict[str, Array]:
-        """Return the inputs of the graph that do not depend on what is asked."""
+        """Return the inputs of the graph that all queries share."""
         known = {"observation": inputs.observation, **dict(zip(("hidden", "cell"), inputs.states, strict=False))}
         if inputs.action_mask is not None:
             known["action_mask"] = inputs.action_mask
@@ -65,7 +65,7 @@ class Graph:
         return known
 
     def run(self, names: list[str], values: dict[str, Array]) -> list[Array]:
-        """Return the named outputs; an ExportError if the graph does not run, or gives NaN."""
+        """Return the named outputs; ExportError if the graph fails, or returns NaN."""
         try:
             outputs = [np.asarray(output) for output in self.session.run(names, values)]
         except Exception as error:
@@ -76,7 +76,7 @@ class Graph:
 
 
 class OnnxRuntime:
-    """A graph of the current format version, which decides."""
+    """Runtime for graphs of the current format version, which choose actions."""
 
     def __init__(self, graph: Graph):
         self.graph, self.manifest = graph, graph.manifest
@@ -120,7 +120,7 @@ class OnnxRuntime:
 
 
 def _atlas(graph: Graph) -> Array | None:
-    """Return the pixels of tile codes, which the graph's file has beside it."""
+    """Return the pixels of tile codes, stored in the metadata of the graph's file."""
     shape = graph.manifest.observation.atlas
     text = graph.session.get_modelmeta().custom_metadata_map.get("atlas")
     if shape is None or text is None:
@@ -132,7 +132,7 @@ def _atlas(graph: Graph) -> Array | None:
 
 
 def _version_2(graph: Graph) -> Runtime:
-    """Run graphs of format version 2, which give weights and parameters of policies; torch decides."""
+    """Make the runtime for format version 2, whose graphs return weights and parameters; torch chooses actions."""
     try:
         import torch as th
 

@@ -1,4 +1,4 @@
-"""The network of an agent as an ONNX graph that decides, too."""
+"""Export of an agent's network as an ONNX graph that also chooses actions."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from sb3_saf.networks.distributions import (
 from sb3_saf.networks.spaces import SpaceSpec
 
 _OPSET = 18
-#: NumPy's name of the noise that draws an action of each kind of space, when it is added to parameters.
+#: NumPy's name of the noise that samples actions when added to parameters, by kind of space.
 _NOISE = {"box": "normal", "multi_binary": "logistic", "discrete": "gumbel", "multi_discrete": "gumbel"}
 
 
 class DecidingNetwork(nn.Module):
-    """An agent's network with its decisions in an action space; random numbers are inputs."""
+    """An agent's network that also chooses actions; random numbers are inputs."""
 
     low: th.Tensor
     high: th.Tensor
@@ -58,7 +58,7 @@ class DecidingNetwork(nn.Module):
         return likeliest, drawn, log_prob, *log_probs, *states
 
     def _drawn(self, output: PoolOutput, inputs: dict[str, th.Tensor]) -> th.Tensor:
-        """Draw (K, D): noise makes draws of the largest: the policy, and then its choices."""
+        """Sample (K, D) as the argmax of parameters plus noise: first the policy, then its choices."""
         policy = (output.log_weights + inputs["gumbel_policy"]).argmax(dim=1)
         parameters = policy_parameters(output.actions, policy)
         noise = inputs[f"{_NOISE[self.space.kind]}_action"]
@@ -71,13 +71,13 @@ class DecidingNetwork(nn.Module):
         return th.stack([part.argmax(dim=1) for part in parts], dim=1)
 
     def _in_space(self, chosen: th.Tensor) -> th.Tensor:
-        """Bring (K, D) into the space, (K, *shape)."""
+        """Convert actions (K, D) to the space, (K, *shape)."""
         chosen = chosen.reshape(-1, *self.space.shape)
         return chosen if self.space.kind != "box" else th.minimum(th.maximum(chosen, self.low), self.high)
 
 
 def output_names(space: SpaceSpec, selection: str, has_memory: bool) -> list[str]:
-    """Name the outputs of a graph."""
+    """Return the names of a graph's outputs."""
     names = ["most_likely"]
     if selection != "greedy":
         names += ["drawn", "log_prob"] + (["log_probs"] if space.kind == "discrete" else [])
@@ -95,11 +95,11 @@ def onnx_bytes(
     """
     Write the graph, run it, and compare.
 
-    Inputs: ``observation`` (rows, *shape) of the observation space's own dtype, ``agent`` (rows,) int64 where it
-    matters who acts, ``action_mask`` (rows, M) bool where masks may be given, ``hidden`` and ``cell`` (layers, rows, H)
-    where there is a memory; and unless the best action is always taken, ``action`` (rows, D), whose ``log_prob`` is
-    given, and the noise with which ``drawn`` is drawn: ``gumbel_policy`` (rows, U) and ``normal_action``,
-    ``logistic_action`` or ``gumbel_action``, called as the distribution that it has to come from.
+    Inputs: ``observation`` (rows, *shape) of the observation space's dtype, ``agent`` (rows,) int64 if the actor
+    depends on it, ``action_mask`` (rows, M) bool if masks are supported, ``hidden`` and ``cell`` (layers, rows, H) with
+    memory; and unless selection is greedy, ``action`` (rows, D), the argument of ``log_prob``, and the noise of
+    ``drawn``: ``gumbel_policy`` (rows, U) and ``normal_action``, ``logistic_action`` or ``gumbel_action``, named by
+    their distribution.
 
     Outputs: ``most_likely`` and ``drawn`` (rows, *shape), ``log_prob`` (rows,), for discrete actions ``log_probs``
     (rows, A), and with a memory ``next_hidden`` and ``next_cell``.
@@ -107,11 +107,11 @@ def onnx_bytes(
     :param network: what to write
     :param space: the action space
     :param selection: see ``sb3_saf.export.network.decide``
-    :param inputs: of the agent's network by name, to trace and to compare with
+    :param inputs: example inputs of the agent's network by name, for tracing and comparison
     :param has_masks: whether actions may be masked
-    :param atlas: pixels of tile codes, if observations are such
+    :param atlas: pixels of tile codes, if observations are tile codes
     :raises ImportError: if onnx, onnxscript or onnxruntime are missing
-    :raises ExportError: if the network cannot be written as a graph, or the graph gives other numbers
+    :raises ExportError: if the network cannot be written as a graph, or the graph's outputs differ
     """
     try:
         import onnxruntime  # noqa: F401
@@ -136,7 +136,7 @@ def onnx_bytes(
 def _more_inputs(
     network: AgentNetwork, space: SpaceSpec, selection: str, inputs: dict[str, th.Tensor], has_masks: bool
 ) -> dict[str, th.Tensor]:
-    """Return examples of the inputs that only decisions read."""
+    """Return example inputs that are only used to choose actions."""
     n_rows = len(inputs["observation"])
     more = {"action_mask": th.ones(n_rows, sum(space.choices), dtype=th.bool)} if has_masks else {}
     if selection == "greedy":
@@ -156,7 +156,7 @@ def _more_inputs(
 def _written(
     network: DecidingNetwork, inputs: dict[str, th.Tensor], names: list[str], metadata: dict[str, str]
 ) -> bytes:
-    rows = th.export.Dim("rows", max=2**31 - 1)  # without a limit, torch 2.7 refuses its own
+    rows = th.export.Dim("rows", max=2**31 - 1)  # torch 2.7 fails without a limit
     axes = {name: {1 if name in ("hidden", "cell") else 0: rows} for name in inputs}
     try:
         with _quiet():
@@ -171,7 +171,7 @@ def _written(
                 external_data=False,
                 verbose=False,
             )
-    except Exception as error:  # a user's own encoder may do anything
+    except Exception as error:  # a user's encoder may raise anything
         raise ExportError(f"the network cannot be written as ONNX: {error}") from error
     assert program is not None
     proto = program.model_proto
@@ -183,7 +183,7 @@ def _written(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporter's messages about its own stages."""
+    """Silence the exporter's progress messages."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""What computes an exported actor. Letters: K rows, D action dimensions, A actions, M choices, H size of a memory."""
+"""Interface of runtimes. Letters: K rows, D action dimensions, A actions, M choices, H size of a memory."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy.typing as npt
 Array: TypeAlias = npt.NDArray[Any]
 #: Hidden and cell state of an LSTM, (layers, K, H) each; empty without memory.
 States: TypeAlias = tuple[Array, ...]
-#: Where random numbers come from; None goes on where the last call ended.
+#: Source of random numbers; None continues from the last call.
 Rng: TypeAlias = int | np.random.Generator | None
 
 
 class Inputs(NamedTuple):
-    """What an agent knows: (K, *shape) own observations, (K, M) legal choices, None if all are, and its memory."""
+    """Own observations (K, *shape), legal choices (K, M), None if all are, and memory."""
 
     observation: Array
     action_mask: Array | None
@@ -23,16 +23,16 @@ class Inputs(NamedTuple):
 
 
 class Runtime(Protocol):
-    """Torch or onnxruntime, with the network of one actor."""
+    """Runtime (torch or onnxruntime) of one actor's network."""
 
-    #: (n_codes, t, t, C) uint8 pixels of tile codes, where observations are such.
+    #: (n_codes, t, t, C) uint8 pixels of tile codes, None for other observations.
     atlas: Array | None
 
     def act(self, inputs: Inputs, deterministic: bool, rng: Rng) -> tuple[Array, States]:
-        """Return (K, *shape) actions, and what is remembered then."""
+        """Return actions (K, *shape), and the next memory."""
 
     def log_probs(self, inputs: Inputs) -> Array:
-        """Return (K, A) log-probabilities of discrete actions."""
+        """Return log-probabilities (K, A) of discrete actions."""
 
     def log_prob(self, inputs: Inputs, actions: Array) -> Array:
-        """Return (K,) log-likelihoods of actions (K, D)."""
+        """Return log-likelihoods (K,) of actions (K, D)."""

@@ -19,7 +19,7 @@ from sb3_saf.networks.distributions import masked_parameters, mixture_log_prob, 
 
 
 class TorchRuntime:
-    """The network of an export, on the CPU; ``agent`` where it matters who acts."""
+    """Network of an export on the CPU; ``agent`` is needed if the actor depends on it."""
 
     def __init__(self, folder: Path, manifest: Manifest, agent: int | None):
         if WEIGHTS_FILE not in manifest.files:
@@ -32,7 +32,7 @@ class TorchRuntime:
         self.network, self.atlas = load_network(manifest, weights)
 
     def evaluate(self, inputs: Inputs) -> tuple[PoolOutput, States]:
-        """Ask the network; nothing is forbidden yet."""
+        """Evaluate the network, without masks."""
         agent = None
         if self.manifest.reads_agent:
             assert self.agent is not None
@@ -72,7 +72,7 @@ class TorchRuntime:
 
 @contextmanager
 def _seeded(rng: Rng) -> Iterator[None]:
-    """Draw from torch's global generator, or as if it had just been seeded."""
+    """Sample from torch's global generator, or from a temporarily seeded one."""
     if rng is None:
         yield
         return

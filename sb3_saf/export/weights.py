@@ -1,4 +1,4 @@
-"""Weights from the zip file of a saved model, and nothing else of it."""
+"""Loading of weights only from the zip file of a saved model."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from sb3_saf.errors import ExportError
 from sb3_saf.export.network import check_tensors
 
 _ENTRY: Final = "policy.pth"
-#: What a file of tensors may be longer than the tensors.
+#: Maximum bytes of a file of tensors in addition to the tensors.
 _OVERHEAD: Final = 1 << 22
 
 
 def load_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -> None:
     """
-    Take the policy's weights from a model that ``save`` wrote, without running code from the file.
+    Load the policy's weights of a model written by ``save``, without running code from the file.
 
-    SB3's own ``load`` unpickles the whole model, which lets a file from a stranger run anything. Here the caller makes
-    the model (with the same ``policy_kwargs``), and the file gives numbers alone: ``torch.load`` with
-    ``weights_only=True``, names, shapes and types compared with the model's first. The optimiser's state and the
-    hyper-parameters are not read.
+    SB3's ``load`` unpickles the whole model, so an untrusted file can run arbitrary code. Here the caller makes the
+    model (with the same ``policy_kwargs``), and only tensors are read: ``torch.load`` with ``weights_only=True``, after
+    comparing names, shapes and types with the model's. The optimiser's state and the hyperparameters are not read.
 
-    :param model: an algorithm or a policy, changed only if all of the file fits
+    :param model: an algorithm or a policy, changed only if the whole file matches
     :param path: the zip file, with or without ``.zip``
     :raises ExportError: if the file is damaged, malformed, or of a differently built policy
     """
@@ -48,15 +47,15 @@ def read_weights(path: Path, limit: int = 1 << 31) -> dict[str, th.Tensor]:
     """
     Return the policy's weights in a model's file; only tensors are read.
 
-    :param limit: bytes that they may take
-    :raises ExportError: if the file is damaged, malformed, or holds anything else
+    :param limit: maximum bytes of the weights
+    :raises ExportError: if the file is damaged, malformed, or has other content
     """
     if not path.is_file():
         raise ExportError(f"expected a model saved by Stable-Baselines3, found no file {path}")
     try:
         with zipfile.ZipFile(path) as archive, archive.open(_ENTRY) as file:
-            data = file.read(limit + 1)  # counted while it is unpacked: a stated size may be wrong
-    except Exception as error:  # a damaged zip may raise anything, zlib's and struct's errors included
+            data = file.read(limit + 1)  # limited while unpacking: the stated size may be wrong
+    except Exception as error:  # a damaged zip may raise many errors, including zlib's and struct's
         raise ExportError(f"{path} is not a model saved by Stable-Baselines3: {error}") from error
     if len(data) > limit:
         raise ExportError(f"{_ENTRY} in {path} has more than {limit} bytes, too many for the model's weights")

@@ -1,4 +1,4 @@
-"""From a trained model to the files of an actor."""
+"""Export of a trained model to the files of an actor."""
 
 from __future__ import annotations
 
@@ -50,30 +50,30 @@ def export_actors(
     overwrite: bool = False,
 ) -> Path:
     """
-    Write what one agent needs to act on its own observation: encoder, policies and the choice among them.
+    Write the actor of one agent: encoder, policies and their selection.
 
     ===================== ============================================================================
     file                  content
     ===================== ============================================================================
-    ``actor.json``        spaces, networks, versions and checksums, in plain words and numbers
+    ``actor.json``        spaces, networks, versions and checksums
     ``actor.safetensors`` the weights, and the pictures of tile codes
     ``actor.onnx``        the same network as a graph, from raw observations to action parameters
-    ``act.py``            an example that needs NumPy and onnxruntime alone
+    ``act.py``            an example that needs only NumPy and onnxruntime
     ===================== ============================================================================
 
-    Nothing of the critic is written. ``sb3_saf.Actor.load`` reads the folder. Actors of models with masks of actions
-    are told the mask with each observation, those of models with memory carry one (see :class:`~sb3_saf.Actor`). With
-    an encoder or activation of your own, which no file can name, there is no ``actor.safetensors``: the ONNX graph is
-    all. The folder appears whole or not at all; an earlier export in it is replaced.
+    The critic is not exported. ``sb3_saf.Actor.load`` reads the folder. Actors of models with action masks need a mask
+    with each observation, those of models with memory a memory (see :class:`~sb3_saf.Actor`). With a custom encoder or
+    activation only the ONNX graph is written, without ``actor.safetensors``. The folder is written atomically; an
+    earlier export is replaced.
 
     :param model: an algorithm with a SAF, MAPPO or IPPO policy, also recurrent or maskable; QPLEX without memory; or
         the policy itself
-    :param folder: where to
+    :param folder: output folder
     :param onnx: whether to write ``actor.onnx`` and ``act.py``, which needs ``pip install -e '.[export]'``
-    :param overwrite: whether to replace a folder that is not an export, with everything in it
+    :param overwrite: whether to replace a folder that is not an export, with all its content
     :return: the folder
-    :raises ExportError: if the model has no such actor, the folder must not be replaced, or the exported network does
-        not give the model's numbers
+    :raises ExportError: if the model has no such actor, the folder must not be replaced, or the exported network's
+        outputs differ from the model's
     """
     policy = _checked_policy(model)
     described = _Described.of(policy)
@@ -98,14 +98,14 @@ def export_actors(
     data[MANIFEST_FILE] = manifest.to_json().encode("utf-8")
     if onnx:
         data[SCRIPT_FILE] = files("sb3_saf.export").joinpath(SCRIPT_FILE).read_bytes()
-    Manifest.from_json(data[MANIFEST_FILE])  # what cannot be read again is not written
+    Manifest.from_json(data[MANIFEST_FILE])  # checks that it can be read again
     path = Path(folder)
     write_folder(path, data, overwrite)
     return path
 
 
 def _tensors(network: AgentNetwork, observation: ObservationSpec) -> dict[str, th.Tensor]:
-    """Return the weights, and the pixels of tile codes, which an actor finds nowhere else."""
+    """Return the weights, and the pixels of tile codes."""
     tensors = {name: tensor.contiguous() for name, tensor in network.tensors().items()}
     return tensors if observation.atlas is None else tensors | {ATLAS: th.tensor(observation.atlas)}
 
@@ -132,7 +132,7 @@ def _checked_policy(model: object) -> ExportablePolicy:
 
 
 class _Described(NamedTuple):
-    """What the parts of a policy are in the words of a manifest."""
+    """Parts of a policy as entries of a manifest."""
 
     encoder: EncoderNet | None
     memory: MemoryNet | None
@@ -197,7 +197,7 @@ class _Described(NamedTuple):
 
 
 class _OwnExtractor(nn.Module):
-    """A user's own features extractor on raw observations; only an ONNX graph can hold it."""
+    """A user's features extractor on raw observations, for ONNX graphs only."""
 
     def __init__(self, policy: ExportablePolicy):
         super().__init__()
@@ -221,7 +221,7 @@ def _selection(policy: ExportablePolicy) -> Selection | Literal["greedy"]:
 
 
 def _action_mask(policy: ExportablePolicy) -> Literal["none", "optional", "required"]:
-    """Return whether the policy asks for masks: with each observation, or only if somebody has one."""
+    """Return whether action masks are required, optional or not supported by the policy."""
     if policy.team_spaces.action_mask is not None:
         return "required"
     return "optional" if isinstance(policy, TeamMaskablePolicy) else "none"
@@ -244,7 +244,7 @@ def _inner_encoder(policy: ExportablePolicy) -> nn.Module:
 
 
 def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
-    """Describe the encoder; None for one that is not exactly one of ours: a subclass may do anything."""
+    """Describe the encoder; None for classes of users, subclasses included."""
     encoder, features_dim = _inner_encoder(policy), policy.features_dim
     divide = bool(policy.normalize_images and spec_of(policy.team_spaces.own).picture)
     if type(encoder) not in (PaperCNN, NatureEncoder, MLPEncoder, LightEncoder):

@@ -1,1 +1,1 @@
-"""Looking into team policies while they train, on TensorBoard's page."""
+"""Inspection of team policies during training, in TensorBoard."""

@@ -1,5 +1,5 @@
 """
-Calibration of a critic: its values against the discounted returns that followed.
+Calibration of a critic: its values compared with the discounted returns.
 
 Letters: T game steps, B rows, n values.
 """
@@ -23,11 +23,11 @@ class Calibration(NamedTuple):
     """
     Agreement of values V with returns G.
 
-    :param explained_variance: 1 - Var(G - V) / Var(G): 1 for a perfect critic, 0 for one that says a constant; None if
-        all returns are equal
-    :param slope: of the line through (V, G): 1 for a calibrated critic, below 1 for one that exaggerates; None if all
-        values are equal
-    :param bias: mean of V - G: positive for a critic that promises too much
+    :param explained_variance: 1 - Var(G - V) / Var(G): 1 for a perfect critic, 0 for a constant one; None if all
+        returns are equal
+    :param slope: slope of the regression line of G on V: 1 for a calibrated critic, below 1 if values vary too much;
+        None if all values are equal
+    :param bias: mean of V - G: positive if values are too high
     :param rmse: root mean square of V - G
     """
 
@@ -38,7 +38,7 @@ class Calibration(NamedTuple):
 
 
 class Bin(NamedTuple):
-    """Values of about the same size: their mean; mean and standard deviation of the returns that followed."""
+    """Bin of similar values: their mean, and mean and standard deviation of their returns."""
 
     value: float
     mean: float
@@ -49,16 +49,15 @@ def lambda_returns(
     rewards: Floats, ends: Bools, last_values: Floats, values: Floats, gamma: float, lam: float = 1.0
 ) -> Doubles:
     """
-    Compute TD(lambda) targets, which the critic learns; with ``lam=1`` they are the discounted returns.
+    Compute TD(lambda) targets, the training targets of the critic; with ``lam=1`` they are the discounted returns.
 
     ::
 
         R_t = r_t + gamma last_t                                          if the episode ends with step t
         R_t = r_t + gamma ((1 - lam) V_{t+1} + lam R_{t+1})               otherwise
 
-    ``last`` is the value of the last observation where the time limit is no true end (``time_limit="bootstrap"``),
-    else 0. These are SB3's advantages by GAE plus values. Rows of episodes that were not played to their end are to be
-    left out.
+    ``last`` is the value of the last observation if the time limit is no true end (``time_limit="bootstrap"``), else 0.
+    These are SB3's advantages by GAE plus values. Rows of unfinished episodes must be excluded.
 
     :param rewards: (T, B)
     :param ends: (T, B)
@@ -92,12 +91,12 @@ def calibrate(values: Floats, returns: Floats) -> Calibration:
 
 
 def reliability(values: Floats, returns: Floats, n_bins: int = 10) -> list[Bin]:
-    """Compute the mean return by size of the value, values and returns (n,), in ``n_bins`` of equally many at most."""
+    """Compute mean returns of values and returns (n,) in at most ``n_bins`` bins of equal counts by value."""
     order = np.argsort(values, kind="stable")
     parts = np.array_split(order, min(n_bins, len(order)))
     return [Bin(float(values[part].mean()), float(returns[part].mean()), float(returns[part].std())) for part in parts]
 
 
 def rmse(values: Floats, returns: Floats) -> float:
-    """Compute the root mean square error of values (n,) beside returns (n,)."""
+    """Compute the root mean square error of values (n,) against returns (n,)."""
     return float(np.sqrt(((np.asarray(values, dtype=np.float64) - returns) ** 2).mean()))

@@ -1,4 +1,4 @@
-"""The callback that inspects a team policy while it trains, and writes what it finds to TensorBoard."""
+"""Callback that inspects a team policy during training and writes the results to TensorBoard."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from sb3_saf.qplex.policies import QPLEXPolicy
 
 class InspectionCallback(BaseCallback):
     """
-    Inspect SAF, MAPPO, IPPO and QPLEX while they train.
+    Inspect SAF, MAPPO, IPPO and QPLEX during training.
 
     Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes. The run's
-    own TensorBoard file gets team returns; which policy of the pool acts, by zone and by agent; attention and messages
-    of the knowledge source; the critic's calibration, with and without messages; an episode as pictures;
-    hyperparameters; a text that explains the tags; and a layout of the custom scalars page. ``docs/tensorboard.md``
-    says how to read it. What a policy or an environment lacks is left out.
+    TensorBoard file gets team returns; the pool's selection by zone and by agent; attention and messages of the
+    knowledge source; the critic's calibration, with and without messages; an episode as pictures; hyperparameters; a
+    text that explains the tags; and a layout of the custom scalars page. ``docs/tensorboard.md`` explains the results.
+    Parts that a policy or an environment lacks are omitted.
 
-    Training is not affected: no generator that it draws from moves.
+    Training is not affected: its random generators are unchanged.
 
-    :param eval_env: environment of teams of its own, for instance from ``make_team_env`` with ``n_envs=16`` and, for
+    :param eval_env: separate environment of teams, for instance from ``make_team_env`` with ``n_envs=16`` and, for
         pictures of episodes, ``render_mode="rgb_array"``
     :param every_game_steps: game steps (of training, summed over all parallel games) between inspections
     :param n_eval_episodes: team episodes per inspection
-    :param seed: of the episodes; the same ones are played at every inspection
-    :param deterministic: whether the policy takes its most likely actions; as it trains, it does not. QPLEX always
-        takes its best ones
-    :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) whole numbers from 0; None asks the
-        games for ``agent_zones``, as HECOGrid's have them; False for no zones
+    :param seed: seed of the episodes, which are the same at every inspection
+    :param deterministic: whether the policy takes its most likely actions; in training it samples. QPLEX always takes
+        its best ones
+    :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) integers from 0; None uses the
+        games' ``agent_zones``, as in HECOGrid; False for no zones
     :param pictures: whether to draw figures and episodes, which needs matplotlib and Pillow; False writes numbers only
-    :param hparams: hyperparameters of your own to show beside the model's, such as the task and its level
+    :param hparams: additional hyperparameters to show, such as the task and its level
     :param verbose: 1 prints a line per inspection
-    :raises ValueError: if ``eval_env`` is not made of teams or an argument is out of range; when training starts, if
-        the policy is none of this package's or ``eval_env`` does not fit the training environment
+    :raises ValueError: if ``eval_env`` has no teams or an argument is out of range; when training starts, if the policy
+        is not of this package or ``eval_env`` does not match the training environment
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class InspectionCallback(BaseCallback):
         self._next = 0
         self._last: int | None = None
 
-    # --- when -------------------------------------------------------------------------------------------------------
+    # --- timing -----------------------------------------------------------------------------------------------------
 
     def _init_callback(self) -> None:
         require_our_policy(self.model.policy)
@@ -111,11 +111,11 @@ class InspectionCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        # RL-Zoo3 ends callbacks even if training never began, which would hide why.
+        # RL-Zoo3 ends callbacks even if training never began; an error here would hide the cause.
         if self._last is not None and self._last != team_steps(self.model):
             self._inspect()
 
-    # --- what -------------------------------------------------------------------------------------------------------
+    # --- content ----------------------------------------------------------------------------------------------------
 
     def _inspect(self) -> dict[str, float]:
         """Play, write, and return the scalars."""
@@ -149,7 +149,7 @@ class InspectionCallback(BaseCallback):
         return scalars
 
     def _costs(self) -> dict[str, float]:
-        # At the start there is no training yet that it could be a share of.
+        # At the start there is no training time yet of which it could be a fraction.
         elapsed = time.perf_counter() - self._started
         costs = {"time/inspection_seconds": self.seconds}
         return costs | {"time/inspection_share": self.seconds / elapsed} if team_steps(self.model) else costs

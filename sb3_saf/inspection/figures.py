@@ -1,6 +1,6 @@
 """
-Figures of the TensorBoard page. Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones are
-marked in the colours that the environment gives them.
+Figures of the TensorBoard page. Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones have
+the environment's colours.
 
 Letters: U policies, K zones, N agents, L slots, T game steps, n values.
 """
@@ -75,7 +75,7 @@ def _ticks(axes: Axes, rows: Sequence[str], columns: Sequence[str]) -> None:
 
 
 def _numbers(count: int) -> list[str]:
-    """0, 1, 2 ...; of many, every so many."""
+    """Return tick labels 0, 1, 2 ..., thinned out if there are many."""
     step = 1 + count // 16
     return [str(index) if index % step == 0 else "" for index in range(count)]
 
@@ -89,7 +89,7 @@ def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
     if colours is not None:
         from matplotlib.patches import Rectangle
 
-        # A band of the zone's colour, as agents in it are drawn, between the labels and the table.
+        # A band of the zone's colour between the labels and the table.
         for zone in range(n_zones):
             axes.add_patch(Rectangle((-0.58, zone - 0.5), 0.07, 1, color=colours[zone], clip_on=False))
         axes.tick_params(axis="y", pad=10)
@@ -107,7 +107,7 @@ def chosen_by_agent(table: Doubles) -> Figure:
 
 
 def policy_differences(table: Doubles) -> Figure:
-    """Draw how differently policies act: Hellinger distances (U, U)."""
+    """Draw the Hellinger distances between policies, (U, U)."""
     names = [f"policy {policy}" for policy in range(len(table))]
     figure, (axes,) = _figure(5.6, 4.4, title="How differently policies act (0 alike, 1 never alike)")
     _heat_map(axes, table, "Hellinger distance", vmax=1.0, percent=False)
@@ -116,7 +116,7 @@ def policy_differences(table: Doubles) -> Figure:
 
 
 def attention(write: Attention, read: Attention) -> Figure:
-    """Draw who writes to which slot, (L, N), and who reads which, (N, L)."""
+    """Draw the attention of writing, (L, N), and of reading, (N, L)."""
     n_slots, n_agents = write.mean.shape
     width, height = min(14.0, 4.2 + 0.28 * n_agents), 2.4 + 0.7 * n_slots
     figure, (above, below) = _figure(width, height, 2, title="Knowledge source: mean attention")
@@ -131,7 +131,7 @@ def attention(write: Attention, read: Attention) -> Figure:
 
 
 def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
-    """Draw who writes to which slot, step by step in one episode, (T, L, N)."""
+    """Draw the attention of writing at each step of one episode, (T, L, N)."""
     n_steps, n_slots, n_agents = write.shape
     n_shown = min(n_slots, 6)
     height = 1.4 + n_shown * (0.35 + 0.12 * min(n_agents, 20))
@@ -160,12 +160,12 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
 
 def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Calibration, unit: str | None) -> Figure:
     """
-    Values against the returns that followed.
+    Draw values against returns.
 
     :param values: (n,)
     :param returns: (n,)
-    :param found: what they agree on
-    :param unit: what returns count
+    :param found: their calibration
+    :param unit: unit of returns
     """
     figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)

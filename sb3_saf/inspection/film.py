@@ -1,4 +1,4 @@
-"""An episode as pictures: a few moments in two rows, and a GIF that plays in the page."""
+"""An episode as pictures: a few moments in two rows, and a GIF."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_saf.inspection.games import Picture
 
-#: Pixels: height of a moment in the strip, and of the GIF.
+#: Height in pixels of a moment in the strip, and of the GIF.
 _HEIGHT: Final = 320
 _GAP: Final = 6
 _N_MOMENTS: Final = 6
@@ -20,7 +20,7 @@ _COLOURS: Final = 64
 
 
 def strip(pictures: Sequence[Picture]) -> Picture:
-    """Join six of (height, width, 3) pictures, evenly spread, in two rows; all in one row where there are fewer."""
+    """Join six evenly spaced pictures (height, width, 3) in two rows, or all in one row if there are fewer."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, _N_MOMENTS).round().astype(int))
     moments = [_scaled(pictures[index]) for index in chosen]
     rows = [moments] if len(moments) < _N_MOMENTS else [moments[:_PER_ROW], moments[_PER_ROW:]]
@@ -36,9 +36,7 @@ def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
 
 def gif(pictures: Sequence[Picture]) -> bytes:
     """
-    Encode all pictures as a GIF that repeats.
-
-    TensorBoard shows a GIF like any image; SB3's ``Video`` makes one, too, but needs moviepy for it.
+    Encode all pictures as a repeating GIF. TensorBoard shows a GIF like any image; SB3's ``Video`` would need moviepy.
 
     :param pictures: (height, width, 3) each
     """

@@ -4,15 +4,15 @@ Optional attributes of games that inspection reads through ``get_attr`` and ``en
 ================ ======================= ==============================================================================
 attribute        form                    meaning
 ================ ======================= ==============================================================================
-``agent_zones``  (N,) whole numbers      the zone that each agent is in now, from 0; -1 for none
+``agent_zones``  (N,) integers           present zone of each agent, from 0; -1 for none
 ``zone_colours`` Z times (r, g, b)       colour of each zone, 0 to 255
-``return_unit``  str                     what the team return counts, such as ``"treasures"``
+``return_unit``  str                     unit of the team return, such as ``"treasures"``
 ``best_return``  number                  the largest possible team return
 ``action_names`` A times str             name of each action
-``render_mode``  ``"rgb_array"``         its method ``render`` then gives a picture, (height, width, 3) uint8
+``render_mode``  ``"rgb_array"``         the method ``render`` then returns a picture, (height, width, 3) uint8
 ================ ======================= ==============================================================================
 
-A game on a grid may have two methods for :func:`~sb3_saf.replay`: ``grid_scene()`` gives what a drawing needs (see
+A game on a grid may have two methods for :func:`~sb3_saf.replay`: ``grid_scene()`` returns the data for a drawing (see
 ``HECOGridEnv``), ``replica()`` another game that plays the same episode from the same seed.
 
 Letters: E games, N agents, B rows, A actions.
@@ -31,23 +31,23 @@ from sb3_saf.envs.teams import require_n_agents
 
 Ints = npt.NDArray[np.int64]
 Picture = npt.NDArray[np.uint8]
-#: From the environment to the zone of each row's agent, (B,) whole numbers from 0, -1 for none.
+#: Function from the environment to the zone of each row's agent, (B,) integers from 0, -1 for none.
 ZoneFunction = Callable[[VecEnv], npt.ArrayLike]
-#: None asks the environment; False is for no zones.
+#: None uses the environment's attribute; False disables zones.
 Zones = ZoneFunction | Literal[False] | None
 
 _NO_ZONE = -1
 
 
 class ReturnScale(NamedTuple):
-    """The unit of team returns, such as ``"treasures"``, and the largest possible one; None where it is not known."""
+    """The unit of team returns, such as ``"treasures"``, and the largest possible one; None if unknown."""
 
     unit: str | None
     best: float | None
 
 
 def check_zones(zones: object) -> None:
-    """Check the argument ``zones``; a ValueError if it is neither None, False nor a function."""
+    """Check the argument ``zones``; ValueError if it is neither None, False nor a function."""
     if zones is not None and zones is not False and not callable(zones):
         raise ValueError(
             "zones must be a function from the environment to the zone of each row, None to ask the environment for "
@@ -56,7 +56,7 @@ def check_zones(zones: object) -> None:
 
 
 def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
-    """Return what gives the zones of rows of teams, as the user's ``zones`` say; None if there are none."""
+    """Return the function for the zones of rows according to ``zones``; None if there are none."""
     check_zones(zones)
     if zones is False:
         return None
@@ -66,12 +66,12 @@ def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
 
 
 def zones_by_attribute(env: VecEnv) -> Ints:
-    """Return (B,) the games' attribute ``agent_zones``."""
+    """Return the games' attribute ``agent_zones``, (B,)."""
     return np.concatenate([np.asarray(zones, dtype=np.int64) for zones in _of_games(env, "agent_zones")])
 
 
 def zones_now(zones: ZoneFunction, env: VecEnv) -> Ints:
-    """Return (B,) the zone of each row; a ValueError if they are not (B,) whole numbers of at least -1."""
+    """Return the zone of each row, (B,); ValueError if they are not (B,) integers of at least -1."""
     found = np.asarray(zones(env))
     if found.shape != (env.num_envs,) or found.dtype.kind not in "iu" or (found < _NO_ZONE).any():
         raise ValueError(
@@ -109,5 +109,5 @@ def picture(env: VecEnv) -> Picture | None:
 
 
 def _of_games(env: VecEnv, name: str) -> Sequence[Any]:
-    """Return an attribute of each game, asked for once per game."""
+    """Return an attribute of each game, queried once per game."""
     return env.get_attr(name, indices=range(0, env.num_envs, require_n_agents(env)))

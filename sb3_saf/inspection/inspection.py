@@ -1,4 +1,4 @@
-"""Inspection of a team: its recorded episodes as numbers, figures and a film."""
+"""Inspection of a team: its recorded episodes as scalars, figures and a film."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 class Inspection(NamedTuple):
     """
-    Recorded episodes of a team, and how to show them.
+    Recorded episodes of a team, with scalars and figures.
 
     :param recording: every step, as arrays
-    :param action_space: one agent's
+    :param action_space: one agent's action space
     :param scale: unit of team returns
-    :param colours: of the zones; None if the environment has none
-    :param gae_lambda: of the targets that the critic learns
+    :param colours: colours of the zones; None if the environment has none
+    :param gae_lambda: lambda of the critic's training targets
     """
 
     recording: EpisodeRecording
@@ -40,7 +40,7 @@ class Inspection(NamedTuple):
 
     @property
     def scalars(self) -> dict[str, float]:
-        """Everything that is a number, by the names that TensorBoard shows (``docs/tensorboard.md``)."""
+        """Scalars by their names in TensorBoard (``docs/tensorboard.md``)."""
         return {
             **numbers.team_scalars(self.recording, self.scale),
             **numbers.pool_scalars(self.recording, self.action_space),
@@ -51,7 +51,7 @@ class Inspection(NamedTuple):
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """Figures by the names that TensorBoard shows. Needs matplotlib."""
+        """Figures by their names in TensorBoard. Needs matplotlib."""
         return {"critic/calibration": self._calibration(), **self._of_the_pool(), **self._of_the_knowledge_source()}
 
     @property
@@ -110,21 +110,21 @@ def inspect_team(
     observations: bool = True,
 ) -> Inspection:
     """
-    Inspect a team: play episodes, and keep what its policy saw, did and computed.
+    Inspect a team: play episodes, and record its observations, actions and network outputs.
 
-    :class:`~sb3_saf.InspectionCallback` writes the same to TensorBoard. Of the result, ``scalars`` are numbers by name,
-    ``figures`` are drawn when asked for, ``film`` is the first episode as a GIF, ``recording`` has every step.
+    :class:`~sb3_saf.InspectionCallback` writes the same to TensorBoard. The result has ``scalars`` by name, ``figures``
+        drawn on access, ``film``, the first episode as a GIF, and ``recording`` with every step.
 
-    :param model: with a policy of this package
+    :param model: model with a policy of this package
     :param eval_env: environment of teams, for instance from ``make_team_env`` with ``n_envs=16`` and, for a film,
         ``render_mode="rgb_array"``
     :param n_eval_episodes: team episodes to play
-    :param seed: of the episodes
+    :param seed: seed of the episodes
     :param deterministic: whether the policy takes its most likely actions
     :param zones: as in :class:`~sb3_saf.InspectionCallback`
     :param pictures: whether to draw the first game
-    :param observations: whether to keep the agents' own observations
-    :raises ValueError: if the policy is none of this package's or ``eval_env`` is not made of teams
+    :param observations: whether to record the agents' own observations
+    :raises ValueError: if the policy is not of this package or ``eval_env`` has no teams
     """
     recording = record_episodes(
         model.policy,
@@ -143,7 +143,7 @@ def inspect_team(
 
 
 def _first_episode(recording: EpisodeRecording, attention: np.ndarray) -> np.ndarray:
-    """Return (T', ...) of the first game that was played, up to the end of its first episode."""
+    """Return the entries (T', ...) of the first game up to the end of its first episode."""
     game = int(np.flatnonzero(numbers.counted_games(recording).any(axis=0))[0])
     ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
     return attention[: int(np.flatnonzero(ends)[0]) + 1, game]

@@ -1,5 +1,5 @@
 """
-How a pool of policies is used, and whether its policies differ at all.
+Statistics of a pool of policies: its selection, and the differences between its policies.
 
 Letters: n rows, U policies, P parameters of an action distribution, K groups (zones or agents).
 """
@@ -18,10 +18,8 @@ Floats = npt.NDArray[np.floating[Any]]
 
 class SelectionEntropy(NamedTuple):
     """
-    How the pool is used, from 0 to 1 (entropies divided by log U).
-
-    Both low: the pool has collapsed to one policy. ``each`` low and ``mean`` high: confident choices that differ from
-    one observation to the next. Both high: nothing is chosen, all policies are blended.
+    Entropies of the selection, from 0 to 1 (divided by log U). Both low: the pool has collapsed to one policy. ``each``
+    low and ``mean`` high: confident selection that depends on the observation. Both high: all policies are blended.
 
     :param each: mean entropy of the weights of one observation
     :param mean: entropy of the mean weights
@@ -32,7 +30,7 @@ class SelectionEntropy(NamedTuple):
 
 
 def selection_entropy(weights: Floats) -> SelectionEntropy:
-    """Compute entropies of the choice from weights (n, U)."""
+    """Compute entropies of the selection from weights (n, U)."""
     scale = math.log(weights.shape[1])
     return SelectionEntropy(
         float(entropy(weights).mean()) / scale, float(entropy(weights.mean(axis=0, dtype=np.float64))) / scale
@@ -47,10 +45,10 @@ def entropy(probabilities: Floats) -> npt.NDArray[np.float64]:
 
 def chosen_by(weights: Floats, groups: npt.NDArray[np.integer[Any]], n_groups: int) -> npt.NDArray[np.float64]:
     """
-    How often each policy is chosen in each group.
+    Return how often each policy is selected in each group.
 
     :param weights: (n, U)
-    :param groups: (n,) from 0; rows with -1 belong to none
+    :param groups: (n,) from 0; -1 for rows without a group
     :param n_groups: K
     :return: (K, U), rows sum to 1; NaN for groups without rows
     """
@@ -63,12 +61,12 @@ def chosen_by(weights: Floats, groups: npt.NDArray[np.integer[Any]], n_groups: i
 
 def zone_dependence(weights: Floats, zones: npt.NDArray[np.integer[Any]]) -> float | None:
     """
-    How much the zone tells about the policy that is chosen: their mutual information, divided by the smaller of
-    log U and log K.
+    Return the mutual information of zone and selected policy, divided by the smaller of log U and log K.
 
     :param weights: (n, U)
     :param zones: (n,) from 0, -1 for none
-    :return: from 0 (no zone differs from another) to 1 (each zone has its own policy); None for fewer than two zones
+    :return: from 0 (selection is independent of the zone) to 1 (each zone has its own policy); None for fewer than two
+        zones
     """
     inside = zones >= 0
     counts = np.bincount(zones[inside])
@@ -83,11 +81,9 @@ def zone_dependence(weights: Floats, zones: npt.NDArray[np.integer[Any]]) -> flo
 
 def differences(action_space: spaces.Space[Any], actions: Floats) -> npt.NDArray[np.float64]:
     """
-    How differently the policies of a pool act: the Hellinger distance between their action distributions, mean over
-    observations.
-
-    sqrt(1 - sum_a sqrt(p(a) q(a))): 0 for equal distributions, 1 for those that have no action in common. It is exact
-    for every kind of action space, joint actions of several dimensions included.
+    Return the Hellinger distances between the action distributions of a pool's policies, mean over observations. sqrt(1
+    - sum_a sqrt(p(a) q(a))): 0 for equal distributions, 1 for disjoint ones. It is exact for every kind of action
+    space, including joint actions of several dimensions.
 
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param actions: (n, U, P) parameters of each policy's distribution
@@ -109,7 +105,7 @@ def mean_difference(table: npt.NDArray[np.float64]) -> float:
 
 
 def _overlap(action_space: spaces.Space[Any], p: Floats, q: Floats) -> npt.NDArray[np.float64]:
-    """(n,) Bhattacharyya coefficients, a product over action dimensions."""
+    """Return Bhattacharyya coefficients (n,), a product over action dimensions."""
     if isinstance(action_space, spaces.Box):
         return _overlap_of_gaussians(p, q)
     if isinstance(action_space, spaces.MultiBinary):

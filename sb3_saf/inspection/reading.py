@@ -1,9 +1,8 @@
 """
-What a policy computes in one step of all games: actions and values, the weights of its pool, the attention of its
-knowledge source, and the values of its critic without the message that it read.
-
-Rows are read with the policies' own readers, so that what is shown is what they read. Letters: B rows of E games with
-N agents each, U policies or heads, L slots, P parameters of an action distribution, A actions, d features.
+Readers of a policy's outputs in one step of all games: actions and values, weights of the pool, attention of the
+knowledge source, and the critic's values without the message read. Rows are read by the policies' own methods. Letters:
+B rows of E games with N agents each, U policies or heads, L slots, P parameters of an action distribution, A actions, d
+features.
 """
 
 from __future__ import annotations
@@ -33,16 +32,16 @@ Bools = npt.NDArray[np.bool_]
 #: Policies of this package.
 OurPolicy = TeamPolicy | QPLEXPolicy
 
-#: What replaces a message: zeros, or what the same agent of another game read at the same time.
+#: Replacement of a message: zeros, or the message of the same agent in another game at the same step.
 Replacement = Literal["zero", "shuffled"]
 REPLACEMENTS: Final[tuple[Replacement, ...]] = get_args(Replacement)
 
 
 class PoolReading(NamedTuple):
     """
-    The pool of policies in one step.
+    Pool of policies in one step.
 
-    :param weights: (B, U), how likely each policy is chosen; sums to 1
+    :param weights: (B, U), selection probability of each policy; sums to 1
     :param actions: (B, U, P), parameters of each policy's action distribution, illegal actions masked
     """
 
@@ -52,12 +51,12 @@ class PoolReading(NamedTuple):
 
 class SourceReading(NamedTuple):
     """
-    The knowledge source in one step.
+    Knowledge source in one step.
 
     :param write: (E, L, N), attention of slots over agents
     :param read: (E, N, L), attention of agents over slots
     :param strengths: (B,), Euclidean norm of the message that each agent read
-    :param values: (B,) each, values with another message in place of the one read
+    :param values: (B,) each, values with a replaced message
     """
 
     write: th.Tensor
@@ -70,9 +69,9 @@ class StepReading(NamedTuple):
     """
     One step of all games.
 
-    :param actions: (B, ...) as an environment takes them
+    :param actions: (B, ...) actions for the environment
     :param values: (B,)
-    :param probabilities: (B, A) of each action; None unless actions are Discrete
+    :param probabilities: (B, A) probability of each action; None unless actions are Discrete
     :param pool: None for a policy without a pool
     :param source: None for a policy without a knowledge source
     """
@@ -85,7 +84,7 @@ class StepReading(NamedTuple):
 
 
 def require_our_policy(policy: BasePolicy) -> OurPolicy:
-    """Return the policy; a ValueError if it is none of this package's and cannot be inspected."""
+    """Return the policy; ValueError if it is not of this package and cannot be inspected."""
     if isinstance(policy, (TeamPolicy, QPLEXPolicy)):
         return policy
     raise ValueError(
@@ -98,9 +97,9 @@ def reader_of(policy: OurPolicy, n_rows: int, deterministic: bool = False) -> Po
     """
     Make the reader of a policy.
 
-    :param policy: to read
+    :param policy: policy to read
     :param n_rows: B
-    :param deterministic: whether it takes its most likely actions; those of a value-based policy always are its best
+    :param deterministic: whether it takes its most likely actions; value-based policies always take their best ones
     """
     if isinstance(policy, QPLEXPolicy):
         return QReader(policy)
@@ -111,9 +110,9 @@ def reader_of(policy: OurPolicy, n_rows: int, deterministic: bool = False) -> Po
 
 class PolicyReader:
     """
-    Acts with an actor-critic policy and reads what it computes.
+    Act with an actor-critic policy and read its outputs.
 
-    :param policy: SAF's, MAPPO's, IPPO's, with or without action masks
+    :param policy: policy of SAF, MAPPO or IPPO, with or without action masks
     :param deterministic: whether it takes its most likely actions
     """
 
@@ -139,10 +138,10 @@ class PolicyReader:
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """
-        Compute the values of last observations, which bootstrap a time limit that is no true end.
+        Compute the values of last observations, for bootstrapping time limits that are no true ends.
 
         :param obs: rows of the games that ended
-        :param rows: (K,) which rows of the last step they are
+        :param rows: (K,) their indices among the rows of the last step
         :return: (K,)
         """
         values: th.Tensor = self.policy.predict_values(obs)
@@ -164,7 +163,7 @@ class PolicyReader:
     def _source_reading(self, source: SAFStates, obs: Tensors) -> SourceReading:
         _, teams = self.policy.encode_teams(obs)
         _, exchanged = source.communicate(teams.features, teams.members, teams.active)
-        # Rows that are no whole teams in order have equal teams computed once; from here on, games count.
+        # In rows that are not whole teams in order, equal teams are computed once; expand them to games.
         n_agents = self.policy.team_spaces.n_agents
         team = th.arange(len(exchanged.read)) if teams.rows is None else teams.rows[::n_agents] // n_agents
         values: dict[Replacement, th.Tensor] = {}
@@ -175,14 +174,14 @@ class PolicyReader:
         return SourceReading(exchanged.write_attention[team], exchanged.read_attention[team], strengths, values)
 
     def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
-        """Compute (B,) values while messages are replaced."""
+        """Compute values (B,) with replaced messages."""
         values: th.Tensor = self.policy.predict_values(obs)
         return values.flatten()
 
 
 @contextmanager
 def _other_messages(source: SAFStates, replacement: Replacement) -> Iterator[None]:
-    """Let a critic read other messages than those that its agents have read."""
+    """Replace the messages that a critic reads."""
 
     def replaced(_: th.nn.Module, inputs: tuple[th.Tensor, ...]) -> th.Tensor:
         states, read = inputs[0].chunk(2, dim=2)
@@ -197,9 +196,10 @@ def _other_messages(source: SAFStates, replacement: Replacement) -> Iterator[Non
 
 class RecurrentPolicyReader(PolicyReader):
     """
-    Reader of a policy with memory. Messages are replaced at every step, so the critic's memory is of replaced messages.
+    Reader of a policy with memory. Messages are replaced at every step, so the critic's memory also depends on replaced
+    messages.
 
-    :param policy: of RecurrentPPO
+    :param policy: policy of RecurrentPPO
     :param n_rows: B
     :param deterministic: whether it takes its most likely actions
     """
@@ -237,9 +237,9 @@ class RecurrentPolicyReader(PolicyReader):
 
 class QReader:
     """
-    Acts with a value-based policy and reads what it computes. It always takes its best actions.
+    Act with a value-based policy and read its outputs. It always takes its best actions.
 
-    :param policy: QPLEX's, QMIX's or VDN's, with or without memory
+    :param policy: policy of QPLEX, QMIX or VDN, with or without memory
     """
 
     #: Values are Q_tot, of the sum of all agents' rewards.
@@ -250,7 +250,7 @@ class QReader:
         self._state: State | None = None
 
     def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
-        """See :class:`PolicyReader`; ``action_masks`` is not read: legal actions are part of the rows."""
+        """See :class:`PolicyReader`; ``action_masks`` is unused: legal actions are part of the rows."""
         values, latents, self._state = self.policy.evaluate(obs, self._state, starts)
         best = values.argmax(dim=1)
         probabilities = th.nn.functional.one_hot(best, values.shape[1]).to(values.dtype)
@@ -263,7 +263,7 @@ class QReader:
         return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state).values)
 
     def _pool(self, values: th.Tensor, latents: th.Tensor) -> PoolReading | None:
-        """Return the weights with which training draws heads, and each head's best action with probability 1."""
+        """Return the weights with which training samples heads, and each head's best action with probability 1."""
         if not isinstance(self.policy.actor, PolicyPool):
             return None
         log_weights, of_heads = self.policy.actor.evaluate(latents)

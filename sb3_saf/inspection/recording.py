@@ -1,8 +1,7 @@
 """
-Recording of team episodes: everything that a policy saw, did and computed, step by step, as plain arrays.
-
-Figures, films, TensorBoard and reports read a recording and nothing else. Letters: T game steps, E games, N agents,
-B = E N rows, A actions, U policies, L slots, P parameters of an action distribution.
+Recording of team episodes: observations, actions and network outputs of every step as plain arrays. Figures, films,
+TensorBoard and reports read recordings only. Letters: T game steps, E games, N agents, B = E N rows, A actions, U
+policies, L slots, P parameters of an action distribution.
 """
 
 from __future__ import annotations
@@ -40,30 +39,30 @@ Ints = npt.NDArray[np.int64]
 
 class EpisodeRecording(NamedTuple):
     """
-    Team episodes, step by step. Rows count while their agent takes part in an episode of the set.
+    Team episodes, step by step. Rows count while their agent takes part in a recorded episode.
 
     :param n_agents: N; row ``e * N + i`` is agent ``i`` of game ``e``
-    :param of_team: whether values and rewards are the team's, the same in all its rows, not the agent's own
+    :param of_team: whether values and rewards are the team's, equal in all its rows, instead of the agent's own
     :param gamma: discount factor of the returns
-    :param observations: (T, B, *shape) own observations; None if they were not asked for
-    :param actions: (T, B, ...) as the games took them
+    :param observations: (T, B, *shape) own observations; None if not recorded
+    :param actions: (T, B, ...) actions passed to the games
     :param action_probabilities: (T, B, A); None unless actions are Discrete
     :param counted: (T, B) whether the row counts
-    :param rewards: (T, B) as the critic learns them
+    :param rewards: (T, B) rewards from which the critic learns
     :param ends: (T, B) whether the episode ended with this step, or (unless values are the team's) the agent's own part
-    :param last_values: (T, B) value of what follows a time limit that is no true end, else 0
+    :param last_values: (T, B) value of the last observation at a time limit that is no true end, else 0
     :param values: (T, B)
-    :param returns: (T, B) discounted returns that followed
-    :param zones: (T, B), -1 for none; None where there are no zones
-    :param pool_weights: (T, B, U) how likely each policy is chosen; None without a pool
+    :param returns: (T, B) discounted returns
+    :param zones: (T, B), -1 for none; None if there are no zones
+    :param pool_weights: (T, B, U) selection probability of each policy; None without a pool
     :param pool_actions: (T, B, U, P) parameters of each policy's action distribution; None without a pool
     :param write_attention: (T, E, L, N) attention of slots over agents; None without a knowledge source
     :param read_attention: (T, E, N, L) attention of agents over slots; None without a knowledge source
     :param message_strengths: (T, B) norm of the message that each agent read; None without a knowledge source
-    :param values_without: (T, B) each, values with another message in place of the one read
+    :param values_without: (T, B) each, values with a replaced message
     :param episode_returns: team return of each episode
     :param episode_lengths: game steps of each episode
-    :param pictures: of the first game's first episode, one per step
+    :param pictures: pictures of the first game's first episode, one per step
     """
 
     n_agents: int
@@ -105,21 +104,20 @@ def record_episodes(
     pictures: bool = True,
 ) -> EpisodeRecording:
     """
-    Play a fixed set of team episodes and record them; no generator that training draws from moves.
+    Play a fixed set of team episodes and record them, without changing training's random generators. Episodes are
+    divided over the games as in ``evaluate_team``.
 
-    Each game plays its share, as ``evaluate_team`` divides them.
-
-    :param policy: of this package
+    :param policy: policy of this package
     :param env: environment of teams
     :param n_eval_episodes: team episodes to play
-    :param seed: of games and actions
+    :param seed: seed of games and actions
     :param deterministic: whether the policy takes its most likely actions
     :param gamma: discount factor of the returns
     :param zones: as in :class:`~sb3_saf.InspectionCallback`
-    :param normalizer: normalises the rewards that the critic learns from; None if nothing does
-    :param observations: whether to keep the agents' own observations
+    :param normalizer: normaliser of the critic's rewards; None for raw rewards
+    :param observations: whether to record the agents' own observations
     :param pictures: whether to draw the first game, if its render mode allows it
-    :raises ValueError: if the policy is none of this package's or ``env`` is not made of teams
+    :raises ValueError: if the policy is not of this package or ``env`` has no teams
     """
     ours, n_agents = require_our_policy(policy), require_n_agents(env)
     check_count("n_eval_episodes", n_eval_episodes)
@@ -138,7 +136,7 @@ def record_episodes(
 
 
 class _Recorder:
-    """Plays episodes, ``shares`` (E,) of each game, and collects what every step gives."""
+    """Recorder that plays ``shares`` (E,) episodes of each game and collects the results of every step."""
 
     def __init__(
         self,
@@ -161,7 +159,7 @@ class _Recorder:
         self.columns: dict[str, list[npt.NDArray[Any]]] = {}
 
     def play(self, seed: int, draw: bool) -> None:
-        """Play until every game has had its share."""
+        """Play until every game has played its share."""
         self.env.seed(seed)
         obs = self.env.reset()
         starts = np.ones(self.env.num_envs, dtype=bool)
@@ -186,7 +184,7 @@ class _Recorder:
         self.readings.append(reading)
         self._keep("counted", counted)
         self._keep("rewards", self._team_sums(learned) if self.reader.of_team else learned)
-        # Nothing that comes after an agent's own end counts for it, as in TeamRolloutBuffer.
+        # An agent's return ends with its own end, as in TeamRolloutBuffer.
         self._keep("ends", dones if self.reader.of_team else dones | ~_active(following, self.n_agents))
         self._keep("last_values", _last_values(self.reader, dones, infos))
         if zones is not None:
@@ -200,12 +198,12 @@ class _Recorder:
         self.columns.setdefault(name, []).append(column)
 
     def _team_sums(self, rewards: Floats) -> Floats:
-        """Return (B,) the team's reward in each of its rows."""
+        """Return the team's reward in each of its rows, (B,)."""
         teams: Floats = rewards.reshape(-1, self.n_agents).sum(axis=1, keepdims=True)
         return np.repeat(teams, self.n_agents, axis=1).reshape(-1)
 
     def _count(self, rewards: Floats, dones: Bools, counted: Bools) -> None:
-        """Add up the returns and lengths of episodes."""
+        """Update the returns and lengths of episodes."""
         playing = counted.reshape(-1, self.n_agents).any(axis=1)
         self.returns_now += rewards.reshape(-1, self.n_agents).sum(axis=1, dtype=np.float64)
         self.lengths_now += 1
@@ -216,7 +214,7 @@ class _Recorder:
         self.episodes += ended
 
     def recording(self, gamma: float) -> EpisodeRecording:
-        """Return everything so far."""
+        """Return the recording of all steps so far."""
         columns = {name: np.stack(column) for name, column in self.columns.items()}
         pools = [reading.pool for reading in self.readings if reading.pool]
         sources = [reading.source for reading in self.readings if reading.source]
@@ -263,14 +261,14 @@ def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:
 
 
 def _active(obs: Any, n_agents: int) -> Bools:
-    """Return (B,) whether the row's agent takes part."""
+    """Return whether the row's agent takes part, (B,)."""
     if ACTIVE_KEY not in obs:
         return np.ones(len(obs[OBS_KEY]), dtype=bool)
     return np.asarray(obs[ACTIVE_KEY][::n_agents]).reshape(-1) != 0
 
 
 def _last_values(reader: PolicyReader | QReader, dones: Bools, infos: list[dict[str, Any]]) -> Floats:
-    """Compute (B,) values of last observations where a time limit is no true end, as SB3 bootstraps them."""
+    """Compute values (B,) of last observations at time limits that are no true ends, as SB3 bootstraps them."""
     values = np.zeros(len(infos), dtype=np.float32)
     rows = np.array([row for row in np.flatnonzero(dones) if infos[row].get(TRUNCATED)], dtype=np.int64)
     if len(rows):

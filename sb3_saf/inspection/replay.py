@@ -1,5 +1,5 @@
 """
-One self-contained web page that plays episodes and shows what each agent sees and its policy computes.
+Self-contained web page that plays episodes with each agent's observation and policy outputs.
 
 Letters: T game steps, N agents, A actions, U policies, L slots.
 """
@@ -29,9 +29,9 @@ from sb3_saf.inspection.games import draws_pictures, picture
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.randomness import own_randomness
 
-#: Longer episodes are cut, and the page says so.
+#: Maximum game steps of an episode; longer ones are cut, with a note on the page.
 MAX_STEPS: Final = 2000
-#: Shares between 0 and 1 travel as 16-bit numbers.
+#: Scale of fractions from 0 to 1 stored as 16-bit integers.
 _SHARE: Final = 65535
 _KINDS: Final = {"u1": np.uint8, "u2": np.uint16, "i2": np.int16, "f4": np.float32}
 
@@ -40,13 +40,13 @@ Packed = dict[str, Any]
 
 
 class _Episode(NamedTuple):
-    """One episode of one game: (T, N) actions, (T,) rewards of the team, and what the page shows beside them."""
+    """One episode of one game: actions (T, N), team rewards (T,), and further data of the page."""
 
     actions: npt.NDArray[Any]
     rewards: npt.NDArray[np.float64]
-    #: Packed, by name.
+    #: Packed arrays by name.
     arrays: dict[str, Packed | None]
-    #: Data URLs of pictures, where there is no grid.
+    #: Data URLs of pictures, if there is no grid.
     frames: list[str]
     #: Whether values are the team's.
     of_team: bool = False
@@ -62,23 +62,23 @@ def replay(
     gamma: float | None = None,
 ) -> Path:
     """
-    Play episodes and write a page on which they can be watched, agent by agent, offline and without a server.
+    Play episodes and write a page that shows them agent by agent, offline and without a server.
 
-    Models of SAF, MAPPO, IPPO and QPLEX are shown with what they have: action probabilities, pool, knowledge source,
-    values. Exported actors are shown with their own observations and actions. HECOGrid is drawn from its state, other
-    games from the pictures that they render.
+    Models of SAF, MAPPO, IPPO and QPLEX are shown with action probabilities, pool, knowledge source and values, as far
+    as they have them. Exported actors are shown with own observations and actions. HECOGrid is drawn from its state,
+    other games from rendered pictures.
 
-    :param model: a trained model, its policy, an exported :class:`~sb3_saf.Actor`, or several by name, which are shown
-        side by side
+    :param model: a trained model, its policy, an exported :class:`~sb3_saf.Actor`, or several by name, shown side by
+        side
     :param env: from ``make_team_env``, with at least ``episodes`` games; HECOGrid needs no render mode, others
         ``render_mode="rgb_array"``
-    :param path: of the page
-    :param episodes: games to show, each from its start; a page shows the first 2,000 game steps
-    :param seed: of games and actions; all models play the same games
+    :param path: path of the page
+    :param episodes: games to show from their start; a page shows at most 2,000 game steps
+    :param seed: seed of games and actions; all models play the same games
     :param deterministic: whether to take the most likely actions
-    :param gamma: discount factor of the returns beside values; None for the model's own
+    :param gamma: discount factor of the returns; None for the model's
     :return: the path
-    :raises ValueError: if a model was trained on other spaces, the games are too few, or they cannot be shown
+    :raises ValueError: if a model was trained on other spaces, there are too few games, or they cannot be shown
     """
     n_agents = require_n_agents(env)
     check_count("episodes", episodes)
@@ -170,7 +170,7 @@ def _share(shares: npt.NDArray[Any] | None, steps: slice, rows: slice | int) -> 
 
 
 def _play_actor(actor: Actor, env: VecEnv, game: int, seed: int, deterministic: bool) -> _Episode:
-    """Play one episode with an exported actor, which sees its own observation and its index."""
+    """Play one episode with an exported actor on own observations and agent indices."""
     n = require_n_agents(env)
     rows = slice(game * n, (game + 1) * n)
     if actor.has_memory or actor.manifest.reads_agent:
@@ -205,7 +205,7 @@ def _play_actor(actor: Actor, env: VecEnv, game: int, seed: int, deterministic: 
 
 
 def _run(name: str, episode: _Episode, env: VecEnv, game: int, seed: int) -> tuple[Packed, Packed]:
-    """Return what the page needs of a game with a grid, played again from its seed, and the grid itself."""
+    """Return the page's data of a game with a grid, played again from its seed, and the grid itself."""
     env.seed(seed)
     replica: Any = env.env_method("replica", indices=[game * require_n_agents(env)])[0]
     replica.reset(seed=_seeds(env)[game])
@@ -237,7 +237,7 @@ def _run_of_frames(name: str, episode: _Episode) -> Packed:
 
 
 def _seeds(env: VecEnv) -> list[int]:
-    """Return the seeds that the games will start from."""
+    """Return the seeds of the games."""
     layer: Any = env
     while not hasattr(layer, "seeded_with"):
         layer = layer.venv
@@ -245,7 +245,7 @@ def _seeds(env: VecEnv) -> list[int]:
 
 
 def _atlas(env: VecEnv) -> npt.NDArray[np.uint8] | None:
-    """Return (codes, t, t, 3) pixels of tile codes, None if observations are no codes."""
+    """Return the pixels of tile codes, (codes, t, t, 3); None if observations are not tile codes."""
     own = TeamSpaces.from_observation_space(env.observation_space).own
     atlas = getattr(own, "atlas", None)
     return None if atlas is None else np.asarray(atlas)
@@ -267,7 +267,7 @@ def _data(env: VecEnv, runs: list[Packed], grid: Packed | None) -> Packed:
 
 
 def _packed(array: npt.ArrayLike, kind: str, scale: float = 1) -> Packed:
-    """Return an array as base64 of little-endian numbers, which the page multiplies by ``scale``."""
+    """Return an array as base64 of little-endian numbers, multiplied by ``scale`` on the page."""
     numbers = np.asarray(array)
     if kind != "f4":
         numbers = np.rint(numbers)
@@ -293,7 +293,7 @@ def _page(title: str, data: Packed) -> str:
     folder = files("sb3_saf.inspection")
     template = folder.joinpath("replay.html").read_text(encoding="utf-8")
     script = folder.joinpath("replay.js").read_text(encoding="utf-8")
-    # "<" inside of strings only: no name can end the element that holds the data.
+    # "<" occurs in strings only: no name can close the element with the data.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     for mark, content in (("{{title}}", escape(title)), ("{{script}}", script), ("{{data}}", text)):
         template = template.replace(mark, content)

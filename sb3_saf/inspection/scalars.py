@@ -1,7 +1,7 @@
 """
 Scalars of the TensorBoard page, from a recording.
 
-Tags are ``group/name``; a group is one box of the page. What a policy or an environment lacks is left out.
+Tags are ``group/name``; a group is one box of the page. Scalars that a policy or an environment lacks are omitted.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class Attention(NamedTuple):
     Attention of queries over sources, over many teams.
 
     :param mean: (Q, S) mean weights; rows sum to 1
-    :param entropy: mean entropy of one query's weights, divided by log S: 0 for a single source, 1 for all alike; None
-        for a single source
+    :param entropy: mean entropy of one query's weights, divided by log S: 0 if one source has all weight, 1 for uniform
+        weights; None if there is only one source
     :param entropy_of_mean: entropy of a query's mean weights, divided by log S, mean over queries; None for a single
-        source. Higher than ``entropy`` where the source that is attended to changes
+        source. Higher than ``entropy`` if the attended source changes
     """
 
     mean: npt.NDArray[np.float64]
@@ -52,7 +52,7 @@ class Attention(NamedTuple):
 
 
 def attention_of(weights: npt.NDArray[np.floating[Any]]) -> Attention:
-    """Sum up attention (n, Q, S); queries without any source (zeros) are left out."""
+    """Summarise attention (n, Q, S); queries without any source (zeros) are excluded."""
     shown = weights.sum(axis=2) > 0
     n_sources = weights.shape[2]
     with np.errstate(invalid="ignore"):
@@ -65,14 +65,14 @@ def attention_of(weights: npt.NDArray[np.floating[Any]]) -> Attention:
 
 
 def counted_agents(recording: EpisodeRecording) -> npt.NDArray[np.int64]:
-    """Return (n,) the agent of each row that counts."""
+    """Return the agent of each counted row, (n,)."""
     n_steps, n_rows = recording.counted.shape
     agents = np.tile(np.arange(recording.n_agents), n_rows // recording.n_agents)
     return np.broadcast_to(agents, (n_steps, n_rows))[recording.counted]
 
 
 def counted_games(recording: EpisodeRecording) -> npt.NDArray[np.bool_]:
-    """Return (T, E) whether a game was in an episode of the set."""
+    """Return whether a game was in a recorded episode, (T, E)."""
     return np.any(recording.counted.reshape(len(recording.counted), -1, recording.n_agents), axis=2)
 
 
@@ -88,7 +88,7 @@ def team_scalars(recording: EpisodeRecording, scale: ReturnScale) -> Scalars:
 
 
 def pool_scalars(recording: EpisodeRecording, action_space: spaces.Space[object]) -> Scalars:
-    """Compute how often each policy is chosen, how decidedly, and how much policies differ."""
+    """Compute how often each policy is selected, the entropy of selection, and the differences between policies."""
     if recording.pool_weights is None or recording.pool_actions is None:
         return {}
     weights = recording.pool_weights[recording.counted]
@@ -115,23 +115,23 @@ def _zone_scalars(recording: EpisodeRecording, weights: npt.NDArray[np.float32])
 
 
 def write_attention(recording: EpisodeRecording) -> Attention | None:
-    """Sum up the attention of slots over agents; None without a knowledge source."""
+    """Summarise the attention of slots over agents; None without a knowledge source."""
     if recording.write_attention is None:
         return None
     return attention_of(recording.write_attention[counted_games(recording)])
 
 
 def read_attention(recording: EpisodeRecording) -> Attention | None:
-    """Sum up the attention of agents over slots; None without a knowledge source."""
+    """Summarise the attention of agents over slots; None without a knowledge source."""
     if recording.read_attention is None:
         return None
-    # Readers that take no part are left out as queries without sources are.
+    # Inactive readers are excluded, like queries without sources.
     takes_part = recording.counted.reshape(*recording.read_attention.shape[:3], 1)
     return attention_of((recording.read_attention * takes_part)[counted_games(recording)])
 
 
 def knowledge_scalars(recording: EpisodeRecording) -> Scalars:
-    """Compute how concentrated writing and reading are, and how much each slot is read."""
+    """Compute the concentration of writing and reading, and the attention to each slot."""
     scalars: Scalars = {}
     read = read_attention(recording)
     for name, attention in (("write", write_attention(recording)), ("read", read)):
@@ -165,13 +165,13 @@ def critic_scalars(recording: EpisodeRecording, gae_lambda: float) -> Scalars:
 
 
 def targets(recording: EpisodeRecording, lam: float) -> npt.NDArray[np.float64]:
-    """Compute (T, B) TD(lambda) targets of a recording."""
+    """Compute TD(lambda) targets (T, B) of a recording."""
     r = recording
     return lambda_returns(r.rewards, r.ends, r.last_values, r.values, r.gamma, lam)
 
 
 def message_scalars(recording: EpisodeRecording) -> Scalars:
-    """Compute the critic's error with the message that it read, and with others in its place."""
+    """Compute the critic's error with the message read, and with replaced ones."""
     if recording.message_strengths is None:
         return {}
     counted, returns = recording.counted, recording.returns[recording.counted]

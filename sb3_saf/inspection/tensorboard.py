@@ -1,8 +1,7 @@
 """
-What inspection writes to TensorBoard: scalars, pictures, hyperparameters, a text that explains the tags, and a layout.
-
-It goes through SB3's logger formats into the run's own event file, by a logger beside the model's: what training has
-recorded and not yet dumped stays there.
+TensorBoard output of inspection: scalars, pictures, hyperparameters, a text that explains the tags, and a layout. It is
+written through SB3's logger formats to the run's event file, by a separate logger, so that training's pending records
+are unchanged.
 """
 
 from __future__ import annotations
@@ -19,20 +18,20 @@ from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, T
 from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.inspection.reading import OurPolicy
 
-#: Formats that hold numbers only.
+#: Formats for numbers only.
 _NUMBERS_ONLY: Final = ("stdout", "log", "json", "csv")
 
-#: Hyperparameters that are shown, of algorithms that have them.
+#: Hyperparameters to show, if the algorithm has them.
 _SHOWN: Final = (
     *("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
     *("buffer_size", "learning_starts", "update_interval", "target_update_interval", "exploration_fraction"),
 )
-#: Scalars that are shown beside hyperparameters.
+#: Scalars to show with the hyperparameters.
 _METRICS: Final = (
     *("team/return", "critic/explained_variance", "pool/entropy", "pool/difference", "message/value_error"),
 )
 
-#: What the groups of tags mean, shown on the Text page.
+#: Explanation of the groups of tags on the Text page.
 _TEXT: Final = """
 The x-axis of every chart counts **game steps**, of all parallel games together. Stable-Baselines3's
 `time/total_timesteps` counts agents' steps: game steps times the number of agents.
@@ -88,9 +87,9 @@ _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
         "error (root mean square)": [r"critic/error"],
     },
 }
-#: Groups that algorithms log themselves, later than the layout is made.
+#: Groups logged by algorithms, after the layout is made.
 _OF_ALGORITHMS: Final = ("rollout/", "time/", "train/", "lambda/")
-#: Charts of algorithms that learn Q_tot.
+#: Charts of algorithms with Q_tot.
 _VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
     "Mixer": {
         "weight of each agent's advantage (lambda)": [r"lambda/agent_\d+"],
@@ -101,21 +100,21 @@ _VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
 
 
 _BAND: Final = ("team/return", "team/return_low", "team/return_high")
-#: Tags that are lines of one chart. TensorBoard has a colour for each run, so a line is written as a run of its own.
+#: Tags that are lines of one chart. TensorBoard has one colour per run, so each line is written as a separate run.
 _OF_LINES: Final = re.compile(
     r"(?P<chart>.+)/(?P<line>(policy|slot)_\d+)|(?P<errors>message/value_error)_?(?P<with>.*)"
 )
 
 
 class Line(NamedTuple):
-    """Where TensorBoard shows a scalar that is one of several lines: its tag, and a run below the training's."""
+    """Target of a scalar that is one of several lines: its tag, and a run below the training's."""
 
     chart: str
     run: str
 
 
 def line_of(tag: str) -> Line | None:
-    """Return the line that a tag is; None for a chart of its own."""
+    """Return the line of a tag; None if the tag has its own chart."""
     found = _OF_LINES.fullmatch(tag)
     if found is None:
         return None
@@ -124,9 +123,9 @@ def line_of(tag: str) -> Line | None:
 
 class Page:
     """
-    Writes to the formats of a model's logger, but not to the screen.
+    Writer to the formats of a model's logger, except the screen.
 
-    :param model: in ``learn``, with its logger set up
+    :param model: model in ``learn``, with its logger set up
     :param n_agents: N
     """
 
@@ -140,7 +139,7 @@ class Page:
 
     @property
     def has_tensorboard(self) -> bool:
-        """Whether pictures are written anywhere."""
+        """Whether there is a format for pictures."""
         return bool(self._writers)
 
     def scalars(self, scalars: Mapping[str, float]) -> None:
@@ -152,11 +151,11 @@ class Page:
                 self._lines[line] = value
 
     def show(self, tag: str, value: object) -> None:
-        """Record a figure, an image, a histogram or hyperparameters, for TensorBoard alone."""
+        """Record a figure, an image, a histogram or hyperparameters, for TensorBoard only."""
         self._logger.record(tag, value, exclude=_NUMBERS_ONLY)
 
     def gif(self, tag: str, encoded: bytes, step: int) -> None:
-        """Write an animated image as it is."""
+        """Write an encoded GIF."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         image = Summary.Image(encoded_image_string=encoded, colorspace=3)
@@ -165,7 +164,7 @@ class Page:
 
     def explain(self, tags: Iterable[str], value_based: bool) -> None:
         """
-        Write the Text page, and the layout of the custom scalars page without charts that this run has nothing for.
+        Write the Text page, and the layout of the custom scalars page with the charts for which this run has scalars.
 
         :param tags: of the run's first inspection
         :param value_based: whether the run learns Q_tot
@@ -175,7 +174,7 @@ class Page:
             writer.add_custom_scalars(layout(tags, value_based))
 
     def write(self, step: int) -> None:
-        """Write what was recorded; ``step`` counts agents' steps, as SB3's do, the x-axis game steps."""
+        """Write the recorded values; ``step`` counts agent steps, as in SB3, the x-axis game steps."""
         self._logger.dump(step)
         for line, value in self._lines.items():
             for board in self._writers:
@@ -189,7 +188,7 @@ class Page:
         if folder not in self._writers_of_lines:
             from torch.utils.tensorboard import SummaryWriter
 
-            # What an interrupted run wrote after its last checkpoint comes again.
+            # Hides what an interrupted run wrote after its last checkpoint, which is written again.
             self._writers_of_lines[folder] = SummaryWriter(folder, purge_step=step // self._n_agents)
         return self._writers_of_lines[folder]
 
@@ -205,7 +204,7 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
     tags = [tag if (line := line_of(tag)) is None else line.chart for tag in tags]
     groups: dict[str, dict[str, list[Any]]] = {}
     if set(_BAND) <= set(tags):
-        # A group of its own, because the page shows bands after all lines of their group.
+        # A separate group, because the page shows bands after all lines of their group.
         groups["Team return"] = {"evaluation, with 95 % interval": ["Margin", list(_BAND)]}
     for group, charts in (_CHARTS | (_VALUE_CHARTS if value_based else {})).items():
         kept = {name: patterns for name, patterns in charts.items() if any(_is_coming(p, tags) for p in patterns)}
@@ -224,7 +223,7 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
 
 
 def _is_coming(pattern: str, tags: Iterable[str]) -> bool:
-    """Return whether a run has scalars for a pattern: from inspection, or from the algorithm's own logs."""
+    """Return whether a run has scalars for a pattern, from inspection or from the algorithm's logs."""
     return pattern.startswith(_OF_ALGORITHMS) or any(re.fullmatch(pattern, tag) for tag in tags)
 
 
@@ -232,14 +231,13 @@ def hyperparameters(
     model: BaseAlgorithm, policy: OurPolicy, more: Mapping[str, object], scalars: Mapping[str, float]
 ) -> HParam:
     """
-    Describe a run for the HParams page: what the user gave, then seed and method, then all else.
-
-    TensorBoard sorts the columns by name, so the first ones have numbers in front: ``1 task``.
+    Describe a run for the HParams page: the user's hyperparameters, then seed and method, then all others. TensorBoard
+    sorts the columns by name, so the first ones have a number as prefix: ``1 task``.
 
     :param model: the algorithm
     :param policy: its policy
-    :param more: the user's own, such as the task and its level
-    :param scalars: that the run writes
+    :param more: the user's hyperparameters, such as the task and its level
+    :param scalars: scalars of the run
     """
     env = model.get_env()
     assert env is not None

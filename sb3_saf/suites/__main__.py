@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    :return: 0, or 2 if the command was wrong
+    :return: 0, or 2 if the command was invalid
     """
     parser = OneLineParser(prog=PROGRAM, description="Suites of cooperative games, and the tasks of one of them.")
     parser.add_argument("name", nargs="?", help=f"one of {', '.join(suites())}: list all of its tasks")
@@ -54,7 +54,7 @@ def summary(suite: Suite) -> str:
 def example(suite: Suite, task: str) -> str:
     """Return the id of a task with its agents, observations and actions."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of opponents, which the line names
+        warnings.simplefilter("ignore")  # about opponents, which the line names
         env = make_team_env(f"{suite.name}/{task}")
     spaces = TeamSpaces.from_observation_space(env.observation_space)
     env.close()

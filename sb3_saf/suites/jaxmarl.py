@@ -1,8 +1,8 @@
 """
-All else that JaxMARL registers: ``jaxmarl/MPE_simple_spread_v3``, ``jaxmarl/overcooked_v2``, ``jaxmarl/hanabi``.
+All other environments of JaxMARL: ``jaxmarl/MPE_simple_spread_v3``, ``jaxmarl/overcooked_v2``, ``jaxmarl/hanabi``.
 
-Parameters are those of the environment. Observations are flattened, those of agents with shorter ones padded with
-zeros; actions that an agent does not have are masked. Environments whose packages are missing are not listed.
+Parameters are those of the environment. Observations are flattened, and shorter ones padded with zeros; actions that an
+agent lacks are masked. Environments with missing packages are not listed.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 Level-based foraging: ``lbf/Foraging-8x8-2p-3f-v3``.
 
 An episode's rewards of all agents sum to at most 1, and 1 means that all food was collected, which is the success.
-Agents learn from the team's sum, as in EPyMARL's cooperative experiments. The package reports its time limit as an end
-of the game; here it is a truncation where food is left.
+Agents learn from the team's sum, as in EPyMARL's cooperative experiments. The package reports its time limit as
+termination; here it is a truncation if food is left.
 """
 
 from __future__ import annotations

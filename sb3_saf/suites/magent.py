@@ -1,9 +1,9 @@
 """
 MAgent2's battles and hunts of many agents: ``magent/tiger_deer_v4``.
 
-Most of its games are of several groups, which play against each other. Agents that die keep their rows; those of
-groups with other spaces are padded and masked. With N agents a critic that reads the whole team gets N times N
-observations a step: for hundreds of agents make the map smaller (``map_size=20``).
+Most of its games have several groups, which play against each other. Dead agents keep their rows; groups with other
+spaces are padded and masked. With N agents, a critic of the whole team reads N times N observations per step: for
+hundreds of agents use a smaller map (``map_size=20``).
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """
 Melting Pot's substrates: ``meltingpot/clean_up``, ``meltingpot/collaborative_cooking__cramped``.
 
-Agents see ``RGB`` (88 x 88 pixels; ``pixels_per_sprite=1`` averages each sprite of 8 x 8 to one pixel, which is what
-most published agents learn from) and what else the substrate gives them, such as ``READY_TO_SHOOT`` or ``INVENTORY``.
-``WORLD.RGB`` and ``COLLECTIVE_REWARD``, which they must not see when they act, are left out of observations; with
-``state=True`` the critic reads ``WORLD.RGB``. The engine draws its own random numbers: seeds do not decide episodes.
-An episode that the substrate ends is an end, one that reaches ``max_cycles`` is truncated.
+Agents observe ``RGB`` (88 x 88 pixels; ``pixels_per_sprite=1`` averages each sprite of 8 x 8 to one pixel, as for most
+published agents) and the substrate's other observations, such as ``READY_TO_SHOOT`` or ``INVENTORY``. ``WORLD.RGB`` and
+``COLLECTIVE_REWARD``, which are not for acting, are removed from observations; with ``state=True`` the critic reads
+``WORLD.RGB``. The engine draws its own random numbers: seeds do not determine episodes. Episodes ended by the substrate
+are terminated, those that reach ``max_cycles`` truncated.
 
-dm-meltingpot fetches its assets while it is built. Where that cannot work, the folder ``meltingpot`` of its public
-source on ``PYTHONPATH`` does as well, beside ``pip install dmlab2d dm-env chex immutabledict ml-collections networkx
-reactivex tensorflow-cpu shimmy``.
+dm-meltingpot downloads its assets when it is built. If that fails, put the folder ``meltingpot`` of its public source
+on ``PYTHONPATH``, and run ``pip install dmlab2d dm-env chex immutabledict ml-collections networkx reactivex
+tensorflow-cpu shimmy``.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from sb3_saf.suites.suite import Suite
 
-#: Side of a sprite in pixels as the engine draws it.
+#: Side of the engine's sprites in pixels.
 _SPRITE: Final = 8
 _PICTURE: Final = "RGB"
 _WORLD: Final = "WORLD.RGB"
-#: What agents must not see when they act, beside all that begins with ``WORLD.``.
+#: Observation not for acting, besides all that begin with ``WORLD.``.
 _HIDDEN: Final = "COLLECTIVE_REWARD"
 
 
 class MeltingPotTeam(BaseParallelWrapper[str, Any, Any]):
     """
-    A substrate whose agents see what they may see, and whose ``state()`` is the picture of the world.
+    A substrate without the observations not for acting, and with the picture of the world as ``state()``.
 
     :param env: the substrate as shimmy's ParallelEnv
-    :param substrate: the same, as Melting Pot made it
-    :param pixels_per_sprite: side of a sprite in what agents see: 1, 2, 4 or 8
+    :param substrate: Melting Pot's own object of it
+    :param pixels_per_sprite: side of a sprite in observations: 1, 2, 4 or 8
     :raises ValueError: for another number of pixels
     """
 
@@ -82,7 +82,7 @@ class MeltingPotTeam(BaseParallelWrapper[str, Any, Any]):
         }
 
     def _smaller(self, picture: Any) -> Any:
-        """(H, W, C) bytes with blocks of pixels averaged."""
+        """Return the picture (H, W, C) uint8 with blocks of pixels averaged."""
         if self._block == 1:
             return picture
         height, width, channels = picture.shape
@@ -95,7 +95,7 @@ def _tasks() -> list[str]:
 
 
 def _substrates() -> Any:
-    # By its name, because the package that has it is called otherwise.
+    # By name, because the package has a different name.
     return importlib.import_module("meltingpot.substrate")
 
 

@@ -1,9 +1,9 @@
 """
 Overcooked on JAX: ``overcooked/cramped_room``.
 
-Both cooks are given the team's reward, 20 for a soup that is served. ``reward_shaping`` adds as many times JaxMARL's
-rewards for steps on the way to it, to those who take them; ``reward_shaping_steps`` are the game steps, summed over
-games, in which that falls to nothing. Evaluation counts soups alone.
+Both cooks receive the team's reward, 20 for each served soup. ``reward_shaping`` is the weight of JaxMARL's shaped
+rewards, given to the acting agent; it decreases to 0 over ``reward_shaping_steps`` game steps, summed over games.
+Evaluation counts soups only.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """
-Path finding of many agents in a grid, ``pogema/...``: known by name, to say why it cannot be had.
-
-Every released version asks for ``gymnasium==0.28.1`` or ``gym``, and versions up to 1.4.0 read attributes through
-wrappers, which Gymnasium 1 has given up; their seeds do not decide the maps.
+Multi-agent path finding in a grid, ``pogema/...``: registered only to explain why it is not supported. Every released
+version requires ``gymnasium==0.28.1`` or ``gym``, and versions up to 1.4.0 read attributes through wrappers, which
+Gymnasium 1 has removed; their seeds do not determine the maps.
 """
 
 from __future__ import annotations

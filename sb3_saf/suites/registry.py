@@ -15,10 +15,10 @@ from sb3_saf.suites.suite import Suite
 
 class SuiteTask(NamedTuple):
     """
-    A task of a suite that is installed.
+    A task of an installed suite.
 
-    :param suite: its declaration
-    :param task: its name, what stands after the slash
+    :param suite: declaration of the suite
+    :param task: name after the slash
     """
 
     suite: Suite
@@ -26,11 +26,11 @@ class SuiteTask(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Return the name by which users ask for it."""
+        """Return the id for users."""
         return f"{self.suite.name}/{self.task}"
 
     def warn_if_competitive(self) -> None:
-        """Say once for each caller what training its agents as one team means."""
+        """Warn once per caller that opposing agents are trained as one team."""
         if self.suite.is_competitive(self.task):
             warnings.warn(
                 f"agents of {self.id} play against each other; here all agents of a game are one team that shares one "
@@ -59,7 +59,7 @@ def find_task(env_id: str) -> SuiteTask | None:
     """
     Look a task up by an id such as ``"lbf/Foraging-8x8-2p-3f-v3"``.
 
-    :return: None if no suite has the part before the slash as its name
+    :return: None if no suite has the name before the slash
     :raises ValueError: if the suite's package is missing or of another version, or has no such task
     """
     name, slash, task = env_id.partition("/")

@@ -1,8 +1,7 @@
 """
-The multi-robot warehouse: ``rware/rware-tiny-2ag-v2``.
-
-A return is the number of shelves that the team delivered. Agents learn from the team's sum, as in EPyMARL's
-cooperative experiments. The end after 500 steps, which the package reports as an end of the game, is a truncation here.
+Multi-robot warehouse: ``rware/rware-tiny-2ag-v2``. The return is the number of shelves that the team delivered. Agents
+learn from the team's sum, as in EPyMARL's cooperative experiments. The package reports the limit of 500 steps as
+termination; here it is a truncation.
 """
 
 from __future__ import annotations

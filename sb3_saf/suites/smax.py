@@ -1,10 +1,8 @@
 """
-SMAX, the micromanagement of StarCraft without StarCraft: ``smax/3m``.
-
-Allies are trained, enemies play JaxMARL's heuristic. Every ally is given the team's reward: the enemy health that it
-took away, at most 1 in total, and 1 for a battle that is won, which is the success. Dead allies get it, too, so their
-rows go on, with one legal action that does nothing. An episode that ends with both sides alive was stopped by its time
-limit. ``state=True`` shows ``world_state``.
+SMAX, StarCraft micromanagement without StarCraft: ``smax/3m``. Allies are trained, enemies follow JaxMARL's heuristic.
+Every ally receives the team's reward: the enemy health removed, at most 1 in total, and 1 for a won battle, which is
+the success. Dead allies receive it, too, so their rows continue, with one legal action without effect. An episode that
+ends with both sides alive was stopped by its time limit. With ``state=True`` the state is ``world_state``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a suite declares, and how it says that its package is not there."""
+"""Declaration of a suite, and errors for missing packages."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from typing import Any, Final, Literal
 
 from packaging.requirements import Requirement
 
-#: How the rewards of a team's agents become one number.
+#: Reduction of the rewards of a team's agents to one number.
 Reduction = Literal["sum", "mean"]
 
-#: Nearest names that a message shows.
+#: Maximum number of nearest names in a message.
 _N_NEAREST: Final = 3
 
 
@@ -27,25 +27,26 @@ class Suite:
     """
     A package of games for teams. Exactly one of ``game`` and ``vec_env`` is given; see :mod:`sb3_saf.suites`.
 
-    :param name: what stands before the slash of an id
+    :param name: part of an id before the slash
     :param title: one line
-    :param requires: what is installed from a package index, as pip writes it, the suite's own package first; the same
-        lines as the extra of ``setup.cfg``
-    :param extra: of ``setup.cfg``, which installs it
+    :param requires: requirements in pip's format, the suite's own package first; the same lines as the extra of
+        ``setup.cfg``
+    :param extra: extra of ``setup.cfg`` that installs them
     :param page: address of the package's documentation
-    :param list_tasks: returns the names after the slash; called when the package is installed, which it may import
-    :param examples: tasks that ``python -m sb3_saf.suites`` shows with agents and spaces
+    :param list_tasks: returns the names after the slash; only called if the package is installed, so it may import it
+    :param examples: tasks shown by ``python -m sb3_saf.suites`` with agents and spaces
     :param game: makes one game: ``game(task, *, render_mode=None, **params)``
     :param vec_env: makes all games: ``vec_env(task, n_envs, seed, *, state=False, render_mode=None, **params)``
     :param competitive: patterns of tasks whose agents play against each other
-    :param team_return: the suite's own unit of an episode's return: the sum over agents of their rewards, or the mean
-        (where every agent is given the team's whole reward)
-    :param team_reward: what agents are given to learn from, see ``make_team_env``
-    :param training_params: parameters of the games that only training is given, such as rewards on the way to what
-        counts: evaluation measures the task itself
-    :param has_state: whether ``state=True`` can be asked for
-    :param is_seeded: whether seeds decide what happens in its games
-    :param module: of the package, where it may be a folder of sources on ``PYTHONPATH`` instead of an installed package
+    :param team_return: the suite's unit of returns: the sum over agents of their rewards, or the mean (if every agent
+        receives the team's whole reward)
+    :param team_reward: default reward for learning, see ``make_team_env``
+    :param training_params: parameters of the games for training only, such as shaped rewards: evaluation measures the
+        task itself
+    :param has_state: whether ``state=True`` is supported
+    :param is_seeded: whether seeds determine its games
+    :param module: module of the package, if it may be a folder of sources on ``PYTHONPATH`` instead of an installed
+        package
     :param unavailable: why no version of the package works; such a suite has no games, only this message
     """
 
@@ -73,13 +74,13 @@ class Suite:
 
     @property
     def requirements(self) -> tuple[Requirement, ...]:
-        """What this interpreter needs, parsed."""
+        """Parsed requirements of this interpreter."""
         parsed = (Requirement(line) for line in self.requires)
         return tuple(one for one in parsed if one.marker is None or one.marker.evaluate())
 
     @property
     def pip_line(self) -> str:
-        """The command that installs the suite, in a clone of this repository."""
+        """Command that installs the suite, in a clone of this repository."""
         return f"pip install -e '.[{self.extra}]'"
 
     def installed_version(self) -> str | None:
@@ -95,7 +96,7 @@ class Suite:
         return package == self._package and self.module is not None and find_spec(self.module) is not None
 
     def problem(self) -> str | None:
-        """Return why no game can be made, None if all that is needed is installed."""
+        """Return why no game can be made, None if all requirements are installed."""
         if self.unavailable is not None:
             return self.unavailable
         if not self.requirements:
@@ -118,7 +119,7 @@ class Suite:
         """
         Names after the slash.
 
-        :raises ValueError: if the package is missing or of a version that cannot work, with what to install
+        :raises ValueError: if the package is missing or has an unsupported version, with the install command
         """
         if (problem := self.problem()) is not None:
             raise ValueError(f"{self.name}/...: {problem}")
@@ -152,7 +153,7 @@ def modules_with_versions(package: str) -> list[str]:
 
 
 def parallel_env(package: str, task: str, *, render_mode: str | None = None, **params: Any) -> Any:
-    """Make a game of one of these modules, as PettingZoo's packages name them."""
+    """Make a game of one of these modules, named as in PettingZoo's packages."""
     return importlib.import_module(f"{package}.{task}").parallel_env(render_mode=render_mode, **params)
 
 

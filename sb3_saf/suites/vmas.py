@@ -1,9 +1,9 @@
 """
-VMAS, robots in two dimensions, batched in torch: ``vmas/balance``.
+VMAS, batched two-dimensional robotics in torch: ``vmas/balance``.
 
 Parameters are those of the scenario, and ``max_steps`` (100, as in BenchMARL), which is a time limit;
-``continuous_actions=False`` gives numbered actions instead of forces. The games of a batch draw from one random stream:
-what happens in a game depends on the number of games.
+``continuous_actions=False`` gives discrete actions instead of forces. The games of a batch share one random stream, so
+a game depends on the number of games.
 """
 
 from __future__ import annotations

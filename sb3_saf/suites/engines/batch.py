@@ -1,4 +1,4 @@
-"""Games that an engine steps all at once, as a Stable-Baselines3 VecEnv with one row per agent."""
+"""Batched games of an engine as a Stable-Baselines3 VecEnv with one row per agent."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.space_reader import checked_actions
 from sb3_saf.envs.teams import Array, check_count
 
-#: SB3's name for "the episode was won", of which it logs ``rollout/success_rate``.
+#: SB3's key for success of an episode, logged as ``rollout/success_rate``.
 IS_SUCCESS = "is_success"
 
 
 class BatchStep(NamedTuple):
     """
-    What one step of E games gave; games that ended have begun their next episode.
+    Results of one step of E games; ended games have begun their next episode.
 
     :param rows: (B, ...) observations of the rows, entries of a Dict by key
-    :param rewards: (E, N) as the suite gives them
+    :param rewards: (E, N) rewards of the suite
     :param ended: (E,) bool
-    :param truncated: (E,) bool, games that only a time limit ended
-    :param last: (B, ...) the rows before new episodes began; read where ``ended``
-    :param won: (E,) bool, where the suite tells wins
+    :param truncated: (E,) bool, games ended by a time limit only
+    :param last: (B, ...) the rows before new episodes began; used where ``ended``
+    :param won: (E,) bool, None if the suite does not report wins
     """
 
     rows: dict[str, Array]
@@ -44,13 +44,13 @@ class BatchStep(NamedTuple):
 
 class Batch(ABC):
     """
-    E games of N agents in one engine. Arrays that it returns are not written to later.
+    Base of E games of N agents in one engine. Returned arrays are not modified later.
 
     :param n_games: E
     :param agents: N names
     :param rows: spaces of a row's observation
-    :param action_space: of a row
-    :param env: the suite's own object, for its attributes
+    :param action_space: action space of a row
+    :param env: the suite's environment, for its attributes
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Batch(ABC):
         """
         Begin an episode in every game.
 
-        :param seeds: (E,) 63 bits each; None to go on with the games' random streams
+        :param seeds: (E,) 63 bits each; None to continue the games' random streams
         :return: (B, ...) rows
         """
 
@@ -81,33 +81,33 @@ class Batch(ABC):
 
     @abstractmethod
     def picture(self, game: int) -> npt.NDArray[np.uint8]:
-        """Return what the suite draws of a game, (height, width, 3)."""
+        """Return the suite's picture of a game, (height, width, 3)."""
 
 
 class ResumableBatch(Batch):
-    """A batch that gives its state."""
+    """Base of batches with snapshots."""
 
     @abstractmethod
     def snapshot(self) -> dict[str, Array]:
-        """Return copies of all that the future depends on, the random state included."""
+        """Return a copy of the complete state, random state included."""
 
     @abstractmethod
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Go on from a snapshot of equal names, shapes and dtypes."""
+        """Restore a snapshot of equal names, shapes and dtypes."""
 
 
 class BatchVecEnv(TeamVecEnv):
     """
-    A batch of games as rows: row ``e * N + i`` is agent ``i`` of game ``e``.
+    VecEnv of a batch of games: row ``e * N + i`` is agent ``i`` of game ``e``.
 
     Observations of rows are Dicts, see :class:`sb3_saf.envs.row_spaces.RowSpaces`. Infos of done rows hold
-    ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` where the suite
-    tells wins. All other infos are one empty dict.
+    ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite reports
+    wins. All other infos are one empty dict.
 
     :param batch: the games
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
     :param render_mode: None or ``"rgb_array"``
-    :raises ValueError: for another render mode
+    :raises ValueError: for any other render mode
     """
 
     def __init__(self, batch: Batch, seed: int | None = None, render_mode: str | None = None) -> None:
@@ -127,7 +127,7 @@ class BatchVecEnv(TeamVecEnv):
         Begin an episode in every game.
 
         :return: (B, ...) rows
-        :raises ValueError: for options, which these games do not take
+        :raises ValueError: for options, which these games do not support
         """
         if any(self._options):
             raise ValueError(f"expected no options for the reset of batched games, got {self._options[0]}")
@@ -140,7 +140,7 @@ class BatchVecEnv(TeamVecEnv):
 
     def step_async(self, actions: npt.ArrayLike) -> None:
         """
-        Take the actions of the next step.
+        Store the actions of the next step.
 
         :param actions: (B, ...) from the action space
         :raises ValueError: for a wrong shape, type or value, or a step without a reset
@@ -167,7 +167,7 @@ class BatchVecEnv(TeamVecEnv):
         return step.rows, rewards, np.repeat(step.ended, self.n_agents), infos
 
     def _end(self, infos: list[dict[str, Any]], step: BatchStep, game: int) -> None:
-        """Say how the episode of a game ended."""
+        """Fill in the infos of a game whose episode ended."""
         first = game * self.n_agents
         for row in range(first, first + self.n_agents):
             last = {key: part[row] for key, part in step.last.items()}
@@ -180,33 +180,33 @@ class BatchVecEnv(TeamVecEnv):
         """Do nothing: engines hold memory only."""
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
-        """One picture per row, None unless the render mode is ``"rgb_array"``; rows of one game share theirs."""
+        """Return one picture per row, None unless the render mode is ``"rgb_array"``; rows of a game share one."""
         games = range(self.n_games)
         return self.per_row(self.batch.picture(game) if self.render_mode == "rgb_array" else None for game in games)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Attribute of the suite's environment, which all rows share."""
+        """Return an attribute of the suite's environment, which all rows share."""
         value = self.render_mode if attr_name == "render_mode" else getattr(self.batch.env, attr_name)
         return [value for _ in chosen_indices(indices, self.num_envs)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse: all games share one engine, which is made for its parameters."""
+        """Raise an error: all games share one engine with fixed parameters."""
         raise AttributeError(f"games of an engine have no attributes of their own, got {attr_name!r}; make new games")
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Refuse: all games share one engine, which has no objects for single games."""
+        """Raise an error: all games share one engine without objects for single games."""
         raise AttributeError(f"games of an engine have no methods of their own, got {method_name!r}")
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """No row is wrapped in a Gymnasium wrapper."""
+        """Return False for each row: none is wrapped in a Gymnasium wrapper."""
         return [False for _ in chosen_indices(indices, self.num_envs)]
 
 
 class ResumableBatchVecEnv(BatchVecEnv):
     """
-    Rows whose state goes into checkpoints.
+    VecEnv whose state is stored in checkpoints.
 
-    :param batch: games that give their state
+    :param batch: games with snapshots
     :param seed: see the base class
     :param render_mode: see the base class
     """
@@ -215,9 +215,9 @@ class ResumableBatchVecEnv(BatchVecEnv):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """
-        All that the future depends on, as plain data.
+        Return the complete state as plain data.
 
-        :return: for :meth:`load_checkpoint_state` of an environment that was made with the same arguments
+        :return: for :meth:`load_checkpoint_state` of an environment with the same arguments
         """
         return {
             "running": self._running,
@@ -227,9 +227,9 @@ class ResumableBatchVecEnv(BatchVecEnv):
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
-        Check that these games could be in a state.
+        Check that a state is valid for these games.
 
-        :param state: what :meth:`checkpoint_state` gave
+        :param state: result of :meth:`checkpoint_state`
         :raises ValueError: naming the first difference
         """
         seeds, games = state["next_seeds"], state["games"]
@@ -242,16 +242,16 @@ class ResumableBatchVecEnv(BatchVecEnv):
                 raise ValueError(difference)
 
     def _example(self) -> dict[str, Array]:
-        """Return a state of such games, which are begun for it if they have not."""
+        """Return a state of these games, which are reset first if they have not begun."""
         if not self._running:
             self.batch.reset([0] * self.n_games)
         return self.batch.snapshot()
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
-        Go on from there; observations of the present are those of before.
+        Restore a state; the observations are those of that state.
 
-        :param state: what :meth:`checkpoint_state` gave
+        :param state: result of :meth:`checkpoint_state`
         :raises ValueError: see :meth:`check_checkpoint_state`
         """
         self.check_checkpoint_state(state)
@@ -266,7 +266,7 @@ def _is_seed(seed: object) -> bool:
 
 
 def _differences(own: Mapping[str, Array], found: Mapping[str, Any]) -> Iterator[str]:
-    """Say how a state differs in form from one of these games."""
+    """Yield the differences in form between a state and one of these games."""
     for name in sorted(own.keys() ^ found.keys()):
         yield f"expected the state of games with {', '.join(own)}, they differ in {name!r}"
     for name, array in own.items():

@@ -1,8 +1,7 @@
 """
-Games of JaxMARL, stepped all at once by ``vmap`` and ``jit``.
-
-Each game has a random stream of its own, so that its course depends on its seed and the actions alone. New episodes
-begin by ``reset`` of the suite after ``step_env``: its own ``step`` begins them, too, but loses the last observation.
+Games of JaxMARL, batched by ``vmap`` and ``jit``. Each game has its own random stream, so that it depends on its seed
+and the actions only. New episodes begin by the suite's ``reset`` after ``step_env``: its ``step`` also resets, but
+loses the last observation.
 """
 
 from __future__ import annotations
@@ -28,13 +27,15 @@ _WORLD_STATE: Final = "world_state"
 
 class Rules(NamedTuple):
     """
-    What the interface of JaxMARL leaves to each environment.
+    Rules of an environment that JaxMARL's interface does not define.
 
-    :param is_undecided: ``(env, state) -> bool``, whether a game that has just ended was stopped by its time limit;
-        None for "whenever ``state.step`` has reached ``env.max_steps``"
-    :param is_won: ``(env, state) -> bool`` of a game that has just ended, None where there is no winning
-    :param pays_the_dead: whether agents that died are given the team's reward until its episode ends. Their rows then
-        go on: as ends of their own they would teach that the team's victory is nothing to those who died for it
+    :param is_undecided: ``(env, state) -> bool``, whether an ended game was stopped by its time limit; None if
+        ``state.step`` reaching ``env.max_steps`` decides
+
+    :param is_won: ``(env, state) -> bool`` of an ended game, None if success is not defined
+    :param pays_the_dead: whether dead agents receive the team's reward until its episode ends. Their rows then
+        continue: if they ended, dead agents would not learn from the team's success
+
     :param extra_reward: ``infos -> {agent: reward}`` for :attr:`JaxGames.extra_weight`
     :param draw: ``(env, state) -> picture``, (height, width, 3)
     """
@@ -50,8 +51,8 @@ class Game(NamedTuple):
     """
     A game, or with a leading axis all of them.
 
-    :param key: (2,) of its random stream
-    :param state: of the environment
+    :param key: (2,) key of its random stream
+    :param state: state of the environment
     :param active: (N,) bool, agents that take part
     """
 
@@ -62,12 +63,12 @@ class Game(NamedTuple):
 
 class Ends(NamedTuple):
     """
-    How a step ended, of one game or all.
+    Rewards and ends of a step, of one game or all.
 
     :param rewards: (N,)
     :param ended: whether the episode is over
-    :param truncated: whether a time limit alone ended it
-    :param won: whether it was won, None where nobody tells
+    :param truncated: whether only a time limit ended it
+    :param won: whether it was won, None if not reported
     """
 
     rewards: Any
@@ -78,13 +79,13 @@ class Ends(NamedTuple):
 
 class JaxPrograms:
     """
-    The compiled functions of an environment. Those who share them compile once for each number of games.
+    Compiled functions of an environment, shared by its users and compiled once per number of games.
 
-    :param env: of JaxMARL
-    :param rules: of this environment
-    :param with_state: whether rows show the state of the game
-    :raises ValueError: if agents differ in more than the lengths of their observations and actions, or there is no
-        state to show
+    :param env: environment of JaxMARL
+    :param rules: rules of this environment
+    :param with_state: whether rows have the state of the game
+    :raises ValueError: if agents differ in more than the lengths of their observations and actions, or a requested
+        state is missing
     """
 
     def __init__(self, env: Any, rules: Rules, with_state: bool = False) -> None:
@@ -111,7 +112,7 @@ class JaxPrograms:
 
     @cached_property
     def _own_dtype(self) -> npt.DTypeLike:
-        """Bytes where all observations are bytes or flags, else float32."""
+        """Return uint8 if all observations are bytes or flags, else float32."""
         small = all(one.dtype in (np.uint8, np.bool_) for one in self._observations.values())
         return np.uint8 if small else np.float32
 
@@ -123,7 +124,7 @@ class JaxPrograms:
 
     @cached_property
     def gives_masks(self) -> bool:
-        """Whether the environment says which actions are legal."""
+        """Whether the environment provides action masks."""
         try:
             jax.eval_shape(self.env.get_avail_actions, self._state_form)
         except (NotImplementedError, AttributeError):
@@ -132,7 +133,7 @@ class JaxPrograms:
 
     @cached_property
     def _n_actions(self) -> list[int]:
-        """Numbers of actions of the agents; empty where actions are not Discrete."""
+        """Numbers of actions of the agents; empty if actions are not Discrete."""
         if not all(isinstance(space, jax_spaces.Discrete) for space in self._action_spaces):
             return []
         return [int(space.n) for space in self._action_spaces]
@@ -178,12 +179,12 @@ class JaxPrograms:
         self, games: Game, actions: Any, extra_weight: Any
     ) -> tuple[Game, dict[str, Any], dict[str, Any], Ends]:
         """
-        Step, and begin new episodes where some have ended; without such, nothing is begun.
+        Step, and begin new episodes of ended games, if there are any.
 
-        :param games: E
+        :param games: E games
         :param actions: (E, N, ...)
         :param extra_weight: see :class:`JaxGames`
-        :return: games; (E, N, ...) their rows, and those before new episodes began; how episodes ended
+        :return: games; (E, N, ...) their rows, and those before new episodes began; ends of episodes
         """
         games, last, ends = jax.vmap(self._step, in_axes=(0, 0, None))(games, actions, extra_weight)
 
@@ -207,7 +208,7 @@ class JaxPrograms:
         ended = dones[_ALL]
         done = jnp.stack([dones[agent] for agent in self.agents])
         truncated = ended & self._is_undecided(state)
-        # Where a time limit stops a team, all its agents are done, those that would have gone on as well.
+        # If a time limit stops a team, all its agents are done, also those still active.
         goes_on = ~done | (truncated & done.all())
         active = game.active & goes_on & (~ended | truncated)
         team = jnp.stack([rewards[agent] for agent in self.agents])
@@ -219,7 +220,7 @@ class JaxPrograms:
         return Game(key, state, active), rows, Ends(team.astype(jnp.float32), ended, truncated, won)
 
     def _chosen(self, game: Game, actions: Any) -> dict[str, Any]:
-        """Actions of the agents, cut to their own spaces; a padded action becomes the first legal one."""
+        """Return the agents' actions, limited to their own spaces; a padded action becomes the first legal one."""
         if not self._n_actions:
             shapes = [space.shape for space in self._action_spaces]
             return {
@@ -243,10 +244,10 @@ class JaxPrograms:
 
     def _rows(self, observations: Mapping[str, Any], state: Any, active: Any, shown: Any) -> dict[str, Any]:
         """
-        The rows of a game, (N, ...).
+        Return the rows of a game, (N, ...).
 
-        :param active: (N,) what rows say about taking part
-        :param shown: (N,) agents whose observations are shown, the others' rows are zeros
+        :param active: (N,) the signal ``"active"`` of rows
+        :param shown: (N,) agents whose observations are shown, other rows are zeros
         """
         width = self.rows.own.shape[0]  # type: ignore[index]
         own = jnp.stack([_padded(observations[agent], width, self._own_dtype) for agent in self.agents])
@@ -261,7 +262,7 @@ class JaxPrograms:
         return rows
 
     def _masks(self, state: Any) -> Any:
-        """(N, A) legal actions; those that an agent does not have are not."""
+        """Return legal actions (N, A); actions that an agent lacks are illegal."""
         legal: Any = self.env.get_avail_actions(state) if self.gives_masks else {}
         width = max(self._n_actions)
         own = [legal.get(agent, np.ones(n)) for agent, n in zip(self.agents, self._n_actions, strict=True)]
@@ -273,7 +274,7 @@ class JaxPrograms:
 
 
 def _choose(fresh: tuple[Game, dict[str, Any]], game: Game, rows: dict[str, Any], ended: Any) -> Any:
-    """Take a new episode where the last one ended."""
+    """Select the new episode for ended games."""
     return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, (game, rows))
 
 
@@ -290,10 +291,10 @@ class JaxGames(ResumableBatch):
     """
     E games of an environment.
 
-    :param programs: of the environment
+    :param programs: programs of the environment
     :param n_games: E
-    :param extra_weight: of the rewards that the rules tell beside the game's own, such as those for steps on the way
-    :param extra_steps: game steps, summed over games, in which that weight falls to 0; None for never
+    :param extra_weight: weight of the rules' extra rewards, such as those for shaping
+    :param extra_steps: game steps, summed over games, over which that weight decreases to 0; None for never
     """
 
     def __init__(
@@ -331,12 +332,12 @@ class JaxGames(ResumableBatch):
         return np.float32(self._extra_weight * left)
 
     def _on_host(self, rows: dict[str, Any]) -> dict[str, Array]:
-        """(E, N, ...) on the device -> (B, ...); on a CPU no byte is copied."""
+        """Convert (E, N, ...) on the device to NumPy (B, ...), without a copy on a CPU."""
         n_rows = self.n_games * len(self.agents)
         return {key: part.reshape(n_rows, *part.shape[2:]) for key, part in jax.tree.map(np.asarray, rows).items()}
 
     def picture(self, game: int) -> npt.NDArray[np.uint8]:
-        """Return what JaxMARL draws of a game (see the base class)."""
+        """Return JaxMARL's picture of a game (see the base class)."""
         if self._programs.rules.draw is None:
             raise ValueError(f"JaxMARL draws no pictures of {type(self.env).__name__}; leave render_mode out")
         assert self.games is not None, "the games have begun"
@@ -344,13 +345,13 @@ class JaxGames(ResumableBatch):
         return self._programs.rules.draw(self.env, state)
 
     def snapshot(self) -> dict[str, Array]:
-        """Return copies of all games, by the places of the environment's state (see the base class)."""
+        """Return copies of all games, by the paths of the environment's state (see the base class)."""
         leaves = jax.tree_util.tree_leaves_with_path(self.games)
         arrays = {jax.tree_util.keystr(path): np.array(leaf) for path, leaf in leaves}
         return {**arrays, "n_steps": np.array(self._n_steps)}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Go on from a snapshot (see the base class)."""
+        """Restore a snapshot (see the base class)."""
         if self.games is None:
             self.reset([0] * self.n_games)
         own = jax.tree_util.tree_leaves_with_path(self.games)

@@ -1,4 +1,4 @@
-"""JaxMARL's environments by name, each compiled once for all who ask for the same."""
+"""JaxMARL's environments by name, each compiled once for equal arguments."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from sb3_saf.suites.engines.jaxmarl_rules import rules_of
 #: Environments that need another package (brax, jaxrobotarium), or a trained enemy.
 _BRAX: Final = ("ant_4x2", "halfcheetah_6x1", "hopper_3x1", "humanoid_9|8", "walker2d_2x3")
 _NEEDS_A_POLICY: Final = "LearnedPolicyEnemySMAX"
-#: Their observations and rewards are not those of named agents.
+#: Environments whose observations and rewards are not by agent name.
 _NOT_BY_AGENT: Final = ("storm", "storm_2p", "storm_np")
-#: Compiled environments that are kept; one takes tens of MB.
+#: Maximum number of cached compiled environments; one takes tens of MB.
 _N_KEPT: Final = 8
 
 
 def registered() -> list[str]:
-    """Return the names of the environments that can be made here."""
+    """Return the names of the supported environments."""
     missing = {_NEEDS_A_POLICY, *_NOT_BY_AGENT}
     if not MABRAX_AVAILABLE:
         missing.update(_BRAX)
@@ -31,7 +31,7 @@ def registered() -> list[str]:
 
 
 class _Params:
-    """Arguments of an environment, equal if they are the same or equal values; arrays are told by identity."""
+    """Arguments of an environment, compared by value; arrays are compared by identity."""
 
     def __init__(self, params: Mapping[str, Any]) -> None:
         self.params = dict(params)
@@ -71,16 +71,17 @@ def vec_env(
     """
     Make games of an environment.
 
-    :param name: as JaxMARL registers it
+    :param name: JaxMARL's registered name
     :param n_envs: E
-    :param seed: of the run
-    :param state: whether rows show the state of the game
+    :param seed: seed of the run
+    :param state: whether rows have the state of the game
     :param render_mode: None or ``"rgb_array"``
-    :param reward_shaping: weight of the rewards for steps on the way, where the environment has such
-    :param reward_shaping_steps: game steps, summed over games, in which that weight falls to 0; None for never
-    :param fixed: arguments of the environment that the task decides
+    :param reward_shaping: weight of the shaped rewards, if the environment has any
+    :param reward_shaping_steps: game steps, summed over games, over which that weight decreases to 0; None for never
+    :param fixed: arguments of the environment that the task sets
     :param params: its other arguments
-    :raises ValueError: if there is no such state, picture or reward, or the environment is not one for rows of teams
+    :raises ValueError: if the state, picture or reward is not available, or the environment has no teams of named
+        agents
     """
     programs = _programs(name, _Params({**params, **(fixed or {})}), state)
     if reward_shaping and programs.rules.extra_reward is None:

@@ -1,4 +1,4 @@
-"""JaxMARL, whose import puts the interpreter's first streams in the place of a notebook's or a test's: undone here."""
+"""Import of JaxMARL, which resets ``sys.stdout`` and ``sys.stderr`` of notebooks and tests: undone here."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What JaxMARL's environments say of winning, time limits and pictures, each in its own way."""
+"""Rules of JaxMARL's environments for success, time limits and pictures."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from sb3_saf.suites.engines.jaxmarl import Rules
 
 Picture = npt.NDArray[np.uint8]
 
-#: The side of pictures that matplotlib draws, in inches.
+#: Side of matplotlib pictures in inches.
 _INCHES: Final = 4
 
 
 def _sides(env: Any, state: Any) -> tuple[Any, Any]:
-    """Return whether anybody of the allies, and of the enemies, is alive in SMAX."""
+    """Return whether any ally, and any enemy, is alive in SMAX."""
     alive = _battle(state).unit_alive
     return alive[: env.num_allies].any(), alive[env.num_allies :].any()
 
 
 def _battle(state: Any) -> Any:
-    """The battle inside the state of an environment whose enemies play by themselves."""
+    """Return the battle within the state of an environment with scripted enemies."""
     return getattr(state, "state", state)
 
 
@@ -101,7 +101,7 @@ def rules_of(name: str) -> Rules:
     """
     Return the rules of an environment.
 
-    :param name: as JaxMARL registers it
+    :param name: JaxMARL's registered name
     """
     if name.startswith("MPE_"):
         return Rules(draw=_draw_particles)

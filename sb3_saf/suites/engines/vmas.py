@@ -1,4 +1,4 @@
-"""Games of VMAS, which torch steps all at once."""
+"""Games of VMAS, batched in torch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 
 with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # gym, which VMAS takes its spaces from, recommends gymnasium
+    warnings.simplefilter("ignore")  # gym, from which VMAS imports its spaces, recommends gymnasium
     import vmas
     from vmas.simulator.environment import Environment
 
@@ -25,7 +25,7 @@ from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
 #: Game steps after which BenchMARL stops an episode.
 _MAX_STEPS: Final = 100
 _ONE_AGENT: Final = "simple"
-#: In VMAS's warning of parameters that a scenario does not know.
+#: Text of VMAS's warning about unknown parameters of a scenario.
 _UNUSED: Final = "not used by the scenario"
 
 
@@ -38,9 +38,9 @@ class VmasGames(Batch):
     """
     E games of a scenario.
 
-    VMAS keeps one random state for all its environments; each batch puts its own in for the time of a call.
+    VMAS has one random state for all environments; each batch sets its own one during a call.
 
-    :param env: of VMAS, with ``terminated_truncated=True``
+    :param env: environment of VMAS, with ``terminated_truncated=True``
     """
 
     def __init__(self, env: Any) -> None:
@@ -55,7 +55,7 @@ class VmasGames(Batch):
 
     @contextlib.contextmanager
     def _own_randomness(self) -> Iterator[None]:
-        """Exchange VMAS's random state for this batch's."""
+        """Set VMAS's random state to this batch's temporarily."""
         shared = Environment.vmas_random_state
         kept = list(shared)
         shared[:] = self._random
@@ -66,7 +66,7 @@ class VmasGames(Batch):
             shared[:] = kept
 
     def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
-        """Begin an episode in every game; the first seed is the batch's (see the base class)."""
+        """Begin an episode in every game; the first seed is used for the batch (see the base class)."""
         with self._own_randomness():
             observations = self.env.reset(seed=None if seeds is None else seeds[0] % 2**32)
         return self._rows(observations, np.ones(self.n_games, dtype=bool))
@@ -90,7 +90,7 @@ class VmasGames(Batch):
         return _observe(self.env)
 
     def _chosen(self, actions: Array) -> list[th.Tensor]:
-        """Actions of the agents, cut to their own spaces; actions that an agent does not have become its first."""
+        """Return the agents' actions, limited to their own spaces; actions that an agent lacks become its first."""
         chosen = []
         for index, space in enumerate(self._action_spaces):
             own = th.from_numpy(np.ascontiguousarray(actions[:, index]))
@@ -100,7 +100,7 @@ class VmasGames(Batch):
         return [one.to(self.env.device) for one in chosen]
 
     def _rows(self, observations: Sequence[Any], active: npt.NDArray[np.bool_]) -> dict[str, Array]:
-        """(B, ...) rows of games whose agents all take part, or none."""
+        """Return rows (B, ...); in each game either all agents are active or none."""
         width = max(self._widths)
         padded = [
             th.nn.functional.pad(th.cat([_flat(part) for part in _parts(one)], dim=1), (0, width - own))
@@ -114,7 +114,7 @@ class VmasGames(Batch):
         return rows
 
     def picture(self, game: int) -> npt.NDArray[np.uint8]:
-        """Return what VMAS draws of a game; it needs a display, or EGL (see the base class)."""
+        """Return VMAS's picture of a game; needs a display, or EGL (see the base class)."""
         with self._own_randomness():
             return np.asarray(self.env.render(mode="rgb_array", env_index=game), dtype=np.uint8)
 
@@ -125,7 +125,7 @@ def _observe(env: Any) -> list[Any]:
 
 
 def _parts(observation: Any) -> Iterator[th.Tensor]:
-    """The tensors of an agent's observation, each (E, ...)."""
+    """Yield the tensors of an agent's observation, each (E, ...)."""
     if isinstance(observation, dict):
         for part in observation.values():
             yield from _parts(part)
@@ -138,7 +138,7 @@ def _flat(part: th.Tensor) -> th.Tensor:
 
 
 def _row_actions(own: Sequence[Any]) -> tuple[spaces.Space[Any], npt.NDArray[np.int8] | None]:
-    """Return the action space of a row, and (N, A) the actions that each agent has, None if all have all."""
+    """Return the action space of a row, and the actions of each agent (N, A), None if all agents have all."""
     if not own[0].shape:
         counts = np.array([space.n for space in own])
         masks = (np.arange(counts.max()) < counts[:, np.newaxis]).astype(np.int8)
@@ -167,14 +167,14 @@ def vec_env(
 
     :param scenario: its name
     :param n_envs: E
-    :param seed: of the run
-    :param state: must be False: VMAS tells no state of the game
+    :param seed: seed of the run
+    :param state: must be False: VMAS has no state of the game
     :param render_mode: None or ``"rgb_array"``
     :param max_steps: time limit in game steps; None for none
-    :param continuous_actions: whether actions are forces, or numbers of directions
-    :param device: of torch, where the games are
-    :param params: of the scenario
-    :raises ValueError: if the scenario does not know a parameter, or a state is asked for
+    :param continuous_actions: whether actions are forces, or indices of directions
+    :param device: torch device of the games
+    :param params: parameters of the scenario
+    :raises ValueError: for an unknown parameter, or if a state is requested
     """
     if state:
         raise ValueError(f"vmas/{scenario} tells no state of the game; leave state=True out")
