@@ -156,7 +156,7 @@ class Session:
 
     @property
     def status(self) -> str:
-        """Return the selected agent and the outcome of the last action."""
+        """Selected agent and outcome of the last action."""
         agent, state = self.selected, self.env.get_state()
         facing = Direction(int(state["agent_dir"][agent])).name.lower()
         key = ", has a key" if state["agent_has_key"][agent] else ""

@@ -186,14 +186,14 @@ class TeamReplayBuffer(ReplayBuffer):
 
     @property
     def nbytes(self) -> int:
-        """Return the bytes of all arrays."""
+        """Size of all arrays in bytes."""
         parts = [*self.seen.values(), *self.aside.values()]
         parts += [self.actions, self.rewards, self.terminal, self.ended, self.starts, self.aside_index]
         return sum(array.nbytes for array in parts)
 
     @property
     def n_stored(self) -> int:
-        """Return the number of game steps that can be sampled, over all games."""
+        """Number of game steps that can be sampled, over all games."""
         return self.size() * self.n_games
 
     def _check_memory(self) -> None:

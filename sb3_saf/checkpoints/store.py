@@ -43,7 +43,7 @@ class CheckpointFolder:
         self._lock: int | None = None
 
     def checkpoints(self) -> list[Path]:
-        """Files of all checkpoints, newest first."""
+        """Return the files of all checkpoints, newest first."""
         if not self.path.is_dir():
             return []
         found = [(int(match[1]), path) for path in self.path.iterdir() if (match := _NAME.fullmatch(path.name))]

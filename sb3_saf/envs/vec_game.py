@@ -45,7 +45,7 @@ class VecGame(ParallelEnv[Any, Any, Any]):
 
     @property
     def state_space(self) -> spaces.Space[Any]:
-        """Return the space of :meth:`state`."""
+        """Space of :meth:`state`."""
         if self._rows.state is None:
             raise AttributeError("the games were made without state=True")
         return self._rows.state

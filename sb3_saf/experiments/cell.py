@@ -167,7 +167,7 @@ class TrainingClock(BaseCallback):
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
-        """Return game steps, processor seconds of this process, and wall seconds since the start, (K, 3)."""
+        """Game steps, processor seconds of this process, and wall seconds since the start, (K, 3)."""
         return np.array(self._points, dtype=np.float64).reshape(-1, 3)
 
     def _on_training_start(self) -> None:

@@ -43,7 +43,7 @@ class Level(NamedTuple):
 
     @property
     def slug(self) -> str:
-        """Return a name for files and folders, such as ``"c2-h1"``."""
+        """Name for files and folders, such as ``"c2-h1"``."""
         return "-".join(f"{_SHORT.get(name, name)}{value}" for name, value in self.parameters) or "default"
 
     def __str__(self) -> str:
@@ -67,12 +67,12 @@ class View(NamedTuple):
 
     @property
     def axis(self) -> str:
-        """Return the name of the axis in figures."""
+        """Name of the axis in figures."""
         return self.label or self.parameter or "level"
 
     @property
     def suffix(self) -> str:
-        """Return the level of the training, for titles; empty if training is at each test level."""
+        """Level of the training, for titles; empty if training is at each test level."""
         return "" if self.train is None else f", trained at {self.train}"
 
     def position(self, level: Level) -> Any:

@@ -45,7 +45,7 @@ class Cell:
 
     @property
     def id(self) -> str:
-        """Return the folder of the cell below ``cells``, with slashes."""
+        """Folder of the cell below ``cells``, with slashes."""
         return f"{re.sub(r'[^A-Za-z0-9_.]', '-', self.task)}-{self.level.slug}/{self.method}/seed-{self.seed}"
 
     @property

@@ -1,18 +1,18 @@
 """
 Folder of results. A finished cell is one folder, which is created atomically.
 
-    settings.json                    what is the same for every cell
+    settings.json                    configuration of all cells
     cells/TeamTogether-c2-h1/saf/seed-0/
-        cell.json  config.json       what was trained; everything that decides the result
-        command.txt                  trains it again
-        versions.json  status.json   commit and software; what it cost
+        cell.json  config.json       the cell; everything that determines its result
+        command.txt                  command that reproduces it
+        versions.json  status.json   commit and software; cost
         curve.csv  model.zip         returns of the training episodes; the model
         tests/c2-h1.json             returns of the test episodes
     unfinished/TeamTogether-c2-h1/saf/seed-1/
-        job.json  training/          what to do; checkpoints and monitor of the training
-        error.txt  log.txt           why the last attempt failed
-    coordination/experiment.json     an experiment of one's own
-    coordination/selections/*.json   what was asked for, so that a report knows what is missing
+        job.json  training/          the job; checkpoints and monitor of the training
+        error.txt  log.txt           error and log of the last attempt
+    coordination/experiment.json     a user's experiment
+    coordination/selections/*.json   requested selections, for missing cells in reports
     coordination/table.csv           one row per cell and test level, made from the cells
 """
 

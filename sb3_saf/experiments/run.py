@@ -33,7 +33,7 @@ class CellOptions:
 
     :param device: as in SB3
     :param threads: threads of torch in each worker
-    :param retries: further attempts for a cell that failed or whose process died
+    :param retries: additional attempts for a failed or killed cell
     :param tensorboard: whether cells keep TensorBoard logs
     :param resume: whether killed cells continue from their last checkpoint
     """

@@ -4,18 +4,18 @@ Results as tidy pandas tables, for reports and custom figures.
 Tables of tests have one row per cell and test level, and are always computed from the cells:
 
 ``method``, ``task``                 name of the algorithm, or ``"random"``; the environment
-``train_level``, ``level``           where it was trained and tested, such as ``"c2-h1"``
+``train_level``, ``level``           levels of training and test, such as ``"c2-h1"``
 ``train_...``, one column each       parameters of these levels, such as ``train_coordination``, ``coordination``
-``seed``, ``evaluation_seed``        of the run; from which the games of the test got theirs
-``n_agents``, ``max_return``         N; the largest team return there is, where it is known
-``game_steps``, ``episodes``         of the training, 0 for a random team; of the test
+``seed``, ``evaluation_seed``        seed of the run; seed of the test games
+``n_agents``, ``max_return``         N; the largest possible team return, if known
+``game_steps``, ``episodes``         game steps of the training, 0 for a random team; episodes of the test
 ``return_mean``, ``return_low``,     mean team return with its 95 % interval over episodes (Student's t)
 ``return_high``
-``success_rate``                     part of the episodes that were won; empty where the games do not tell
-``score``                            share of the largest return; where that is not known, of the range of all returns
+``success_rate``                     fraction of episodes won; empty if the games do not report it
+``score``                            fraction of the largest return; if that is unknown, of the range of all returns
                                      in the table on this task and level
-``returns``                          team return of every episode, with spaces between
-``processor_seconds``,               what the training cost, and the test
+``returns``                          team return of every episode, separated by spaces
+``processor_seconds``,               cost of training and test
 ``wall_seconds_training``, ``wall_seconds_test``
 ``cell``                             folder below ``cells``
 """
@@ -206,7 +206,7 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Return whether the first is higher or lower, or why there is no verdict."""
+        """Whether the first is higher or lower, or why there is no verdict."""
         if len(self.seeds) < FEWEST_SEEDS:
             return f"no winner: fewer than {FEWEST_SEEDS} seeds"
         if self.first.low > self.second.high and self.difference.low > 0:

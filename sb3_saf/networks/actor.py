@@ -279,7 +279,7 @@ class PolicyPool(ActorNetwork):
 
     @property
     def is_categorical_mixture(self) -> bool:
-        """Return whether the mixture is a single categorical, which is then computed before rows are gathered."""
+        """Whether the mixture is a single categorical, which is then computed before rows are gathered."""
         return self.selection == "mixture" and self.space.kind == "discrete"
 
 

@@ -105,7 +105,7 @@ class _FlattenPictures(nn.Flatten):
     """Flatten pictures, and keep the gradient in channels-last memory, which makes the previous layer fast."""
 
     def forward(self, pictures: th.Tensor) -> th.Tensor:
-        """(K, C, H, W) to (K, C * H * W)."""
+        """Flatten (K, C, H, W) to (K, C * H * W)."""
         if pictures.requires_grad:
             pictures.register_hook(_channels_last)
         return super().forward(pictures)
@@ -147,7 +147,7 @@ class PaperCNN(Encoder):
         )
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
+        """Encode observations (K, *shape) as (K, features_dim)."""
         features: th.Tensor = self.net(self.pixels(observations))
         return features
 
@@ -180,7 +180,7 @@ class NatureEncoder(Encoder):
         self.nature = _NatureCNN(self.pixels.shape, features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
+        """Encode observations (K, *shape) as (K, features_dim)."""
         features: th.Tensor = self.nature(self.pixels(observations))
         return features
 
@@ -204,7 +204,7 @@ class _NatureCNN(nn.Module):
         self.linear = nn.Sequential(nn.Linear(64 * prod(out), features_dim), nn.ReLU())
 
     def forward(self, pictures: th.Tensor) -> th.Tensor:
-        """(K, C, H, W) to (K, d)."""
+        """Encode pictures (K, C, H, W) as (K, d)."""
         features: th.Tensor = self.linear(self.cnn(pictures))
         return features
 
@@ -264,7 +264,7 @@ class LightEncoder(Encoder):
         self.net = mlp([self.n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
+        """Encode observations (K, *shape) as (K, features_dim)."""
         if self.pixels.layout == "codes":
             by_code = self.embed(self.tile_inputs)
             tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
@@ -305,7 +305,7 @@ class MLPEncoder(Encoder):
         self.net = mlp([self.space.n_inputs, hidden, features_dim], nn.Tanh, output_gain=HIDDEN_GAIN)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations, raw or preprocessed, to (K, features_dim)."""
+        """Encode observations (K, *shape), raw or preprocessed, as (K, features_dim)."""
         if not observations.is_floating_point():
             observations = preprocess(observations, self.space, normalize_images=False)
         features: th.Tensor = self.net(observations.flatten(1))

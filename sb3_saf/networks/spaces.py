@@ -97,7 +97,7 @@ class SpaceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (first, second, third) if first == min(self.shape) else (third, first, second)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest values of a Box, broadcastable to its shape."""
+        """Return the lowest and highest values of a Box, broadcastable to its shape."""
         return _bound_array(self.low, self, "low"), _bound_array(self.high, self, "high")
 
 

@@ -116,19 +116,19 @@ class LeanCategorical(CategoricalDistribution):
         """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
-        """(B,) log-likelihoods of actions (B,)."""
+        """Return log-likelihoods (B,) of actions (B,)."""
         return self.log_probs.gather(1, actions.long().reshape(-1, 1)).squeeze(1)
 
     def entropy(self) -> th.Tensor:
-        """(B,) entropies."""
+        """Return entropies (B,)."""
         return -(self.log_probs.exp() * self.log_probs).sum(dim=1)
 
     def sample(self) -> th.Tensor:
-        """(B,) drawn actions."""
+        """Sample actions (B,)."""
         return th.multinomial(self.log_probs.exp(), 1, True).squeeze(1)
 
     def mode(self) -> th.Tensor:
-        """(B,) most likely actions."""
+        """Return the most likely actions (B,)."""
         return self.log_probs.argmax(dim=1)
 
 
@@ -197,11 +197,11 @@ class PoolDistribution(_FromPool):
         """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
-        """(B,) log-likelihoods of actions (B, D)."""
+        """Return log-likelihoods (B,) of actions (B, D)."""
         return mixture_log_prob(self.space, self.log_weights, self.parameters, actions)
 
     def entropy(self) -> th.Tensor | None:
-        """(B,) exact by enumeration, or None."""
+        """Return exact entropies (B,) by enumeration, or None."""
         return mixture_entropy(self.space, self.log_weights, self.parameters)
 
     def sample(self) -> th.Tensor:
@@ -272,11 +272,11 @@ class SelectedDistribution(_FromPool):
         return self
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
-        """(B,) log-likelihood under the drawn policy."""
+        """Return log-likelihoods (B,) under the drawn policy."""
         return self.drawn.log_prob(actions)
 
     def entropy(self) -> th.Tensor | None:
-        """(B,) entropy of the drawn policy."""
+        """Return entropies (B,) of the drawn policy."""
         return self.drawn.entropy()
 
     def sample(self) -> th.Tensor:
@@ -284,5 +284,5 @@ class SelectedDistribution(_FromPool):
         return self.drawn.sample()
 
     def mode(self) -> th.Tensor:
-        """Most likely action of the favourite policy."""
+        """Return the most likely action of the favourite policy."""
         return self.favourite.mode()

@@ -55,7 +55,7 @@ class PaperCNN(encoders.PaperCNN, BaseFeaturesExtractor):
             self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
+        """Encode observations (K, *shape) as (K, features_dim)."""
         if self._places is None or not looks_up(self.pixels, observations):
             return super().forward(observations)
         features: th.Tensor = self.net[2:](self._first_layer(observations, self._places))
@@ -97,7 +97,7 @@ class LightEncoder(encoders.LightEncoder, BaseFeaturesExtractor):
         self._places = places_of_linear(self.n_tiles)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
+        """Encode observations (K, *shape) as (K, features_dim)."""
         if not looks_up(self.pixels, observations):
             return super().forward(observations)
         features: th.Tensor = self.net[2:](self._first_layer(observations))
@@ -147,7 +147,7 @@ class PartsEncoder(BaseFeaturesExtractor):
         self.join = nn.Sequential(nn.Linear(n_encoders * features_dim, features_dim), nn.ReLU())
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, n) observations to (K, features_dim)."""
+        """Encode observations (K, n) as (K, features_dim)."""
         slices = [observations[:, part.start : part.stop] for part in self.parts]
         shown = [
             slice_.reshape(-1, *part.picture) / 255.0
@@ -181,7 +181,7 @@ class ObservationEncoder(BaseFeaturesExtractor):
             _warn_if_large(self.encoder, observation_space)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(K, *shape) observations to (K, features_dim)."""
+        """Encode observations (K, *shape) as (K, features_dim)."""
         features: th.Tensor = self.encoder(observations)
         return features
 

@@ -36,7 +36,7 @@ class TeamError(NamedTuple):
 
     @property
     def loss(self) -> th.Tensor:
-        """Return the mean of the squared errors, as published."""
+        """Mean of the squared errors, as published."""
         return self.td.square().mean()
 
 

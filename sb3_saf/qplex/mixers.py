@@ -126,7 +126,7 @@ class ParallelMLPs(nn.Module):
             self.biases.append(nn.Parameter(th.empty(count, 1, n_out).uniform_(-bound, bound)))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """(G, inputs) to (K, G, outputs)."""
+        """Apply the networks: (G, inputs) to (K, G, outputs)."""
         x = x.expand(len(self.weights[0]), *x.shape)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = th.baddbmm(bias, nn.functional.relu(x) if i else x, weight)

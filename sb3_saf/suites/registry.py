@@ -26,7 +26,7 @@ class SuiteTask(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Return the id for users."""
+        """Id for users."""
         return f"{self.suite.name}/{self.task}"
 
     def warn_if_competitive(self) -> None:

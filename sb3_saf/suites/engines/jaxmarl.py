@@ -112,7 +112,7 @@ class JaxPrograms:
 
     @cached_property
     def _own_dtype(self) -> npt.DTypeLike:
-        """Return uint8 if all observations are bytes or flags, else float32."""
+        """Uint8 if all observations are bytes or flags, else float32."""
         small = all(one.dtype in (np.uint8, np.bool_) for one in self._observations.values())
         return np.uint8 if small else np.float32
 
@@ -144,7 +144,7 @@ class JaxPrograms:
 
     @cached_property
     def action_space(self) -> spaces.Space[Any]:
-        """Return the space of a row's action."""
+        """Action space of a row."""
         first = self._action_spaces[0]
         if self._n_actions:
             return spaces.Discrete(max(self._n_actions))
