@@ -3,12 +3,12 @@ Value normalisation: the critic learns returns of mean 0 and variance 1; values 
 How it works with SB3's unmodified PPO:
 
 1. The policy passes every output of its critic through its :class:`ValueNormalizer`, so *all* values outside the policy
-  are on the raw scale: in the buffer, in the advantages, in the bootstrap of a time limit.
+   are on the raw scale: in the buffer, in the advantages, in the bootstrap of a time limit.
 2. SB3 trains with its squared error on the raw scale. The gradient of a value is rescaled in the backward pass to the
-  gradient of the squared error of normalised values (:meth:`ValueNormalizer.forward`).
+   gradient of the squared error of normalised values (:meth:`ValueNormalizer.forward`).
 3. The statistics need the returns, which the rollout buffer computes. The minibatches of ``TeamRolloutBuffer`` contain
-  them (``sb3_saf.buffers.rollout``); the policy updates the statistics at the first minibatch of a rollout, before the
-  gradient step. Training on minibatches of other buffers raises a ValueError.
+   them (``sb3_saf.buffers.rollout``); the policy updates the statistics at the first minibatch of a rollout, before the
+   gradient step. Training on minibatches of other buffers raises a ValueError.
 
 Letters: B rows.
 """
