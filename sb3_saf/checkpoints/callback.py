@@ -81,7 +81,6 @@ class TeamCheckpointCallback(BaseCallback):
     :param folder: folder for the checkpoints of this run only
     :param every_game_steps: **game steps**, summed over all parallel games, between checkpoints, which are written at
         the next start of a rollout
-
     :param keep: number of newest checkpoints to keep
     :param others: all other callbacks of the run, whose state is included
     :param exact: None resumes exactly if the environment provides its state, and otherwise warns at the start: a

@@ -135,7 +135,6 @@ class SAFParts(MAPPOParts):
 
     :param heads: ``"shared"`` for one critic that all agents use, ``"per_agent"`` for one each. The pool is always
         shared; without pool there is one actor, or one for each agent
-
     :param actor_identity: whether pool and selection, or a shared actor, read the agent's index as a one-hot vector
     :param agent_identity: whether a shared critic on joint features reads the agent's index as a one-hot vector
     :param n_policies: U, size of the pool; 1 is the ablation without pool

@@ -31,11 +31,9 @@ class Rules(NamedTuple):
 
     :param is_undecided: ``(env, state) -> bool``, whether an ended game was stopped by its time limit; None if
         ``state.step`` reaching ``env.max_steps`` decides
-
     :param is_won: ``(env, state) -> bool`` of an ended game, None if success is not defined
     :param pays_the_dead: whether dead agents receive the team's reward until its episode ends. Their rows then
         continue: if they ended, dead agents would not learn from the team's success
-
     :param extra_reward: ``infos -> {agent: reward}`` for :attr:`JaxGames.extra_weight`
     :param draw: ``(env, state) -> picture``, (height, width, 3)
     """
