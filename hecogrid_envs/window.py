@@ -23,8 +23,9 @@ _OTHER_WAYS: Final = (
 
 class HumanWindow:
     """
-    Window that shows pictures and collects keys; it opens with the first picture. After the person has closed it,
-    pictures are dropped silently, so that the program continues.
+    Window that shows pictures and collects keys; it opens with the first picture.
+
+    After the person has closed it, pictures are dropped silently, so that the program continues.
 
     :param title: text of the title bar
     :param fps: maximum pictures per second, :meth:`show` waits if necessary; None never waits
@@ -119,8 +120,9 @@ def _import_pygame() -> ModuleType:
 
 def _start_display(pygame: ModuleType) -> None:
     """
-    Start the display, or raise RuntimeError without one. Without a screen, SDL silently selects a driver that shows
-    nothing; it is accepted only if requested explicitly.
+    Start the display, or raise RuntimeError without one.
+
+    Without a screen, SDL silently selects a driver that shows nothing; it is accepted only if requested explicitly.
     """
     _wait_for_display()
     try:

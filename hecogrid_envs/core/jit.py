@@ -33,8 +33,9 @@ def kernel(function: Function) -> Function:
 
 def hot(function: Function) -> Function:
     """
-    Compile an outer loop that runs in every step. It cannot slice or allocate: reference counts are off, since their
-    atomic increments would cost more than the rules.
+    Compile an outer loop that runs in every step.
+
+    It cannot slice or allocate: reference counts are off, since their atomic increments would cost more than the rules.
     """
     return _part(function, _nrt=False)
 

@@ -1,6 +1,8 @@
 """
-State of an SB3 algorithm between two rollouts. SB3 has no public interface to set most of it: its ``load`` sets the
-attributes from an unpickled file, and ``save`` omits some. Only this module reads and sets them.
+State of an SB3 algorithm between two rollouts.
+
+SB3 has no public interface to set most of it: its ``load`` sets the attributes from an unpickled file, and ``save``
+omits some. Only this module reads and sets them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """
-Description of a run, compared by name before a checkpoint is used. Versions and hardware, which affect only the last
-bits of a run, may differ.
+Description of a run, compared by name before a checkpoint is used.
+
+Versions and hardware, which affect only the last bits of a run, may differ.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ _OF_CALLBACKS: Final[dict[type[BaseCallback], tuple[str, ...]]] = {
 
 def description(model: BaseAlgorithm) -> dict[str, Tree]:
     """
-    Describe how a model and its games were made. Schedules are functions, described by their values at five points of
-    training.
+    Describe how a model and its games were made.
+
+    Schedules are functions, described by their values at five points of training.
     """
     env = model.get_env()
     assert env is not None

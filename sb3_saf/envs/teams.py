@@ -382,8 +382,9 @@ def _others(count: int) -> str:
 
 class TeamVecEnvWrapper(VecEnvWrapper):
     """
-    Base of wrappers around vector environments of flattened teams, with attributes ``n_agents`` and ``n_games``. The
-    layers below may have these attributes, too. SB3 would call that ambiguous in a further wrapper (such as
+    Base of wrappers around vector environments of flattened teams, with attributes ``n_agents`` and ``n_games``.
+
+    The layers below may have these attributes, too. SB3 would call that ambiguous in a further wrapper (such as
     VecNormalize); here all layers have equal values, so it is allowed.
 
     SB3's ``evaluate_policy``, ``EvalCallback`` and ``VecMonitor`` count every agent as an environment: their use around

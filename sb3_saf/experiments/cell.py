@@ -71,8 +71,9 @@ class Job:
 
 def run_job(folder: Path) -> None:
     """
-    Do the job in ``FOLDER/job.json``: train, unless ``FOLDER/model.zip`` exists, and test. A killed job continues on
-    the next call from the last checkpoint in ``FOLDER/training``.
+    Do the job in ``FOLDER/job.json``: train, unless ``FOLDER/model.zip`` exists, and test.
+
+    A killed job continues on the next call from the last checkpoint in ``FOLDER/training``.
 
     :param folder: folder of the job; the files of the finished cell, or only its further tests, are written to
         ``FOLDER/result``

@@ -22,8 +22,10 @@ _ANY_ALGORITHM = "ippo"
 @dataclass(frozen=True)
 class Cell:
     """
-    One training and its tests. The name of its folder identifies the training. Cells are independent of experiments, so
-    experiments in one folder share them.
+    One training and its tests.
+
+    The name of its folder identifies the training. Cells are independent of experiments, so experiments in one folder
+    share them.
 
     :param method: name of the algorithm, or ``"random"`` for the untrained team
     :param env: the environment, as in ``sb3_saf.train --env``

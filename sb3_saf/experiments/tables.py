@@ -152,8 +152,9 @@ def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
 
 def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
     """
-    Return the rows of a view, with their position on the axis in a column with the axis's name. The random team belongs
-    to every view, since it does not depend on training levels.
+    Return the rows of a view, with their position on the axis in a column with the axis's name.
+
+    The random team belongs to every view, since it does not depend on training levels.
 
     :param table: table of tests
     """

@@ -30,8 +30,9 @@ Array = npt.NDArray[Any]
 
 class Memory:
     """
-    Memory of an actor in an episode: hidden and cell state of its LSTM, (layers, K, H), initially zeros. Make a new one
-    for each episode.
+    Memory of an actor in an episode: hidden and cell state of its LSTM, (layers, K, H), initially zeros.
+
+    Make a new one for each episode.
     """
 
     def __init__(self, hidden: Array | None = None, cell: Array | None = None):

@@ -1,6 +1,7 @@
 """
-Actor from files: one agent's part of a trained team. This module and its imports use neither Stable-Baselines3 nor
-Gymnasium: ``sb3_saf.Actor`` works without them.
+Actor from files: one agent's part of a trained team.
+
+This module and its imports use neither Stable-Baselines3 nor Gymnasium: ``sb3_saf.Actor`` works without them.
 """
 
 from __future__ import annotations
@@ -116,8 +117,9 @@ class Actor:
 
     def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
-        Return the probability of every discrete action, (A,) or (K, A) for a batch. Arguments as in :meth:`act`; the
-        memory is not updated.
+        Return the probability of every discrete action, (A,) or (K, A) for a batch.
+
+        Arguments as in :meth:`act`; the memory is not updated.
         """
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         self._refuse_greedy()

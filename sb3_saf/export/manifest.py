@@ -1,6 +1,8 @@
 """
-``actor.json``: the manifest that describes an exported actor. It may be untrusted: msgspec checks the type and size of
-every entry before use, names are looked up in closed lists, and unknown entries are refused.
+``actor.json``: the manifest that describes an exported actor.
+
+It may be untrusted: msgspec checks the type and size of every entry before use, names are looked up in closed lists,
+and unknown entries are refused.
 """
 
 from __future__ import annotations

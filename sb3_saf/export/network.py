@@ -187,8 +187,9 @@ def decide(space: SpaceSpec, selection: str, output: PoolOutput, deterministic: 
 
 def load_network(manifest: Manifest, weights: bytes) -> tuple[AgentNetwork, Array | None]:
     """
-    Make the network of a manifest from the content of a safetensors file. Sizes are compared with the file's before
-    memory is allocated.
+    Make the network of a manifest from the content of a safetensors file.
+
+    Sizes are compared with the file's before memory is allocated.
 
     :return: the network, and the pixels of tile codes if observations are tile codes
     :raises ExportError: if manifest and weights do not match

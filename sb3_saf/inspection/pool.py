@@ -18,8 +18,10 @@ Floats = npt.NDArray[np.floating[Any]]
 
 class SelectionEntropy(NamedTuple):
     """
-    Entropies of the selection, from 0 to 1 (divided by log U). Both low: the pool has collapsed to one policy. ``each``
-    low and ``mean`` high: confident selection that depends on the observation. Both high: all policies are blended.
+    Entropies of the selection, from 0 to 1 (divided by log U).
+
+    Both low: the pool has collapsed to one policy. ``each`` low and ``mean`` high: confident selection that depends on
+    the observation. Both high: all policies are blended.
 
     :param each: mean entropy of the weights of one observation
     :param mean: entropy of the mean weights
@@ -81,9 +83,10 @@ def zone_dependence(weights: Floats, zones: npt.NDArray[np.integer[Any]]) -> flo
 
 def differences(action_space: spaces.Space[Any], actions: Floats) -> npt.NDArray[np.float64]:
     """
-    Return the Hellinger distances between the action distributions of a pool's policies, mean over observations. sqrt(1
-    - sum_a sqrt(p(a) q(a))): 0 for equal distributions, 1 for disjoint ones. It is exact for every kind of action
-    space, including joint actions of several dimensions.
+    Return the Hellinger distances between the action distributions of a pool's policies, mean over observations.
+
+    sqrt(1 - sum_a sqrt(p(a) q(a))): 0 for equal distributions, 1 for disjoint ones. It is exact for every kind of
+    action space, including joint actions of several dimensions.
 
     :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
     :param actions: (n, U, P) parameters of each policy's distribution

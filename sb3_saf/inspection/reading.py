@@ -1,8 +1,9 @@
 """
 Readers of a policy's outputs in one step of all games: actions and values, weights of the pool, attention of the
-knowledge source, and the critic's values without the message read. Rows are read by the policies' own methods. Letters:
-B rows of E games with N agents each, U policies or heads, L slots, P parameters of an action distribution, A actions, d
-features.
+knowledge source, and the critic's values without the message read.
+
+Rows are read by the policies' own methods. Letters: B rows of E games with N agents each, U policies or heads, L slots,
+P parameters of an action distribution, A actions, d features.
 """
 
 from __future__ import annotations

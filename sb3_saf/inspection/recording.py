@@ -1,7 +1,8 @@
 """
-Recording of team episodes: observations, actions and network outputs of every step as plain arrays. Figures, films,
-TensorBoard and reports read recordings only. Letters: T game steps, E games, N agents, B = E N rows, A actions, U
-policies, L slots, P parameters of an action distribution.
+Recording of team episodes: observations, actions and network outputs of every step as plain arrays.
+
+Figures, films, TensorBoard and reports read recordings only. Letters: T game steps, E games, N agents, B = E N rows, A
+actions, U policies, L slots, P parameters of an action distribution.
 """
 
 from __future__ import annotations
@@ -104,8 +105,9 @@ def record_episodes(
     pictures: bool = True,
 ) -> EpisodeRecording:
     """
-    Play a fixed set of team episodes and record them, without changing training's random generators. Episodes are
-    divided over the games as in ``evaluate_team``.
+    Play a fixed set of team episodes and record them, without changing training's random generators.
+
+    Episodes are divided over the games as in ``evaluate_team``.
 
     :param policy: policy of this package
     :param env: environment of teams

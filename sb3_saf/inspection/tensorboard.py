@@ -1,7 +1,8 @@
 """
-TensorBoard output of inspection: scalars, pictures, hyperparameters, a text that explains the tags, and a layout. It is
-written through SB3's logger formats to the run's event file, by a separate logger, so that training's pending records
-are unchanged.
+TensorBoard output of inspection: scalars, pictures, hyperparameters, a text that explains the tags, and a layout.
+
+It is written through SB3's logger formats to the run's event file, by a separate logger, so that training's pending
+records are unchanged.
 """
 
 from __future__ import annotations
@@ -231,8 +232,9 @@ def hyperparameters(
     model: BaseAlgorithm, policy: OurPolicy, more: Mapping[str, object], scalars: Mapping[str, float]
 ) -> HParam:
     """
-    Describe a run for the HParams page: the user's hyperparameters, then seed and method, then all others. TensorBoard
-    sorts the columns by name, so the first ones have a number as prefix: ``1 task``.
+    Describe a run for the HParams page: the user's hyperparameters, then seed and method, then all others.
+
+    TensorBoard sorts the columns by name, so the first ones have a number as prefix: ``1 task``.
 
     :param model: the algorithm
     :param policy: its policy

@@ -1,6 +1,7 @@
 """
-Spaces as plain data, for building networks and for the manifest of an export. Neither Gymnasium nor torch is imported
-here, so that exported actors run without them.
+Spaces as plain data, for building networks and for the manifest of an export.
+
+Neither Gymnasium nor torch is imported here, so that exported actors run without them.
 """
 
 from __future__ import annotations

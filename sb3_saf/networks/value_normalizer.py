@@ -1,5 +1,6 @@
 """
 Value normalisation: the critic learns returns of mean 0 and variance 1; values outside the critic are on the raw scale.
+
 How it works with SB3's unmodified PPO:
 
 1. The policy passes every output of its critic through its :class:`ValueNormalizer`, so *all* values outside the policy

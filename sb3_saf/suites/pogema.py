@@ -1,7 +1,8 @@
 """
-Multi-agent path finding in a grid, ``pogema/...``: registered only to explain why it is not supported. Every released
-version requires ``gymnasium==0.28.1`` or ``gym``, and versions up to 1.4.0 read attributes through wrappers, which
-Gymnasium 1 has removed; their seeds do not determine the maps.
+Multi-agent path finding in a grid, ``pogema/...``: registered only to explain why it is not supported.
+
+Every released version requires ``gymnasium==0.28.1`` or ``gym``, and versions up to 1.4.0 read attributes through
+wrappers, which Gymnasium 1 has removed; their seeds do not determine the maps.
 """
 
 from __future__ import annotations

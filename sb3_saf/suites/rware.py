@@ -1,7 +1,8 @@
 """
-Multi-robot warehouse: ``rware/rware-tiny-2ag-v2``. The return is the number of shelves that the team delivered. Agents
-learn from the team's sum, as in EPyMARL's cooperative experiments. The package reports the limit of 500 steps as
-termination; here it is a truncation.
+Multi-robot warehouse: ``rware/rware-tiny-2ag-v2``.
+
+The return is the number of shelves that the team delivered. Agents learn from the team's sum, as in EPyMARL's
+cooperative experiments. The package reports the limit of 500 steps as termination; here it is a truncation.
 """
 
 from __future__ import annotations

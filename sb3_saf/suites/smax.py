@@ -1,8 +1,10 @@
 """
-SMAX, StarCraft micromanagement without StarCraft: ``smax/3m``. Allies are trained, enemies follow JaxMARL's heuristic.
-Every ally receives the team's reward: the enemy health removed, at most 1 in total, and 1 for a won battle, which is
-the success. Dead allies receive it, too, so their rows continue, with one legal action without effect. An episode that
-ends with both sides alive was stopped by its time limit. With ``state=True`` the state is ``world_state``.
+SMAX, StarCraft micromanagement without StarCraft: ``smax/3m``.
+
+Allies are trained, enemies follow JaxMARL's heuristic. Every ally receives the team's reward: the enemy health removed,
+at most 1 in total, and 1 for a won battle, which is the success. Dead allies receive it, too, so their rows continue,
+with one legal action without effect. An episode that ends with both sides alive was stopped by its time limit. With
+``state=True`` the state is ``world_state``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """
-Training from settings: make the games, make the model, learn, save. Commands, tuning, experiments and scripts call
-:func:`train`. :class:`Training` has the same function in two steps, for callers that distinguish errors of preparation
-from errors of training.
+Training from settings: make the games, make the model, learn, save.
+
+Commands, tuning, experiments and scripts call :func:`train`. :class:`Training` has the same function in two steps, for
+callers that distinguish errors of preparation from errors of training.
 """
 
 from __future__ import annotations

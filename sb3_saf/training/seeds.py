@@ -21,9 +21,10 @@ def check_seed(seed: object) -> int:
 
 def evaluation_seed(seed: int) -> int:
     """
-    Return the seed from which the seeds of a run's evaluation games are derived, from 2**62 to 2**63 - 1. It is a
-    separate branch in the run's tree of seeds, with the top bit of 63 set. No run can have this seed, so evaluation
-    games differ from the training games of all runs.
+    Return the seed from which the seeds of a run's evaluation games are derived, from 2**62 to 2**63 - 1.
+
+    It is a separate branch in the run's tree of seeds, with the top bit of 63 set. No run can have this seed, so
+    evaluation games differ from the training games of all runs.
     """
     word = np.random.SeedSequence(check_seed(seed), spawn_key=(_EVALUATION,)).generate_state(1, np.uint64)[0]
     return (int(word) >> 2) | (1 << 62)

@@ -210,8 +210,9 @@ def _settings(
     options: argparse.Namespace, sampled: Mapping[str, Any] | None = None
 ) -> tuple[Settings, Settings | None]:
     """
-    Return the settings of training and, if they differ, of evaluation. The user's options take precedence over those
-    sampled for a trial.
+    Return the settings of training and, if they differ, of evaluation.
+
+    The user's options take precedence over those sampled for a trial.
     """
     overrides = merge(sampled or {}, _fixed(options))
 

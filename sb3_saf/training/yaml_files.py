@@ -170,8 +170,9 @@ def _refined(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dict[str, Any]:
     """
-    Merge entries of a file, the most general first, then their sections of the size; entries may be missing. Sections
-    of sizes are merged last because they are the most specific; ``paper`` is the content outside of them.
+    Merge entries of a file, the most general first, then their sections of the size; entries may be missing.
+
+    Sections of sizes are merged last because they are the most specific; ``paper`` is the content outside of them.
     """
     entries = [dict(content.get(key) or {}) for key in keys]
     sections = [entry.pop(SIZES_KEY, {}).get(size, {}) for entry in entries]

@@ -1,7 +1,8 @@
 """
-Games of JaxMARL, batched by ``vmap`` and ``jit``. Each game has its own random stream, so that it depends on its seed
-and the actions only. New episodes begin by the suite's ``reset`` after ``step_env``: its ``step`` also resets, but
-loses the last observation.
+Games of JaxMARL, batched by ``vmap`` and ``jit``.
+
+Each game has its own random stream, so that it depends on its seed and the actions only. New episodes begin by the
+suite's ``reset`` after ``step_env``: its ``step`` also resets, but loses the last observation.
 """
 
 from __future__ import annotations
