@@ -84,8 +84,7 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
     """
     Compute the confidence interval of the mean of independent values by Student's t distribution.
 
-    mean -+ t * s / sqrt(n), with s the sample standard deviation and t the two-sided quantile for n - 1 degrees of
-    freedom.
+    mean -+ t * s / sqrt(n), with sample standard deviation s and two-sided quantile t for n - 1 degrees of freedom.
 
     :param values: (n,) for instance team returns
     :param confidence: above 0, below 1
@@ -109,8 +108,7 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
 
 class RandomPolicy:
     """
-    Baseline with random actions, uniform over the action space, or over legal actions if observations have an
-    ``action_mask``.
+    Baseline with uniformly random actions, legal ones only if observations have an ``action_mask``.
 
     :param action_space: one agent's action space, a Box must be bounded; or the environment that has it, for instance
         from ``make_team_env``
@@ -253,8 +251,8 @@ def evaluate_team(
     """
     Play team episodes.
 
-    Episodes are divided evenly over the games beforehand, as in SB3, since taking the first ones to finish would favour
-    short episodes.
+    Episodes are divided evenly over the games beforehand, as in SB3; taking the first to finish would favour short
+    ones.
 
     :param model: any object with SB3's ``predict``, for instance an algorithm, a policy or a ``RandomPolicy``
     :param env: vector environment of teams, for instance from ``make_team_env``

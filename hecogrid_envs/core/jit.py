@@ -54,8 +54,7 @@ def source_key() -> int:
     """
     Return a hash of all files that kernels are compiled from.
 
-    Numba reuses cached code while the function's file and closure are unchanged, so the compiled function has this
-    number in its closure.
+    Numba reuses cached code while the function's file and closure are unchanged, so the closure contains this number.
     """
     digest = hashlib.sha256()
     sources = [

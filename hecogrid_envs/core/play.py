@@ -28,7 +28,7 @@ def _compiled_play(sources: int) -> Any:
             ``buffers.fresh`` marks), ``BEGIN`` (an episode from the present terrain, positions, directions and keys),
             ``REDRAW`` (derive the data of views), and ``TILES`` or ``PICTURES``
         :param views: (n * N * V * V,) codes or (n * N * V t * V t * 3,) pixels to write; empty if the task has no views
-        :param last_views: as ``views``; only rows of games that are over are written, with their final views; empty for
+        :param last_views: as ``views``; only final views of games that are over are written, to their rows; empty for
             none
         """
         _key = sources  # read, so that it is part of the closure

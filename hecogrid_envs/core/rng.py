@@ -27,8 +27,7 @@ def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
     """
     Return the seeds of the games of a vector environment.
 
-    Game ``i`` gets the same seed for any number of games; seeds of neighbouring runs (``seed``, ``seed + 1``) are
-    unrelated.
+    Game ``i`` gets the same seed for any number of games; seeds of runs ``seed`` and ``seed + 1`` are unrelated.
 
     :param seed: the run's seed, 0 or larger
     :param n_games: E, number of games

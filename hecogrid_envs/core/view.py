@@ -142,8 +142,7 @@ def draw_pictures(
     """
     n_agents = directions.shape[1]
     line, tile_bytes = 3 * tile, 3 * tile * tile
-    # The last views, as many as a chunk may reach into, are drawn line by line: nothing overwrites the excess after
-    # them.
+    # The last views that a chunk may reach into are drawn line by line: nothing overwrites the excess after them.
     repairing = 1 + (_CHUNK_BYTES - 1) // (size * size * tile_bytes)
     n_quick = (last - first) * n_agents - repairing if line <= _CHUNK_BYTES else 0
     view = 0

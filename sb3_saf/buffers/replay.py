@@ -223,8 +223,7 @@ class TeamReplayBuffer(ReplayBuffer):
         Store one step of all games.
 
         :param obs: Dict observation of B rows
-        :param next_obs: observation after the step; the last observation for rows whose episode ended. ``team`` is not
-            read
+        :param next_obs: observation after the step; the last one for rows whose episode ended. ``team`` is not read
         :param action: (B,)
         :param reward: (B,)
         :param done: (B,)
@@ -318,8 +317,7 @@ class TeamReplayBuffer(ReplayBuffer):
         """
         Return the stored data, for exact resume; slots that were never filled are left out.
 
-        :return: plain data for :meth:`load_checkpoint_state` of a buffer with the same arguments; arrays are views of
-            the buffer's
+        :return: plain data for :meth:`load_checkpoint_state` of an equal buffer; arrays are views of the buffer's
         """
         n_filled = self.n_slots if self.full else self.pos + 1
         return {

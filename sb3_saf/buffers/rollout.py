@@ -129,8 +129,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     - **Memory**: own observations are stored once, ``(T, E, N, *shape)`` in their own dtype. SB3's buffer stores N + 1
       observations per row. A row of HECOGrid with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes
-      of action, reward, value etc.; SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Arrays are reused by all
-      rollouts.
+      of action, reward, value etc.; SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Rollouts reuse the arrays.
     - **Minibatches** hold whole teams, agents in index order (:class:`TeamMinibatch`), so that each team is encoded in
       one minibatch only, and critics need no search. ``batch_size`` counts rows and is rounded down to whole teams, at
       least one: SB3's default of 64 is 60 for 5 agents. The last minibatch may be smaller.
@@ -276,7 +275,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
         An agent's return thus ends with its own end. After the last step T, b is ``dones`` and V_T ``last_values``: the
         policies of this package return zero for inactive agents, which replaces c_T. Advantages of inactive rows are
-        never read.
+        unused.
 
         With ``ends="team"``, m_t = 1 - b_{t+1}, and V of an inactive agent is the mean of V over the active agents of
         its team, since all receive the same reward.
@@ -344,8 +343,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         Yield minibatches of the whole rollout, with teams in random order.
 
-        :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all. With inactive
-            agents, rows are fewer
+        :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all; inactive rows
+            are omitted
         :return: minibatches of whole teams: rows of one team are consecutive and in index order
         :raises ValueError: if the buffer is not full, or no agent was ever active
         """

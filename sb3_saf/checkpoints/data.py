@@ -3,8 +3,8 @@ Reading and writing of a tree of plain data without pickle.
 
 A file is a line of text with the format and the version that wrote it, a line of JSON with the tree, the arrays of the
 tree as NumPy's .npy records, then the SHA-256 of all of that. The first line and the checksum are the same in all
-formats, so any version can distinguish damage from another format. Arrays are written and read one by one, without
-additional memory.
+formats, so any version can distinguish damage from another format. Arrays are written and read one by one to save
+memory.
 """
 
 from __future__ import annotations

@@ -37,8 +37,8 @@ class Signals(NamedTuple):
     Signals requested besides own observations; see :class:`~sb3_saf.envs.supersuit_vec_env.SuperSuitVecEnv`.
 
     :param active: whether agents take part
-    :param action_masks: ``"auto"`` for masks if there are any, True to require them, False for none; None leaves
-        observations unchanged
+    :param action_masks: ``"auto"`` for masks if any, True to require them, False for none; None keeps observations
+        unchanged
     :param state: the game's state
     """
 

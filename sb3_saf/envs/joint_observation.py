@@ -152,8 +152,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """
         Wait for the step of all games.
 
-        :return: Dict observation, rewards (B,), dones (B,) bool, infos; ``terminal_observation`` is the complete Dict
-            observation of its row
+        :return: Dict observation, rewards (B,), dones (B,) bool, infos; ``terminal_observation`` is a complete Dict
         :raises ValueError: for NaN or infinity, dones that differ within a team, agents without a legal action, and
             missing terminal observations
         """

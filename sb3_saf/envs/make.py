@@ -84,16 +84,15 @@ def make_team_env(
         (``simple_spread_v3.parallel_env``). An environment is copied. Agents with different spaces get equal ones
         (:class:`EqualSpaces`)
     :param n_envs: E, parallel games
-    :param seed: the run's seed, from which the games' seeds are derived; None for random ones. The ``seed`` of an
-        algorithm overrides it
+    :param seed: the run's seed, which determines the games' seeds; None for random ones. An algorithm's ``seed``
+        overrides it
     :param backend: ``"native"`` steps all games at once in compiled code, for HECOGrid only and its default;
         ``"supersuit"`` goes through SuperSuit, the default for other games. Both give identical results for HECOGrid
-    :param time_limit: ``"terminal"`` treats a time limit as a true end, ``"bootstrap"`` adds the value of the last
-        observation
+    :param time_limit: ``"terminal"`` treats a time limit as a true end, ``"bootstrap"`` adds the last observation's
+        value
     :param monitor_dir: folder for a ``monitor.csv`` with one line per team episode; None for none
     :param n_cpus: number of processes for the games of ``"supersuit"``
-    :param active: whether observations have the signal ``"active"``; None for True, except for HECOGrid, whose agents
-        always take part
+    :param active: whether observations have the signal ``"active"``; None for True, but False for HECOGrid
     :param action_masks: ``"auto"`` for masks if the environment gives any (in observations, or in the infos of its
         first reset), True to require them, False for none
     :param state: whether observations have the environment's ``state()``

@@ -55,8 +55,7 @@ class GameSource:
     """
     Factory or environment from which games are made.
 
-    It is stored pickled if possible, so that a function that returns an existing environment gives each game a copy of
-    it.
+    It is stored pickled if possible, so that a function that returns an existing environment makes copies of it.
 
     :param make_env: the factory or the environment
     :param is_factory: whether ``make_env`` is a factory

@@ -51,8 +51,7 @@ class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
     Observations: Boxes with equal numbers of axes are padded with zeros at the end of each axis; other spaces are
     flattened to vectors by ``gymnasium.spaces.flatten`` and then padded. Actions: Discrete spaces are extended to the
     largest one, and actions that an agent lacks are masked (``infos[agent]["action_mask"]``, combined with the game's
-    own masks) and refused; Boxes are padded, and only the agent's own entries reach the game, clipped to its own
-    bounds.
+    own masks) and refused; Boxes are padded; only the agent's own entries reach the game, clipped to its bounds.
 
     :param env: the game
     :raises ValueError: if actions are neither all Discrete nor all vectors

@@ -18,7 +18,7 @@ TEAM_REWARDS: Final[tuple[TeamReward, ...]] = get_args(TeamReward)
 
 class SharedReward(TeamVecEnvWrapper):
     """
-    Give every agent the sum or the mean of its team's rewards. Wrap it around a TeamMonitor, which logs the games' own
+    Give every agent the sum or the mean of its team's rewards. Wrap it around a TeamMonitor, which logs unchanged
     returns.
 
     :param venv: rows of flattened teams

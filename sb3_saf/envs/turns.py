@@ -20,8 +20,7 @@ _SEEDS: Final = 2**31
 
 class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
     """
-    ParallelEnv for ``make_team_env`` around a turn-based game (PettingZoo's AEC form: Connect Four, Hanabi, Leduc
-    hold'em, ...).
+    ParallelEnv for ``make_team_env`` around a turn-based game (PettingZoo's AEC form: Connect Four, Hanabi, ...).
 
     At each step one agent moves. All others have one legal action, 0, which is ignored; their mask allows nothing else,
     so that they learn nothing from it. The mask is where the game has it, in observations of the form {"observation",

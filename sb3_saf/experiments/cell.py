@@ -75,8 +75,7 @@ def run_job(folder: Path) -> None:
 
     A killed job continues on the next call from the last checkpoint in ``FOLDER/training``.
 
-    :param folder: folder of the job; the files of the finished cell, or only its further tests, are written to
-        ``FOLDER/result``
+    :param folder: folder of the job; the finished cell, or only its further tests, are written to ``FOLDER/result``
     """
     job = Job.read(folder)
     th.set_num_threads(job.threads)
@@ -213,8 +212,7 @@ def curve(monitor: Path, clock: npt.NDArray[np.float64], n_games: int) -> str:
     :param monitor: a TeamMonitor's file, in the order in which episodes ended
     :param clock: points of a :class:`TrainingClock`
     :param n_games: E, minimum episodes of an interval
-    :return: CSV of the game steps and the processor seconds at the end of each interval, the mean return, and the
-        number of episodes
+    :return: CSV of the game steps and the processor seconds at each interval's end, mean return, and number of episodes
     """
     episodes = np.atleast_1d(np.genfromtxt(monitor, delimiter=",", skip_header=1, names=True))
     lines = ["game_steps,processor_seconds,mean_return,episodes"]

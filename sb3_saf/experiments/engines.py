@@ -179,10 +179,7 @@ class RayEngine(Engine):
             ) from None
 
     def _check_resources(self) -> None:
-        """
-        Raise ValueError for jobs that fit on no node, which would wait forever; on a cluster, which may grow, only
-        warn.
-        """
+        """Raise ValueError for jobs that fit on no node; only warn on a cluster, which may grow."""
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         if any(node.get("CPU", 0) >= self.cpus and node.get("GPU", 0) >= self.gpus for node in nodes):
             return

@@ -24,8 +24,7 @@ class Cell:
     """
     One training and its tests.
 
-    The name of its folder identifies the training. Cells are independent of experiments, so experiments in one folder
-    share them.
+    The name of its folder identifies the training. Experiments in one folder share cells.
 
     :param method: name of the algorithm, or ``"random"`` for the untrained team
     :param env: the environment, as in ``sb3_saf.train --env``

@@ -45,8 +45,7 @@ class Frames(NamedTuple):
 
     :param tests: see the module
     :param curves: one row for each point of a learning curve, columns ``method``, ``task``, ``level``, the level's
-        parameters, ``seed``, ``game_steps``, ``processor_seconds`` and ``score``, the mean team return of training
-        episodes
+        parameters, ``seed``, ``game_steps``, ``processor_seconds`` and ``score``, mean training return
     """
 
     tests: pd.DataFrame

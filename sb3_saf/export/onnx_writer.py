@@ -99,7 +99,7 @@ def onnx_bytes(
     depends on it, ``action_mask`` (rows, M) bool if masks are supported, ``hidden`` and ``cell`` (layers, rows, H) with
     memory; and unless selection is greedy, ``action`` (rows, D), the argument of ``log_prob``, and the noise of
     ``drawn``: ``gumbel_policy`` (rows, U) and ``normal_action``, ``logistic_action`` or ``gumbel_action``, named by
-    their distribution.
+    distribution.
 
     Outputs: ``most_likely`` and ``drawn`` (rows, *shape), ``log_prob`` (rows,), for discrete actions ``log_probs``
     (rows, A), and with a memory ``next_hidden`` and ``next_cell``.

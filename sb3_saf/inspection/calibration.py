@@ -23,8 +23,8 @@ class Calibration(NamedTuple):
     """
     Agreement of values V with returns G.
 
-    :param explained_variance: 1 - Var(G - V) / Var(G): 1 for a perfect critic, 0 for a constant one; None if all
-        returns are equal
+    :param explained_variance: 1 - Var(G - V) / Var(G): 1 for a perfect critic, 0 for a constant one; None for equal
+        returns
     :param slope: slope of the regression line of G on V: 1 for a calibrated critic, below 1 if values vary too much;
         None if all values are equal
     :param bias: mean of V - G: positive if values are too high

@@ -39,8 +39,8 @@ class InspectionCallback(BaseCallback):
     :param every_game_steps: game steps (of training, summed over all parallel games) between inspections
     :param n_eval_episodes: team episodes per inspection
     :param seed: seed of the episodes, which are the same at every inspection
-    :param deterministic: whether the policy takes its most likely actions; in training it samples. QPLEX always takes
-        its best ones
+    :param deterministic: whether the policy takes its most likely actions, as QPLEX always does; others sample in
+        training
     :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) integers from 0; None uses the
         games' ``agent_zones``, as in HECOGrid; False for no zones
     :param pictures: whether to draw figures and episodes, which needs matplotlib and Pillow; False writes numbers only

@@ -67,8 +67,7 @@ def zone_dependence(weights: Floats, zones: npt.NDArray[np.integer[Any]]) -> flo
 
     :param weights: (n, U)
     :param zones: (n,) from 0, -1 for none
-    :return: from 0 (selection is independent of the zone) to 1 (each zone has its own policy); None for fewer than two
-        zones
+    :return: from 0 (selection independent of the zone) to 1 (one policy per zone); None for fewer than two zones
     """
     inside = zones >= 0
     counts = np.bincount(zones[inside])

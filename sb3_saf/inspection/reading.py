@@ -197,8 +197,7 @@ def _other_messages(source: SAFStates, replacement: Replacement) -> Iterator[Non
 
 class RecurrentPolicyReader(PolicyReader):
     """
-    Reader of a policy with memory. Messages are replaced at every step, so the critic's memory also depends on replaced
-    messages.
+    Reader of a policy with memory. Messages are replaced at every step, so the critic's memory depends on them, too.
 
     :param policy: policy of RecurrentPPO
     :param n_rows: B

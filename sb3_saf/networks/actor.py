@@ -201,8 +201,7 @@ class PolicyPool(ActorNetwork):
 
     ``selection="gumbel"``: one policy is drawn for each distribution (Gumbel noise on the logits, hard choice,
     straight-through gradient), and likelihood and entropy are that policy's. This is the behaviour of the released
-    code; two evaluations of one action may use different policies. Deterministic actions are those of the policy with
-    the highest weight.
+    code; two evaluations of one action may use different policies. Deterministic actions use the highest weight.
 
     :param features_dim: size of z
     :param action_space: the action space

@@ -2,8 +2,7 @@
 Critics: value estimates for training.
 
 Letters: K unique own observations, G unique teams, N agents, d features. Own observations and teams are separate
-arguments (``features`` and ``teams``), so that functions of a single observation are computed once per unique
-observation.
+arguments (``features`` and ``teams``), so that functions of one observation are computed once each.
 """
 
 from __future__ import annotations

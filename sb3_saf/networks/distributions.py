@@ -48,8 +48,7 @@ def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.T
 
     :param action_space: Discrete, MultiDiscrete or MultiBinary
     :param parameters: (B, P), or (B, U, P) for a pool
-    :param masks: (B, M) bool, True for allowed choices: those of each dimension in turn (of a MultiBinary: off, on), as
-        in sb3-contrib
+    :param masks: (B, M) bool, allowed choices of each dimension in turn (of a MultiBinary: off, on), as in sb3-contrib
     :return: as ``parameters``
     :raises ValueError: if the masks have a wrong shape, or the action space is a Box
     """

@@ -1,8 +1,7 @@
 """
 Encoding of own observations: each unique one of a batch once, and those of whole teams together with the rows' own.
 
-Letters: B rows, K unique own observations, G teams, N agents, d features; ``*shape`` is the shape of one own
-observation.
+Letters: B rows, K unique own observations, G teams, N agents, d features; ``*shape`` is that of an own observation.
 """
 
 from __future__ import annotations

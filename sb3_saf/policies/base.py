@@ -164,8 +164,7 @@ class TeamPolicy(TeamRowsPolicy):
     # --- construction -----------------------------------------------------------------------------------------------
 
     def _build(self, lr_schedule: Schedule) -> None:
-        # The critic is built last: with one seed, policies with different critics have the same initial encoder and
-        # actor.
+        # The critic is built last: with one seed, the initial encoder and actor do not depend on the critic.
         self._build_actor()
         self._build_critic(lr_schedule)
 

@@ -88,8 +88,7 @@ def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> D
 
 class LeanCategorical(CategoricalDistribution):
     """
-    SB3's distribution of Discrete actions, with identical results, in a third of the time: PyTorch's object is only
-    created on access.
+    SB3's distribution of Discrete actions, with equal results in a third of the time: PyTorch's is created on access.
 
     :param action_dim: number of actions, A
     """

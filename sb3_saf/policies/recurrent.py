@@ -31,8 +31,7 @@ class RecurrentCritic(nn.Module):
     """
     LSTM over the critic's state of the row's agent at each step, then a value head.
 
-    :param team_states: computes the LSTM's input, (B, S) of the rows' agents; None for the features of their own
-        observations
+    :param team_states: computes the LSTM's input, (B, S) of the rows' agents; None for own features
     :param lstm: LSTM from S to H
     :param head: value head on H
     """

@@ -62,8 +62,7 @@ class TeamRowsPolicy(BasePolicy):
         :param observation_space: Dict of ``obs``, ``team``, ``agent``, and optionally ``active``, ``action_mask``,
             ``state``
         :param action_space: one agent's action space
-        :param encode_once: whether equal observations of a batch are encoded once; None for True with integer
-            observations
+        :param encode_once: whether equal observations are encoded once; None for True with integer observations
         :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for
             convolved pictures, whose intermediate results should fit the cache
         :raises ValueError: if the space is not that of a team

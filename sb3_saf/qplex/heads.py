@@ -24,8 +24,7 @@ def q_values(
     Compute Q_i of every action.
 
     A pool uses its favourite head (highest q . k_u), or a head drawn by its weight (Gumbel noise on the logits, hard
-    choice, straight-through gradient). All actions of a row are evaluated by one head, so the best action is well
-    defined.
+    choice, straight-through gradient). One head evaluates all actions of a row, so the best one is well defined.
 
     :param actor: one head for all agents, one for each, or a pool
     :param latents: (K, d) input of the heads

@@ -223,7 +223,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         """
         Act greedily, as SB3's ``predict``.
 
-        :param observation: rows, or only own observations (with ``"agent"`` for memory or one head per agent); one or a
+        :param observation: rows, or only own observations (and ``"agent"`` for memory or one head per agent); one or a
             batch
         :param state: recurrent state after the last step: hidden state, cell state, last action. None at the start
         :param episode_start: (B,) where an episode starts, which resets the state

@@ -51,16 +51,15 @@ _STORED_KEYS: Final[tuple[str, ...]] = (OBS_KEY, AGENT_KEY, ACTION_MASK_KEY, ACT
 
 class QPLEX(OffPolicyAlgorithm):
     """
-    QPLEX, QMIX and VDN: a mixer combines the agents' action values to the team's value, which is trained on the sum of
-    all agents' rewards.
+    QPLEX, QMIX and VDN: a mixer combines the agents' action values to the team's, trained on the sum of their rewards.
 
     It trains on the same environments as PPO with SAFPolicy (``make_team_env``); actions must be Discrete.
 
     **Units**: ``buffer_size``, ``learning_starts``, ``batch_size``, ``train_freq`` and ``target_update_interval`` count
     *game steps*, summed over all parallel games. ``total_timesteps`` counts rows (game steps times N), as in SB3.
 
-    **Exploration**: epsilon-greedy over legal actions, independently for each agent; ``predict(deterministic=False)``
-    also explores.
+    **Exploration**: epsilon-greedy over legal actions, independently per agent, also in
+    ``predict(deterministic=False)``.
 
     :param policy: ``"QPLEXPolicy"``, ``"QPLEXPoolPolicy"`` (Q heads from a pool) or ``"QPLEXLstmPolicy"`` (memory)
     :param env: vector environment of teams

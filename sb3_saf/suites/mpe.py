@@ -2,8 +2,8 @@
 Multi-agent particle environments: ``mpe/simple_spread_v3``.
 
 Time limits are truncations. Agents of ``simple_speaker_listener_v4`` and others differ in their spaces: shorter
-observations are padded with zeros, actions that an agent lacks are masked. ``state()`` is the concatenation of all
-agents' observations.
+observations are padded with zeros, actions that an agent lacks are masked. ``state()`` concatenates all agents'
+observations.
 """
 
 from __future__ import annotations

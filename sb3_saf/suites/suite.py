@@ -29,8 +29,7 @@ class Suite:
 
     :param name: part of an id before the slash
     :param title: one line
-    :param requires: requirements in pip's format, the suite's own package first; the same lines as the extra of
-        ``setup.cfg``
+    :param requires: requirements in pip's format, the suite's own package first; as in the extra of ``setup.cfg``
     :param extra: extra of ``setup.cfg`` that installs them
     :param page: address of the package's documentation
     :param list_tasks: returns the names after the slash; only called if the package is installed, so it may import it
@@ -41,12 +40,10 @@ class Suite:
     :param team_return: the suite's unit of returns: the sum over agents of their rewards, or the mean (if every agent
         receives the team's whole reward)
     :param team_reward: default reward for learning, see ``make_team_env``
-    :param training_params: parameters of the games for training only, such as shaped rewards: evaluation measures the
-        task itself
+    :param training_params: parameters of the games for training only, such as shaped rewards
     :param has_state: whether ``state=True`` is supported
     :param is_seeded: whether seeds determine its games
-    :param module: module of the package, if it may be a folder of sources on ``PYTHONPATH`` instead of an installed
-        package
+    :param module: module of the package, if it may be a source folder on ``PYTHONPATH`` instead of an installed package
     :param unavailable: why no version of the package works; such a suite has no games, only this message
     """
 

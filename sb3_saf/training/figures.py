@@ -1,8 +1,7 @@
 """
 Figures of results, from tidy tables: learning curves, bars against a level, aggregates.
 
-Every function returns a matplotlib ``Figure`` and reads no files. All intervals are 95 %; none is drawn for a single
-run.
+Every function returns a matplotlib ``Figure`` and reads no files. Intervals are 95 %, none for a single run.
 """
 
 from __future__ import annotations

@@ -63,8 +63,7 @@ def learning_curve(runs: pd.DataFrame) -> pd.DataFrame:
     """
     Return mean and interval over the seeds of one method at each point of training.
 
-    Seeds measured at different points are interpolated, within the range that all of them cover: a curve over fewer
-    seeds would jump.
+    Seeds measured at different points are interpolated within their common range: with fewer seeds a curve would jump.
 
     :param runs: columns ``seed``, ``game_steps``, ``score``
     :return: columns ``game_steps``, ``value``, ``low``, ``high``

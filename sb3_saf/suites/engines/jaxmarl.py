@@ -83,8 +83,8 @@ class JaxPrograms:
     :param env: environment of JaxMARL
     :param rules: rules of this environment
     :param with_state: whether rows have the state of the game
-    :raises ValueError: if agents differ in more than the lengths of their observations and actions, or a requested
-        state is missing
+    :raises ValueError: if agents differ in more than lengths of observations and actions, or a requested state is
+        missing
     """
 
     def __init__(self, env: Any, rules: Rules, with_state: bool = False) -> None:

@@ -80,8 +80,7 @@ def vec_env(
     :param reward_shaping_steps: game steps, summed over games, over which that weight decreases to 0; None for never
     :param fixed: arguments of the environment that the task sets
     :param params: its other arguments
-    :raises ValueError: if the state, picture or reward is not available, or the environment has no teams of named
-        agents
+    :raises ValueError: if the state, picture or reward is missing, or the environment has no teams of named agents
     """
     programs = _programs(name, _Params({**params, **(fixed or {})}), state)
     if reward_shaping and programs.rules.extra_reward is None:
