@@ -2,7 +2,7 @@
 Copies of games in progress: how a game's state is copied, and whether the copy continues like the original.
 
 A game with ``get_state()`` and ``set_state(state)`` gives plain data; any other game is pickled. Unpickling runs code
-from the file, so pickled games are signed with the user's private key; unsigned ones are refused.
+from the file, so pickled games are signed with the user's secret key; unsigned ones are refused.
 """
 
 from __future__ import annotations

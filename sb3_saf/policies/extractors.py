@@ -164,10 +164,10 @@ class PartsEncoder(BaseFeaturesExtractor):
 
 class ObservationEncoder(BaseFeaturesExtractor):
     """
-    The default encoder, chosen by space: for pictures (uint8, 0..255) and tile codes :class:`PaperCNN`, or
-    :class:`NatureEncoder` if they have more than 64 x 64 pixels; for pictures beside vectors :class:`PartsEncoder`; for
-        other spaces :class:`MLPEncoder`.
+    The default encoder, chosen by space.
 
+    Pictures (uint8, 0..255) and tile codes: :class:`PaperCNN`, or :class:`NatureEncoder` for more than 64 x 64 pixels;
+    pictures beside vectors: :class:`PartsEncoder`; other spaces: :class:`MLPEncoder`.
     Warns about pictures so large that training is slow with any encoder.
 
     :param observation_space: one agent's own observation space
