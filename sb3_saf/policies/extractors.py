@@ -33,7 +33,7 @@ from sb3_saf.networks.tile_sums import (
 _PAPERS_PIXELS: Final = 64 * 64
 #: Smallest side of a picture for the paper's encoder.
 _FEWEST_PIXELS: Final = 8
-#: Number of pixels above which a warning about slow training is issued.
+#: Numbers of pixels and weights above which a warning about slow training is issued.
 _MANY_PIXELS: Final = 128 * 128
 _MANY_WEIGHTS: Final = 10_000_000
 
