@@ -61,7 +61,7 @@ format: $(INSTALLED) ## format the code and repair what ruff can repair
 	@$(RUN) ruff check --fix-only --quiet .
 	@$(RUN) ruff format .
 
-install: $(INSTALLED) ## only set up .venv, with everything
+install: $(INSTALLED) ## only set up .venv, with all that tests, documentation and notebooks need
 
 # Repeated when one of these files changes; an interrupted installation leaves no stamp and is continued.
 $(TRAINING): setup.cfg pyproject.toml constraints.txt
