@@ -317,7 +317,7 @@ def make_vec_env(
 
     Both backends give the same numbers, row for row, for the same seed.
 
-    :param task: ``"TeamTogether"``, ``"TeamSupport"`` or ``"KeyForTreasure"``
+    :param task: a name of ``TASK_NAMES``, such as ``"TeamSupport"``
     :param n_envs: E, games
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``
     :param backend: ``"native"`` drives the batched core; ``"supersuit"`` goes through SuperSuit's

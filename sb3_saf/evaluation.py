@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, Final, Literal, NamedTuple, cast, overload
+from typing import Any, Literal, NamedTuple, cast, overload
 
 import gymnasium as gym
 import numpy as np
@@ -19,10 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wr
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, Array, check_count, find_n_agents, team_dones
-
-#: SB3's key for success of an episode.
-IS_SUCCESS: Final = "is_success"
+from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, Array, check_count, find_n_agents, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None

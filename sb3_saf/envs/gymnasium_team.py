@@ -10,8 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-#: SB3's name, which it logs as ``rollout/success_rate``.
-IS_SUCCESS = "is_success"
+from sb3_saf.envs.teams import IS_SUCCESS
 
 
 class GymnasiumTeam(ParallelEnv[str, Any, Any]):

@@ -34,6 +34,9 @@ TEAM_KEYS: Final[tuple[TeamKey, ...]] = get_args(TeamKey)
 
 OptionalKey = Literal["active", "action_mask", "state"]
 
+#: SB3's key of infos for success of an episode, logged as ``rollout/success_rate``.
+IS_SUCCESS: Final = "is_success"
+
 #: Which agents of the row's team take part, in index order.
 ACTIVE_KEY: Final = "active"
 #: The row's own legal actions.

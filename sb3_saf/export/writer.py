@@ -57,7 +57,7 @@ def export_actors(
     ===================== ============================================================================
     ``actor.json``        spaces, networks, versions and checksums
     ``actor.safetensors`` the weights, and the pictures of tile codes
-    ``actor.onnx``        the same network as a graph, from raw observations to action parameters
+    ``actor.onnx``        the same network as a graph, from raw observations to actions
     ``act.py``            an example that needs only NumPy and onnxruntime
     ===================== ============================================================================
 

@@ -209,7 +209,7 @@ def load_settings(
 
     :param algo: name in ``ALGOS``
     :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
-    :param size: ``"paper"``, ``"small"`` or ``"smoke"``
+    :param size: ``"paper"``, ``"medium"``, ``"small"`` or ``"smoke"``
     :param env_kwargs: parameters of the game
     :param overrides: keys as in the algorithm's file, such as ``{"n_envs": 8, "policy_kwargs": {"n_slots": 8}}``
     :param config: a file to read instead of the algorithm's

@@ -16,10 +16,7 @@ from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.space_reader import checked_actions
-from sb3_saf.envs.teams import Array, check_count
-
-#: SB3's key for success of an episode, logged as ``rollout/success_rate``.
-IS_SUCCESS = "is_success"
+from sb3_saf.envs.teams import IS_SUCCESS, Array, check_count
 
 
 class BatchStep(NamedTuple):
