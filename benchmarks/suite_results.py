@@ -3,14 +3,14 @@ Measure what teams learn on the suites' tasks, compared with the suites' own bas
 
 ``python -m benchmarks.suite_results`` trains what is missing (``sb3_saf.experiments run``, one folder for each task)
 and writes the table of that page from the finished cells; after an interruption, the same command continues. All tasks
-get their first seed before any gets its second. Results of other programs are in ``results/suites_baselines.csv``.
+get their first seed before any gets its second. Results of other programs, from ``python -m benchmarks.peers``, are in
+``results/suites_baselines.csv``.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -50,7 +50,7 @@ class Task(NamedTuple):
 #: The most important ones first.
 TASKS: Final = (
     Task("smax/3m", 100_000),
-    Task("lbf/Foraging-8x8-2p-3f-v3", 60_000),
+    Task("lbf/Foraging-8x8-2p-3f-v3", 200_000),
     Task("vmas/balance", 100_000),
     Task("jaxmarl/MPE_simple_spread_v3", 200_000),
     Task("jaxmarl/MPE_simple_speaker_listener_v4", 200_000),
@@ -67,9 +67,9 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     experiments(words)
 
 
-def row(task: Task, folder: Path, methods: Sequence[str], baselines: Sequence[Mapping[str, str]]) -> list[str]:
+def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFrame) -> list[str]:
     """Return the cells of a task's row; missing ones say so."""
-    beside = "; ".join(f"{one['value']} ({one['program']}, {one['game_steps']} game steps)" for one in baselines)
+    beside = "; ".join(_others(baselines))
     try:
         tests = read_results(folder, task.name).tests
     except ValueError:
@@ -77,6 +77,13 @@ def row(task: Task, folder: Path, methods: Sequence[str], baselines: Sequence[Ma
     by_method = [tests[tests["method"] == method] for method in ("random", *methods)]
     spent = [_seconds(rows["processor_seconds"]) for rows in by_method[1:]]
     return [task.env_id, f"{tests['game_steps'].max():,}", *map(_figures, by_method), " / ".join(spent), beside]
+
+
+def _others(rows: pd.DataFrame) -> Iterator[str]:
+    for (program, game_steps), found in rows.groupby(["program", "game_steps"]):
+        spent = found["processor_seconds"].mean()
+        figures = _figures(found.rename(columns={"return": "return_mean", "won": "success_rate"}))
+        yield f"{program}, {game_steps:,} game steps: {figures}, {spent:.0f} s"
 
 
 def _seconds(values: pd.Series) -> str:
@@ -95,20 +102,19 @@ def _figures(tests: pd.DataFrame) -> str:
 
 def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterator[str]:
     """Yield the lines of the table and of its sources."""
-    with BASELINES.open(encoding="utf-8", newline="") as file:
-        known = list(csv.DictReader(file))
+    known = pd.read_csv(BASELINES)
     head = ["task", "game steps", "random", *methods, f"processor s ({' / '.join(methods)})", "others"]
     yield f"| {' | '.join(head)} |"
     yield f"|{' --- |' * len(head)}"
     for task in tasks:
-        others = [one for one in known if one["task"] == task.env_id]
+        others = known[known["task"] == task.env_id]
         yield f"| {' | '.join(row(task, folder / task.name, methods, others))} |"
     versions = [read_json(path) for path in folder.glob("*/cells/*/*/*/versions.json")]
     yield ""
     yield f"Commits: {', '.join(sorted({one['commit'] for one in versions if one})) or 'none'}. Others:"
     yield ""
-    for one in known:
-        yield f"- {one['task']}: {one['program']}, {one['source']}"
+    for (task, program), found in known.groupby(["task", "program"]):
+        yield f"- {task}: {program}, {found['source'].iloc[0]}"
 
 
 def main() -> None:

@@ -275,9 +275,9 @@ def test_zone_action_with_one_linear_policy() -> None:
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 
-def message_error(name: str, probe: Probe, **kwargs: Any) -> float:
+def message_error(name: str, probe: Probe, n_updates: int = 25, **kwargs: Any) -> float:
     """Return the root mean square error of the values, over all contexts of three agents."""
-    values = values_of(train(name, probe, n_updates=25, **kwargs), probe)
+    values = values_of(train(name, probe, n_updates, **kwargs), probe)
     return rmse(values, np.roll(probe.contexts()[:, :, 0], -1, axis=1))
 
 
@@ -306,8 +306,8 @@ def test_saf_needs_to_be_told_whose_value_is_asked() -> None:
     """
     Messages identify their sender, but the query that reads them depends only on the own view: without the place in the
     view, the smallest possible error is sqrt(1/2), which SAF reaches. With a value head for each agent, or one on the
-    whole team's states that reads the identity (``critic_input="team"``), it is 0.01 to 0.05.
+    whole team's states that reads the identity (``critic_input="team"``), it is 0.01 to 0.07.
     """
     probe = MessageWithoutPlace(n_agents=3)
     assert message_error("SAFPolicy", probe) == pytest.approx(np.sqrt(0.5), abs=0.01)
-    assert message_error("SAFPolicy", probe, heads="per_agent") < 0.1
+    assert message_error("SAFPolicy", probe, n_updates=40, heads="per_agent") < 0.1

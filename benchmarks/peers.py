@@ -1,0 +1,259 @@
+"""
+Train the suites' own baselines, to be compared with ours: ``results/suites_baselines.csv``.
+
+``python -m benchmarks.peers --jaxmarl CLONE --epymarl CLONE`` runs what the file lacks, each program in its own process
+and with its own settings; only the number of game steps is ours. JaxMARL's and EPyMARL's programs are not in their
+packages, so both need a clone: of https://github.com/FLAIROx/JaxMARL and https://github.com/uoe-agents/epymarl.
+Without one its rows are left out. Their requirements conflict with this project's; ``--python`` names interpreters
+that have them:
+
+- JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml
+- BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
+- EPyMARL: torch, sacred, tensorboard-logger, gymnasium, lbforaging, rware, pyyaml, scipy, pettingzoo
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, NamedTuple
+
+FILE: Final = Path("results", "suites_baselines.csv")
+COLUMNS: Final = ("task", "program", "seed", "game_steps", "return", "won", "processor_seconds", "source")
+#: Game steps of an episode of VMAS, as ours.
+_VMAS_STEPS: Final = 100
+#: The last training episodes whose mean counts, as a share of all updates.
+_LAST: Final = 20
+
+
+class Peer(NamedTuple):
+    """
+    A program of others and what it is trained on.
+
+    :param task: our id
+    :param program: name in the table
+    :param kind: key of ``PROGRAMS``
+    :param own_task: their name of the task
+    :param algorithm: their name of the method
+    :param game_steps: of one training
+    """
+
+    task: str
+    program: str
+    kind: str
+    own_task: str
+    algorithm: str
+    game_steps: int
+
+
+class Outcome(NamedTuple):
+    """
+    What a training reached.
+
+    :param value: team return in the suite's unit
+    :param won: share of episodes, or None
+    :param source: what was run and what is averaged
+    """
+
+    value: float
+    won: float | None
+    source: str
+
+
+PEERS: Final = (
+    Peer("smax/3m", "JaxMARL's IPPO", "jaxmarl", "3m", "ippo_rnn_smax", 100_000),
+    Peer("smax/3m", "JaxMARL's IPPO", "jaxmarl", "3m", "ippo_rnn_smax", 1_000_000),
+    Peer("smax/2s3z", "JaxMARL's IPPO", "jaxmarl", "2s3z", "ippo_rnn_smax", 60_000),
+    Peer("overcooked/cramped_room", "JaxMARL's IPPO", "jaxmarl", "cramped_room", "ippo_ff_overcooked", 200_000),
+    Peer(
+        "jaxmarl/MPE_simple_spread_v3",
+        "JaxMARL's IPPO",
+        "jaxmarl",
+        "MPE_simple_spread_v3",
+        "ippo_ff_mpe",
+        200_000,
+    ),
+    Peer("vmas/balance", "BenchMARL's MAPPO", "benchmarl", "BALANCE", "Mappo", 100_000),
+    Peer(
+        "lbf/Foraging-8x8-2p-3f-v3",
+        "EPyMARL's MAPPO",
+        "epymarl",
+        "lbforaging:Foraging-8x8-2p-3f-v3",
+        "mappo",
+        200_000,
+    ),
+    Peer("rware/rware-tiny-2ag-v2", "EPyMARL's MAPPO", "epymarl", "rware:rware-tiny-2ag-v2", "mappo", 40_000),
+)
+
+
+def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
+    """
+    Run a baseline of JaxMARL and average its last training episodes.
+
+    Its own settings fall over the run: learning rate, shaped rewards (to 0 after the same share of the run).
+    """
+    logged: list[Mapping[str, Any]] = []
+    _replace("wandb", log=logged.append)
+    _replace("hydra", main=lambda **_: lambda function: function)
+    sys.path.insert(0, str(clone))
+    text = (clone / "baselines" / "IPPO" / "config" / f"{peer.algorithm}.yaml").read_text(encoding="utf-8")
+    config = import_module("yaml").safe_load(text.replace("${oc.env:WANDB_ENTITY}", "none"))
+    config = {name: _number(value) for name, value in config.items()}
+    share = peer.game_steps / config["TOTAL_TIMESTEPS"]
+    config |= {"TOTAL_TIMESTEPS": peer.game_steps, "SEED": seed, "NUM_SEEDS": 1}
+    if "MAP_NAME" in config:
+        config["MAP_NAME"] = peer.own_task
+    elif "REW_SHAPING_HORIZON" in config:
+        layouts = import_module("jaxmarl.environments.overcooked").overcooked_layouts
+        config["REW_SHAPING_HORIZON"] *= share
+        config["ENV_KWARGS"] = {"layout": layouts[peer.own_task]}
+    else:
+        config["ENV_NAME"] = peer.own_task
+    jax = import_module("jax")
+    program = import_module(f"baselines.IPPO.{peer.algorithm}")
+    jax.block_until_ready(jax.jit(program.make_train(config))(jax.random.PRNGKey(seed)))
+
+    def last(name: str) -> float:
+        found = [float(one[name].mean()) for one in logged[-max(1, len(logged) // _LAST) :]]
+        return sum(found) / len(found)
+
+    sum_over_agents = peer.algorithm == "ippo_ff_mpe"
+    value = last("returned_episode_returns" if "returned_episode_returns" in logged[-1] else "returns")
+    commit = _commit(clone)
+    source = f"`make_train` of baselines/IPPO/{peer.algorithm}.py at {commit}, jax {jax.__version__}; training episodes"
+    agents = config["NUM_ACTORS"] // config["NUM_ENVS"] if sum_over_agents else 1
+    return Outcome(value * agents, last("win_rate") if "win_rate" in logged[-1] else None, source)
+
+
+def train_benchmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
+    """Run an algorithm of BenchMARL with its base configuration, and evaluate it with drawn actions."""
+    experiment = import_module("benchmarl.experiment")
+    config = experiment.ExperimentConfig.get_from_yaml()
+    config.max_n_frames, config.loggers, config.evaluation = peer.game_steps, [], True
+    config.evaluation_interval = -(-peer.game_steps // config.on_policy_collected_frames_per_batch)
+    config.evaluation_interval *= config.on_policy_collected_frames_per_batch
+    config.evaluation_episodes, config.evaluation_deterministic_actions, config.render = 64, False, False
+    config.create_json, config.checkpoint_interval, config.checkpoint_at_end = False, 0, False
+    task = import_module("benchmarl.environments").VmasTask[peer.own_task].get_from_yaml()
+    task.config["max_steps"] = _VMAS_STEPS
+    mlp = import_module("benchmarl.models.mlp").MlpConfig.get_from_yaml()
+    algorithm = getattr(import_module("benchmarl.algorithms"), f"{peer.algorithm}Config").get_from_yaml()
+    run = experiment.Experiment(
+        task=task, algorithm_config=algorithm, model_config=mlp, critic_model_config=mlp, seed=seed, config=config
+    )
+    run.run()
+    version = import_module("importlib.metadata").version("benchmarl")
+    return Outcome(float(run.mean_return), None, f"BenchMARL {version}, base configuration; 64 episodes, drawn actions")
+
+
+def train_epymarl(peer: Peer, seed: int, clone: Path) -> Outcome:
+    """Run a method of EPyMARL with its own settings, and evaluate it with its most likely actions."""
+    limit = 500 if peer.own_task.startswith("rware") else 50
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "smaclite.py").touch()  # imported by EPyMARL at start
+        words = ["src/main.py", f"--config={peer.algorithm}", "--env-config=gymma", "with", "use_cuda=False"]
+        words += [f"env_args.time_limit={limit}", f"env_args.key={peer.own_task}", f"t_max={peer.game_steps}"]
+        words += [f"seed={seed}", f"test_interval={peer.game_steps // 2}", "test_nepisode=100"]
+        variables = {**os.environ, "PYTHONPATH": folder}
+        words.append(f"local_results_path={folder}")
+        done = subprocess.run([sys.executable, *words], cwd=clone, env=variables, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(done.stderr.strip().splitlines()[-1])
+        found = json.loads(next(Path(folder, "sacred").rglob("info.json")).read_text(encoding="utf-8"))
+    value = found["test_return_mean"][-1]
+    value = value["value"] if isinstance(value, dict) else value
+    source = f"src/main.py at {_commit(clone)}, config {peer.algorithm}; 100 episodes, most likely actions"
+    return Outcome(float(value), None, source)
+
+
+PROGRAMS: Final[Mapping[str, Callable[[Peer, int, Path], Outcome]]] = {
+    "jaxmarl": train_jaxmarl,
+    "benchmarl": train_benchmarl,
+    "epymarl": train_epymarl,
+}
+
+
+def _replace(name: str, **attributes: object) -> None:
+    """Provide a module that a program imports only to log or to read its command line."""
+    module = ModuleType(name)
+    vars(module).update(attributes)
+    sys.modules[name] = module
+
+
+def _number(value: object) -> Any:
+    """Convert numbers that YAML reads as text, such as 1e7."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def _commit(clone: Path) -> str:
+    command = ["git", "-C", str(clone), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _train_here(peer: Peer, seed: int, clone: Path) -> None:
+    """Train in this process, and print the row as JSON."""
+    value, won, source = PROGRAMS[peer.kind](peer, seed, clone)
+    spent = sum(
+        usage.ru_utime + usage.ru_stime
+        for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+    row = [peer.task, peer.program, seed, peer.game_steps, round(value, 3)]
+    print(json.dumps([*row, "" if won is None else round(won, 3), round(spent), source]))
+
+
+def _key(row: Sequence[object]) -> tuple[str, ...]:
+    return tuple(map(str, row[:4]))
+
+
+def main() -> None:
+    """Run what is missing, one training after the other, and write each row when it is there."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jaxmarl", type=Path, help="a clone")
+    parser.add_argument("--epymarl", type=Path, help="a clone")
+    parser.add_argument("--python", nargs="*", default=[], metavar="KIND=PATH", help="interpreters, by kind")
+    parser.add_argument("--seeds", type=int, nargs="+", default=(0, 1, 2))
+    parser.add_argument("--only", default="", help="tasks that contain this text")
+    parser.add_argument("--here", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    clones = {"jaxmarl": options.jaxmarl, "epymarl": options.epymarl, "benchmarl": Path()}
+    if options.here is not None:
+        peer = PEERS[options.here]
+        return _train_here(peer, options.seeds[0], clones[peer.kind])
+    interpreters = dict(pair.split("=", 1) for pair in options.python)
+    with FILE.open(encoding="utf-8", newline="") as file:
+        rows: list[Sequence[object]] = [*csv.reader(file)][1:]
+    for seed in options.seeds:
+        for index, peer in enumerate(PEERS):
+            there = any(_key(row) == _key([peer.task, peer.program, seed, peer.game_steps]) for row in rows)
+            if there or options.only not in peer.task or clones[peer.kind] is None:
+                continue
+            words = ["--here", str(index), "--seeds", str(seed)]
+            words += [
+                f"--{kind}={Path(clone).resolve()}" for kind, clone in clones.items() if clone and clone != Path()
+            ]
+            command = [interpreters.get(peer.kind, sys.executable), __file__, *words]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                print(f"{peer.task}, {peer.program}, seed {seed}: {(done.stderr or 'failed').strip().splitlines()[-1]}")
+                continue
+            rows.append(json.loads(done.stdout.strip().splitlines()[-1]))
+            print(*rows[-1], flush=True)
+            with FILE.open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows([COLUMNS, *sorted(rows, key=_key)])
+
+
+if __name__ == "__main__":
+    main()
