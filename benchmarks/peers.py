@@ -127,12 +127,10 @@ def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
         found = [float(one[name].mean()) for one in logged[-max(1, len(logged) // _LAST) :]]
         return sum(found) / len(found)
 
-    sum_over_agents = peer.algorithm == "ippo_ff_mpe"
     value = last("returned_episode_returns" if "returned_episode_returns" in logged[-1] else "returns")
     commit = _commit(clone)
     source = f"`make_train` of baselines/IPPO/{peer.algorithm}.py at {commit}, jax {jax.__version__}; training episodes"
-    agents = config["NUM_ACTORS"] // config["NUM_ENVS"] if sum_over_agents else 1
-    return Outcome(value * agents, last("win_rate") if "win_rate" in logged[-1] else None, source)
+    return Outcome(value, last("win_rate") if "win_rate" in logged[-1] else None, source)
 
 
 def train_benchmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
