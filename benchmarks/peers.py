@@ -163,11 +163,11 @@ def train_epymarl(peer: Peer, seed: int, clone: Path) -> Outcome:
         words += [f"env_args.time_limit={limit}", f"env_args.key={peer.own_task}", f"t_max={peer.game_steps}"]
         words += [f"seed={seed}", f"test_interval={peer.game_steps // 2}", "test_nepisode=100"]
         variables = {**os.environ, "PYTHONPATH": folder}
-        words.append(f"local_results_path={folder}")
         done = subprocess.run([sys.executable, *words], cwd=clone, env=variables, capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(done.stderr.strip().splitlines()[-1])
-        found = json.loads(next(Path(folder, "sacred").rglob("info.json")).read_text(encoding="utf-8"))
+    files = Path(clone, "results", "sacred").rglob("info.json")  # always written there, one folder for each run
+    found = json.loads(max(files, key=os.path.getmtime).read_text(encoding="utf-8"))
     value = found["test_return_mean"][-1]
     value = value["value"] if isinstance(value, dict) else value
     source = f"src/main.py at {_commit(clone)}, config {peer.algorithm}; 100 episodes, most likely actions"

@@ -103,7 +103,8 @@ def _figures(tests: pd.DataFrame) -> str:
 def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterator[str]:
     """Yield the lines of the table and of its sources."""
     known = pd.read_csv(BASELINES)
-    head = ["task", "game steps", "random", *methods, f"processor s ({' / '.join(methods)})", "others"]
+    names = [method.upper() for method in methods]
+    head = ["task", "game steps", "random", *names, f"processor s ({' / '.join(names)})", "others"]
     yield f"| {' | '.join(head)} |"
     yield f"|{' --- |' * len(head)}"
     for task in tasks:
