@@ -4,8 +4,8 @@ Train the suites' own baselines, to be compared with ours: ``results/suites_base
 ``python -m benchmarks.peers --jaxmarl CLONE --epymarl CLONE`` runs what the file lacks, each program in its own process
 and with its own settings; only the number of game steps is ours. JaxMARL's and EPyMARL's programs are not in their
 packages, so both need a clone: of https://github.com/FLAIROx/JaxMARL and https://github.com/uoe-agents/epymarl.
-Without one its rows are left out. Their requirements conflict with this project's; ``--python`` names interpreters
-that have them:
+Without one its rows are left out. JaxMARL's programs hang on a single core. Requirements conflict with this project's;
+``--python`` names interpreters that have them:
 
 - JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml
 - BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
@@ -230,6 +230,8 @@ def main() -> None:
     if options.here is not None:
         peer = PEERS[options.here]
         return _train_here(peer, options.seeds[0], clones[peer.kind])
+    if wrong := [pair for pair in options.python if "=" not in pair]:
+        parser.error(f"--python: expected KIND=PATH, such as jaxmarl=/opt/jax/bin/python, got {wrong[0]!r}")
     interpreters = dict(pair.split("=", 1) for pair in options.python)
     with FILE.open(encoding="utf-8", newline="") as file:
         rows: list[Sequence[object]] = [*csv.reader(file)][1:]
@@ -243,7 +245,8 @@ def main() -> None:
                 f"--{kind}={Path(clone).resolve()}" for kind, clone in clones.items() if clone and clone != Path()
             ]
             command = [interpreters.get(peer.kind, sys.executable), __file__, *words]
-            done = subprocess.run(command, capture_output=True, text=True)
+            with tempfile.TemporaryDirectory() as folder:  # BenchMARL writes into the current one
+                done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
             if done.returncode:
                 print(f"{peer.task}, {peer.program}, seed {seed}: {(done.stderr or 'failed').strip().splitlines()[-1]}")
                 continue
