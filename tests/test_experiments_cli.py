@@ -76,7 +76,7 @@ def test_plan_counts_what_is_finished_and_names_what_is_left_out(
     assert "cells       4 to train (1 methods x 2 settings x 2 seeds), 2 of them finished" in printed
     assert "game steps  800 left of 1,600 (400 a cell)" in printed
     assert re.search(
-        r"rate +\d+ game steps/s of one worker in the finished cells\ntime +about 0:\d\d:\d\d \(h:mm:ss\) of one",
+        r"rate +[\d,]+ game steps/s of one worker in the finished cells\ntime +about 0:\d\d:\d\d \(h:mm:ss\) of one",
         printed,
     )
     assert (
