@@ -21,13 +21,14 @@ from sb3_saf.experiments.files import read_json
 from sb3_saf.experiments.tables import read_results
 from sb3_saf.training.statistics import mean_over_seeds
 
-METHODS: Final = ("saf", "mappo", "ippo")
+METHODS: Final = ("saf", "mappo", "ippo", "qplex")
 SEEDS: Final = (0, 1, 2)
 BASELINES: Final = Path("results", "suites_baselines.csv")
 PAGE: Final = Path("results", "suites.md")
 #: Text before and after the table on the page.
 _MARKS: Final = ("<!-- table -->", "<!-- end of table -->")
 _NOT_RUN: Final = "not run"
+_BOX: Final = "Box actions"
 
 
 class Task(NamedTuple):
@@ -36,22 +37,28 @@ class Task(NamedTuple):
 
     :param env_id: of the suite
     :param game_steps: of one training, equal for all methods
+    :param discrete: whether actions are discrete, as QPLEX needs
     """
 
     env_id: str
     game_steps: int
+    discrete: bool = True
 
     @property
     def name(self) -> str:
         """Return the name of its experiment and folder."""
         return self.env_id.replace("/", "-")
 
+    def takes(self, method: str) -> bool:
+        """Return whether a method can be trained on it."""
+        return self.discrete or method != "qplex"
+
 
 #: The most important ones first.
 TASKS: Final = (
     Task("smax/3m", 100_000),
     Task("lbf/Foraging-8x8-2p-3f-v3", 200_000),
-    Task("vmas/balance", 100_000),
+    Task("vmas/balance", 100_000, discrete=False),
     Task("jaxmarl/MPE_simple_spread_v3", 200_000),
     Task("jaxmarl/MPE_simple_speaker_listener_v4", 200_000),
     Task("overcooked/cramped_room", 200_000),
@@ -63,7 +70,10 @@ TASKS: Final = (
 def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     """Train and test the missing cells of a task and seed, one after the other."""
     words = ["run", task.name, "--env", task.env_id, "--size", "small", "--workers", "1", "--seeds", str(seed)]
-    words += ["-n", str(task.game_steps), "--methods", *options.methods, "-f", str(options.folder / task.name)]
+    methods = [method for method in options.methods if task.takes(method)]
+    if not methods:
+        return
+    words += ["-n", str(task.game_steps), "--methods", *methods, "-f", str(options.folder / task.name)]
     experiments(words)
 
 
@@ -74,9 +84,10 @@ def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFram
         tests = read_results(folder, task.name).tests
     except ValueError:
         return [task.env_id, f"{task.game_steps:,}", *[_NOT_RUN] * (len(methods) + 2), beside]
-    by_method = [tests[tests["method"] == method] for method in ("random", *methods)]
-    spent = [_seconds(rows["processor_seconds"]) for rows in by_method[1:]]
-    return [task.env_id, f"{tests['game_steps'].max():,}", *map(_figures, by_method), " / ".join(spent), beside]
+    by_method = {method: tests[tests["method"] == method] for method in ("random", *methods)}
+    found = [_figures(rows) if task.takes(method) else _BOX for method, rows in by_method.items()]
+    spent = [_seconds(rows["processor_seconds"]) for method, rows in by_method.items() if method != "random"]
+    return [task.env_id, f"{tests['game_steps'].max():,}", *found, " / ".join(spent), beside]
 
 
 def _others(rows: pd.DataFrame) -> Iterator[str]:
@@ -87,7 +98,7 @@ def _others(rows: pd.DataFrame) -> Iterator[str]:
 
 
 def _seconds(values: pd.Series) -> str:
-    return _NOT_RUN if values.empty else f"{values.mean():.0f}"
+    return "-" if values.empty else f"{values.mean():.0f}"
 
 
 def _figures(tests: pd.DataFrame) -> str:
