@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -26,12 +27,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf import CentralizedValueWrapper, TeamMonitor, TeamRolloutBuffer
+from sb3_saf.suites.registry import find_task
 from sb3_saf.training.settings import load_settings
 
+SB3: Final = "SB3 PPO"
 N_AGENTS: Final = 3
 N_NUMBERS: Final = 18
 N_ACTIONS: Final = 5
@@ -134,17 +137,31 @@ class Cost(NamedTuple):
 
 def free_models(n_games: int) -> dict[str, PPO]:
     """Create SB3's PPO and ours on games that take no time."""
-    n_steps = N_STEPS[n_games]
+    return _models(lambda: FreeGames(n_games, N_AGENTS), N_STEPS[n_games])
+
+
+def suite_models(env_id: str, n_games: int) -> dict[str, PPO]:
+    """Create SB3's PPO and ours on games of a suite, with JaxMARL's 128 steps in each game."""
+    one = find_task(env_id)
+    assert one is not None and one.suite.vec_env is not None
+    make = partial(one.suite.vec_env, one.task, n_games, 0)
+    return _models(make, N_STEPS[4])
+
+
+def _models(make_games: Callable[[], VecEnv], n_steps: int) -> dict[str, PPO]:
+    """Create SB3's PPO on the agents' rows, and ours on teams."""
+    games = make_games()
     settings: dict[str, Any] = {
         "n_steps": n_steps,
-        "batch_size": n_steps * n_games * N_AGENTS // N_MINIBATCHES // N_AGENTS * N_AGENTS,
+        "batch_size": n_steps * games.num_envs // N_MINIBATCHES // N_AGENTS * N_AGENTS,
         "n_epochs": N_EPOCHS,
         "device": "cpu",
         "seed": 0,
     }
-    models = {"SB3 PPO": PPO("MlpPolicy", FreeGames(n_games, N_AGENTS), policy_kwargs=NARROW, **settings)}
+    rows = VecExtractDictObs(games, "obs") if isinstance(games.observation_space, spaces.Dict) else games
+    models = {SB3: PPO("MlpPolicy", rows, policy_kwargs=NARROW, **settings)}
     for name, policy_kwargs in POLICIES.items():
-        env = CentralizedValueWrapper(TeamMonitor(FreeGames(n_games, N_AGENTS)))
+        env = CentralizedValueWrapper(TeamMonitor(make_games()))
         buffer: dict[str, Any] = {"rollout_buffer_class": TeamRolloutBuffer, "policy_kwargs": dict(policy_kwargs)}
         models[name] = PPO(f"{name}Policy", env, **buffer, **settings)
     return models

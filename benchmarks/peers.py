@@ -5,7 +5,8 @@ Train the suites' own baselines, to be compared with ours: ``results/suites_base
 and with its own settings; only the number of game steps is ours. JaxMARL's and EPyMARL's programs are not in their
 packages, so both need a clone: of https://github.com/FLAIROx/JaxMARL and https://github.com/uoe-agents/epymarl.
 Without one its rows are left out. JaxMARL's programs hang on a single core. Requirements conflict with this project's;
-``--python`` names interpreters that have them:
+``--python`` names interpreters that have them. ``--rates`` trains nothing: it compares the speed of JaxMARL's IPPO with
+ours and with Stable-Baselines3's own PPO on one environment, networks and numbers of epochs being equal.
 
 - JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml
 - BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
@@ -22,6 +23,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -34,6 +36,11 @@ COLUMNS: Final = ("task", "program", "seed", "game_steps", "return", "won", "pro
 _VMAS_STEPS: Final = 100
 #: The last training episodes whose mean counts, as a share of all updates.
 _LAST: Final = 20
+#: Speed: what is played, its agents, numbers of games, and game steps of a measured run.
+_RATE_TASK: Final = "jaxmarl/MPE_simple_spread_v3"
+_RATE_AGENTS: Final = 3
+_RATE_GAMES: Final = (4, 16, 128)
+_RATE_STEPS: Final = 200_000
 
 
 class Peer(NamedTuple):
@@ -96,6 +103,16 @@ PEERS: Final = (
 )
 
 
+def _open_jaxmarl(algorithm: str, clone: Path, logged: list[Mapping[str, Any]]) -> tuple[Any, dict[str, Any]]:
+    """Return a program of JaxMARL and its settings; what it logs is appended to ``logged``."""
+    _replace("wandb", log=logged.append)
+    _replace("hydra", main=lambda **_: lambda function: function)
+    sys.path.insert(0, str(clone))
+    text = (clone / "baselines" / "IPPO" / "config" / f"{algorithm}.yaml").read_text(encoding="utf-8")
+    config = import_module("yaml").safe_load(text.replace("${oc.env:WANDB_ENTITY}", "none"))
+    return import_module(f"baselines.IPPO.{algorithm}"), {name: _number(value) for name, value in config.items()}
+
+
 def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
     """
     Run a baseline of JaxMARL and average its last training episodes.
@@ -103,12 +120,7 @@ def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
     Its own settings fall over the run: learning rate, shaped rewards (to 0 after the same share of the run).
     """
     logged: list[Mapping[str, Any]] = []
-    _replace("wandb", log=logged.append)
-    _replace("hydra", main=lambda **_: lambda function: function)
-    sys.path.insert(0, str(clone))
-    text = (clone / "baselines" / "IPPO" / "config" / f"{peer.algorithm}.yaml").read_text(encoding="utf-8")
-    config = import_module("yaml").safe_load(text.replace("${oc.env:WANDB_ENTITY}", "none"))
-    config = {name: _number(value) for name, value in config.items()}
+    program, config = _open_jaxmarl(peer.algorithm, clone, logged)
     share = peer.game_steps / config["TOTAL_TIMESTEPS"]
     config |= {"TOTAL_TIMESTEPS": peer.game_steps, "SEED": seed, "NUM_SEEDS": 1}
     if "MAP_NAME" in config:
@@ -120,7 +132,6 @@ def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
     else:
         config["ENV_NAME"] = peer.own_task
     jax = import_module("jax")
-    program = import_module(f"baselines.IPPO.{peer.algorithm}")
     jax.block_until_ready(jax.jit(program.make_train(config))(jax.random.PRNGKey(seed)))
 
     def last(name: str) -> float:
@@ -212,6 +223,33 @@ def _train_here(peer: Peer, seed: int, clone: Path) -> None:
     print(json.dumps([*row, "" if won is None else round(won, 3), round(spent), source]))
 
 
+def _rate_here(n_games: int, clone: Path) -> None:
+    """Print agent-steps per processor second of JaxMARL's IPPO, compiled beforehand."""
+    program, config = _open_jaxmarl("ippo_ff_mpe", clone, [])
+    rollout = n_games * config["NUM_STEPS"]
+    config |= {"NUM_ENVS": n_games, "TOTAL_TIMESTEPS": rollout * max(2, _RATE_STEPS // rollout), "NUM_SEEDS": 1}
+    jax = import_module("jax")
+    train = jax.jit(program.make_train(config))
+    jax.block_until_ready(train(jax.random.PRNGKey(0)))
+    start = time.process_time()
+    jax.block_until_ready(train(jax.random.PRNGKey(1)))
+    print(config["TOTAL_TIMESTEPS"] * _RATE_AGENTS / (time.process_time() - start))
+
+
+def print_rates(clone: Path, python: str) -> None:
+    """Print a table: whole training loops on the same games, SB3's PPO on the rows of the same VecEnv."""
+    loop = import_module("benchmarks.loop")
+    print("| games | JaxMARL's IPPO | " + " | ".join((loop.SB3, *loop.POLICIES)) + " |")
+    print("| --- |" + " --- |" * (2 + len(loop.POLICIES)))
+    for n_games in _RATE_GAMES:
+        words = [python, __file__, "--rate-here", str(n_games), f"--jaxmarl={clone.resolve()}"]
+        flags = {**os.environ, "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
+        done = subprocess.run(words, capture_output=True, text=True, env=flags, check=True)
+        found = loop.costs(loop.suite_models(_RATE_TASK, n_games), rounds=3)
+        rates = [float(done.stdout.split()[-1]), *(1 / cost.whole for cost in found.values())]
+        print(f"| {n_games} | " + " | ".join(f"{rate:,.0f}" for rate in rates) + " |", flush=True)
+
+
 def _key(row: Sequence[object]) -> tuple[str, ...]:
     return tuple(map(str, row[:4]))
 
@@ -224,8 +262,12 @@ def main() -> None:
     parser.add_argument("--python", nargs="*", default=[], metavar="KIND=PATH", help="interpreters, by kind")
     parser.add_argument("--seeds", type=int, nargs="+", default=(0, 1, 2))
     parser.add_argument("--only", default="", help="tasks that contain this text")
+    parser.add_argument("--rates", action="store_true", help="compare speed, train nothing; needs --jaxmarl")
     parser.add_argument("--here", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--rate-here", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.rate_here is not None:
+        return _rate_here(options.rate_here, options.jaxmarl)
     clones = {"jaxmarl": options.jaxmarl, "epymarl": options.epymarl, "benchmarl": Path()}
     if options.here is not None:
         peer = PEERS[options.here]
@@ -233,6 +275,10 @@ def main() -> None:
     if wrong := [pair for pair in options.python if "=" not in pair]:
         parser.error(f"--python: expected KIND=PATH, such as jaxmarl=/opt/jax/bin/python, got {wrong[0]!r}")
     interpreters = dict(pair.split("=", 1) for pair in options.python)
+    if options.rates:
+        if options.jaxmarl is None:
+            parser.error("--rates: give --jaxmarl, a clone of https://github.com/FLAIROx/JaxMARL")
+        return print_rates(options.jaxmarl, interpreters.get("jaxmarl", sys.executable))
     with FILE.open(encoding="utf-8", newline="") as file:
         rows: list[Sequence[object]] = [*csv.reader(file)][1:]
     for seed in options.seeds:

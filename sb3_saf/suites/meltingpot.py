@@ -8,8 +8,8 @@ published agents) and the substrate's other observations, such as ``READY_TO_SHO
 are terminated, those that reach ``max_cycles`` truncated.
 
 dm-meltingpot downloads its assets when it is built. If that fails, put the folder ``meltingpot`` of its public source
-on ``PYTHONPATH``, and run ``pip install dmlab2d dm-env chex immutabledict ml-collections networkx reactivex
-tensorflow-cpu shimmy``.
+on ``PYTHONPATH``, and run ``pip install dmlab2d dm-env chex immutabledict ml-collections networkx
+pygame-ce reactivex shimmy tensorflow-cpu``.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _game(
 SUITE: Final = Suite(
     name="meltingpot",
     title="Melting Pot: social dilemmas, clean-up, cooking together",
-    requires=("dm-meltingpot>=2.2", "dmlab2d>=1.0.2", "shimmy>=2,<3"),
+    requires=("dm-meltingpot>=2.2", "dmlab2d>=1.0.2", "pygame-ce>=2.4,<3", "shimmy>=2,<3"),
     extra="meltingpot",
     page="https://github.com/google-deepmind/meltingpot",
     list_tasks=_tasks,
