@@ -33,7 +33,7 @@ _LARGEST_SIDE: Final = 60 * _USUAL_TILE
 MAX_PIXELS: Final = 2**26
 
 #: Colours of agents by index, repeating beyond the last; the gems' green is left out.
-AGENT_PALETTE: Final = tuple(
+AGENT_COLOURS: Final = tuple(
     OKABE_ITO[name] for name in ("orange", "sky", "purple", "white", "vermillion", "blue", "yellow")
 )
 
@@ -295,7 +295,7 @@ def _box(x: int, y: int, tile: int, top: int) -> tuple[int, int, int, int]:
 
 
 def _agent_colour(agent: int) -> Colour:
-    return AGENT_PALETTE[agent % len(AGENT_PALETTE)]
+    return AGENT_COLOURS[agent % len(AGENT_COLOURS)]
 
 
 # --- sprites

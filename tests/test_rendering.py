@@ -173,7 +173,7 @@ def test_agents_have_colours_of_their_own_and_numbers() -> None:
     """Also the eighth agent, which has the first one's colour."""
     scene = make_scene([(1 + agent, 5, 0, False) for agent in range(8)], heterogeneity=3)
     cells = draw(scene)[1]
-    for agent, colour in enumerate((*rendering.AGENT_PALETTE, rendering.AGENT_PALETTE[0])):
+    for agent, colour in enumerate((*rendering.AGENT_COLOURS, rendering.AGENT_COLOURS[0])):
         assert count(cells[1 + agent, 5], colour) > 40
     floor = make_scene([(1, 5, 0, False)] * 8)
     assert not np.array_equal(cell_of(make_scene([(1, 5, 0, False)]), 1, 5), cell_of(floor, 1, 5))
@@ -188,7 +188,7 @@ def look(agent: int = 0, direction: int = 0, has_key: bool = False, size: int = 
 @pytest.mark.parametrize("direction", range(4))
 def test_agent_points_where_it_faces(direction: int, tile: int) -> None:
     cell = cell_of(make_scene([(5, 5, direction, False)]), 5, 5, tile)
-    body = (np.rot90(cell, direction) == rendering.AGENT_PALETTE[0]).all(axis=-1)
+    body = (np.rot90(cell, direction) == rendering.AGENT_COLOURS[0]).all(axis=-1)
     half = tile // 2
     assert body[:, :half].sum() > 1.2 * body[:, half:].sum() > 0
 
@@ -205,7 +205,7 @@ def test_treasure_shows_behind_an_agent() -> None:
     for treasure in (0, 1, 2):
         scene.state["treasures"][5, 5] = treasure
         cells.append(cell_of(scene, 5, 5))
-        assert count(cells[-1], rendering.AGENT_PALETTE[0]) > 40
+        assert count(cells[-1], rendering.AGENT_COLOURS[0]) > 40
     green = [int(((cell[..., 1] > 150) & (cell[..., 0] < 70)).sum()) for cell in cells]
     assert green[0] == green[2] == 0
     assert green[1] > 10
