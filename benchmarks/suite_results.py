@@ -3,7 +3,8 @@ Measure what teams learn on the suites' tasks, compared with the suites' own bas
 
 ``python -m benchmarks.suite_results`` trains what is missing (``sb3_saf.experiments run``, one folder for each task)
 and writes the table of that page from the finished cells; after an interruption, the same command continues. All tasks
-get their first seed before any gets its second. Results of other programs, from ``python -m benchmarks.peers``, are in
+get their first seed before any gets its second. Suites that do not install together are trained one by one (``--tasks``), each
+in its own environment. Results of other programs, from ``python -m benchmarks.peers``, are in
 ``results/suites_baselines.csv``.
 """
 
@@ -38,11 +39,13 @@ class Task(NamedTuple):
     :param env_id: of the suite
     :param game_steps: of one training, equal for all methods
     :param discrete: whether actions are discrete, as QPLEX needs
+    :param env_kwargs: ``name:value`` of the environment
     """
 
     env_id: str
     game_steps: int
     discrete: bool = True
+    env_kwargs: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -64,6 +67,7 @@ TASKS: Final = (
     Task("overcooked/cramped_room", 200_000),
     Task("smax/2s3z", 60_000),
     Task("rware/rware-tiny-2ag-v2", 40_000),
+    Task("meltingpot/commons_harvest__open", 20_000, env_kwargs=("pixels_per_sprite:1", "max_cycles:300")),
 )
 
 
@@ -74,7 +78,7 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     if not methods:
         return
     words += ["-n", str(task.game_steps), "--methods", *methods, "-f", str(options.folder / task.name)]
-    experiments(words)
+    experiments([*words, "--env-kwargs", *task.env_kwargs] if task.env_kwargs else words)
 
 
 def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFrame) -> list[str]:
