@@ -3,8 +3,8 @@ Measure what teams learn on the suites' tasks, compared with the suites' own bas
 
 ``python -m benchmarks.suite_results`` trains what is missing (``sb3_saf.experiments run``, one folder for each task)
 and writes the table of that page from the finished cells; after an interruption, the same command continues. All tasks
-get their first seed before any gets its second. Suites that do not install together are trained one by one (``--tasks``), each
-in its own environment. Results of other programs, from ``python -m benchmarks.peers``, are in
+get their first seed before any gets its second. Suites that do not install together are trained in turn (``--tasks``),
+each in its own environment. Results of other programs, from ``python -m benchmarks.peers``, are in
 ``results/suites_baselines.csv``.
 """
 
