@@ -20,6 +20,7 @@ import pandas as pd
 from sb3_saf.experiments.cli import main as experiments
 from sb3_saf.experiments.files import read_json
 from sb3_saf.experiments.tables import read_results
+from sb3_saf.suites.registry import suites
 from sb3_saf.training.statistics import mean_over_seeds
 
 METHODS: Final = ("saf", "mappo", "ippo", "qplex")
@@ -115,8 +116,8 @@ def _figures(tests: pd.DataFrame) -> str:
     return f"{found}{'' if pd.isna(won) else f', {won:.0%} won'} ({len(tests)})"
 
 
-def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterator[str]:
-    """Yield the lines of the table and of its sources."""
+def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str], earlier: str = "") -> Iterator[str]:
+    """Yield the lines of the table and of its sources; rows of suites not installed here remain as ``earlier``."""
     known = pd.read_csv(BASELINES)
     names = [method.upper() for method in methods]
     head = ["task", "game steps", "random", *names, f"processor s ({' / '.join(names)})", "others"]
@@ -124,7 +125,11 @@ def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterat
     yield f"|{' --- |' * len(head)}"
     for task in tasks:
         others = known[known["task"] == task.env_id]
-        yield f"| {' | '.join(row(task, folder / task.name, methods, others))} |"
+        kept = [line for line in earlier.splitlines() if line.startswith(f"| {task.env_id} |")]
+        if kept and suites()[task.env_id.partition("/")[0]].problem() is not None:
+            yield kept[0]
+        else:
+            yield f"| {' | '.join(row(task, folder / task.name, methods, others))} |"
     versions = [read_json(path) for path in folder.glob("*/cells/*/*/*/versions.json")]
     yield ""
     yield f"Commits: {', '.join(sorted({one['commit'] for one in versions if one})) or 'none'}. Others:"
@@ -150,8 +155,8 @@ def main() -> None:
             if task.env_id in options.tasks:
                 run(task, seed, options)
     before, _, rest = options.page.read_text(encoding="utf-8").partition(_MARKS[0])
-    lines = "\n".join(table(tasks, options.folder, options.methods))
-    after = rest.partition(_MARKS[1])[2]
+    earlier, _, after = rest.partition(_MARKS[1])
+    lines = "\n".join(table(tasks, options.folder, options.methods, earlier))
     options.page.write_text(f"{before}{_MARKS[0]}\n\n{lines}\n\n{_MARKS[1]}{after}", encoding="utf-8")
 
 

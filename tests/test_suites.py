@@ -145,6 +145,15 @@ def test_the_table_of_results_has_a_line_for_each_task_and_says_what_was_not_run
     assert beside and {cells[0] for cells in rows if " game steps: " in cells[-1]} == beside
 
 
+def test_rows_of_suites_that_are_not_installed_remain_on_the_page(tmp_path: Path) -> None:
+    earlier = {task: f"| {task.env_id} | from another environment |" for task in TASKS}
+    _, _, *lines = table(TASKS, tmp_path, METHODS, "\n".join(earlier.values()))
+    installed = {name for name, suite in suites().items() if suite.problem() is None}
+    for task, line in zip(TASKS, lines, strict=False):
+        expected = task.env_id.partition("/")[0] not in installed
+        assert (line == earlier[task]) == expected and ("not run" in line) == (not expected)
+
+
 # --- every task -------------------------------------------------------------------------------------------------------
 
 
