@@ -43,6 +43,8 @@ N_EPOCHS: Final = 4
 N_MINIBATCHES: Final = 4
 #: Game steps of a rollout in each game.
 N_STEPS: Final = {4: 128, 16: 128, 128: 25}
+#: The same in games of a suite, as in JaxMARL's settings.
+SUITE_STEPS: Final = 128
 NARROW: Final[dict[str, Any]] = {"net_arch": [64, 64], "features_extractor_class": FlattenExtractor}
 POLICIES: Final[Mapping[str, dict[str, Any]]] = {
     "IPPO": NARROW,
@@ -141,11 +143,10 @@ def free_models(n_games: int) -> dict[str, PPO]:
 
 
 def suite_models(env_id: str, n_games: int) -> dict[str, PPO]:
-    """Create SB3's PPO and ours on games of a suite, with JaxMARL's 128 steps in each game."""
+    """Create SB3's PPO and ours on games of a batched suite."""
     one = find_task(env_id)
     assert one is not None and one.suite.vec_env is not None
-    make = partial(one.suite.vec_env, one.task, n_games, 0)
-    return _models(make, N_STEPS[4])
+    return _models(partial(one.suite.vec_env, one.task, n_games, 0), SUITE_STEPS)
 
 
 def _models(make_games: Callable[[], VecEnv], n_steps: int) -> dict[str, PPO]:
@@ -153,7 +154,7 @@ def _models(make_games: Callable[[], VecEnv], n_steps: int) -> dict[str, PPO]:
     games = make_games()
     settings: dict[str, Any] = {
         "n_steps": n_steps,
-        "batch_size": n_steps * games.num_envs // N_MINIBATCHES // N_AGENTS * N_AGENTS,
+        "batch_size": n_steps * games.num_envs // N_MINIBATCHES,
         "n_epochs": N_EPOCHS,
         "device": "cpu",
         "seed": 0,

@@ -5,8 +5,8 @@ Train the suites' own baselines, to be compared with ours: ``results/suites_base
 and with its own settings; only the number of game steps is ours. JaxMARL's and EPyMARL's programs are not in their
 packages, so both need a clone: of https://github.com/FLAIROx/JaxMARL and https://github.com/uoe-agents/epymarl.
 Without one its rows are left out. JaxMARL's programs hang on a single core. Requirements conflict with this project's;
-``--python`` names interpreters that have them. ``--rates`` trains nothing: it compares the speed of JaxMARL's IPPO with
-ours and with Stable-Baselines3's own PPO on one environment, networks and numbers of epochs being equal.
+``--python`` names interpreters that have them. ``--rates`` measures only speed: that of JaxMARL's IPPO, of
+Stable-Baselines3's own PPO and of ours on one environment, with equal networks, epochs and minibatches.
 
 - JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml
 - BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
@@ -36,10 +36,8 @@ COLUMNS: Final = ("task", "program", "seed", "game_steps", "return", "won", "pro
 _VMAS_STEPS: Final = 100
 #: The last training episodes whose mean counts, as a share of all updates.
 _LAST: Final = 20
-#: Speed: what is played, its agents, numbers of games, and game steps of a measured run.
+#: Speed: what is played (also JaxMARL's own choice), and game steps of a measured run.
 _RATE_TASK: Final = "jaxmarl/MPE_simple_spread_v3"
-_RATE_AGENTS: Final = 3
-_RATE_GAMES: Final = (4, 16, 128)
 _RATE_STEPS: Final = 200_000
 
 
@@ -224,7 +222,7 @@ def _train_here(peer: Peer, seed: int, clone: Path) -> None:
 
 
 def _rate_here(n_games: int, clone: Path) -> None:
-    """Print agent-steps per processor second of JaxMARL's IPPO, compiled beforehand."""
+    """Print game steps per processor second of JaxMARL's IPPO, compiled beforehand."""
     program, config = _open_jaxmarl("ippo_ff_mpe", clone, [])
     rollout = n_games * config["NUM_STEPS"]
     config |= {"NUM_ENVS": n_games, "TOTAL_TIMESTEPS": rollout * max(2, _RATE_STEPS // rollout), "NUM_SEEDS": 1}
@@ -233,20 +231,22 @@ def _rate_here(n_games: int, clone: Path) -> None:
     jax.block_until_ready(train(jax.random.PRNGKey(0)))
     start = time.process_time()
     jax.block_until_ready(train(jax.random.PRNGKey(1)))
-    print(config["TOTAL_TIMESTEPS"] * _RATE_AGENTS / (time.process_time() - start))
+    print(config["TOTAL_TIMESTEPS"] / (time.process_time() - start))
 
 
 def print_rates(clone: Path, python: str) -> None:
-    """Print a table: whole training loops on the same games, SB3's PPO on the rows of the same VecEnv."""
+    """Print agent-steps per processor second of whole training loops, SB3's PPO on the rows of the same VecEnv."""
     loop = import_module("benchmarks.loop")
     print("| games | JaxMARL's IPPO | " + " | ".join((loop.SB3, *loop.POLICIES)) + " |")
     print("| --- |" + " --- |" * (2 + len(loop.POLICIES)))
-    for n_games in _RATE_GAMES:
+    for n_games in loop.N_STEPS:
         words = [python, __file__, "--rate-here", str(n_games), f"--jaxmarl={clone.resolve()}"]
         flags = {**os.environ, "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
-        done = subprocess.run(words, capture_output=True, text=True, env=flags, check=True)
+        done = subprocess.run(words, capture_output=True, text=True, env=flags)
+        if done.returncode:
+            sys.exit(f"JaxMARL's program: {(done.stderr or 'failed').strip().splitlines()[-1]}")
         found = loop.costs(loop.suite_models(_RATE_TASK, n_games), rounds=3)
-        rates = [float(done.stdout.split()[-1]), *(1 / cost.whole for cost in found.values())]
+        rates = [float(done.stdout.split()[-1]) * loop.N_AGENTS, *(1 / cost.whole for cost in found.values())]
         print(f"| {n_games} | " + " | ".join(f"{rate:,.0f}" for rate in rates) + " |", flush=True)
 
 
@@ -262,7 +262,7 @@ def main() -> None:
     parser.add_argument("--python", nargs="*", default=[], metavar="KIND=PATH", help="interpreters, by kind")
     parser.add_argument("--seeds", type=int, nargs="+", default=(0, 1, 2))
     parser.add_argument("--only", default="", help="tasks that contain this text")
-    parser.add_argument("--rates", action="store_true", help="compare speed, train nothing; needs --jaxmarl")
+    parser.add_argument("--rates", action="store_true", help="measure only speed; needs --jaxmarl")
     parser.add_argument("--here", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--rate-here", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
