@@ -245,9 +245,8 @@ def checked_actions(space: spaces.Space[Any], agents: Sequence[Any], n_rows: int
     inside = (array >= low) & (array <= high)
     if isinstance(space, spaces.MultiBinary):
         inside &= (array == 0) | (array == 1)
-    outside = np.argwhere(~inside)
-    if len(outside):
-        row = int(outside[0, 0])
+    if not inside.all():
+        row = int(np.argwhere(~inside)[0, 0])
         game, agent = divmod(row, len(agents))
         raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {agents[agent]})")
     return np.array(array, dtype=dtype)  # a copy: the caller may reuse its array

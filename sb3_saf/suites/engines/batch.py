@@ -166,9 +166,10 @@ class BatchVecEnv(TeamVecEnv):
     def _end(self, infos: list[dict[str, Any]], step: BatchStep, game: int) -> None:
         """Fill in the infos of a game whose episode ended."""
         first = game * self.n_agents
-        for row in range(first, first + self.n_agents):
-            last = {key: part[row] for key, part in step.last.items()}
-            infos[row] = {TRUNCATED: bool(step.truncated[game]), TERMINAL_OBSERVATION: last}
+        truncated = bool(step.truncated[game])
+        parts = zip(*(part[first : first + self.n_agents] for part in step.last.values()), strict=True)
+        for row, last in enumerate(parts, first):
+            infos[row] = {TRUNCATED: truncated, TERMINAL_OBSERVATION: dict(zip(step.last, last, strict=True))}
             self.reset_infos[row] = {}
         if step.won is not None:
             infos[first][IS_SUCCESS] = bool(step.won[game])

@@ -322,7 +322,8 @@ class JaxGames(ResumableBatch):
         narrow = actions.astype(np.int32) if actions.dtype.kind == "i" else actions
         self.games, rows, last, ends = self._programs.step(self.games, narrow, self._weight())
         self._n_steps += self.n_games
-        rewards, ended, truncated, won = jax.tree.map(np.asarray, ends)
+        rewards, ended, truncated = (np.asarray(part) for part in ends[:3])
+        won = None if ends.won is None else np.asarray(ends.won)
         shown = self._on_host(rows)
         return BatchStep(shown, rewards, ended, truncated, self._on_host(last) if ended.any() else shown, won)
 
@@ -333,7 +334,7 @@ class JaxGames(ResumableBatch):
     def _on_host(self, rows: dict[str, Any]) -> dict[str, Array]:
         """Convert (E, N, ...) on the device to NumPy (B, ...), without a copy on a CPU."""
         n_rows = self.n_games * len(self.agents)
-        return {key: part.reshape(n_rows, *part.shape[2:]) for key, part in jax.tree.map(np.asarray, rows).items()}
+        return {key: np.asarray(part).reshape(n_rows, *part.shape[2:]) for key, part in rows.items()}
 
     def picture(self, game: int) -> npt.NDArray[np.uint8]:
         """Return JaxMARL's picture of a game (see the base class)."""
