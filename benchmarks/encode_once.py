@@ -46,7 +46,10 @@ def vectors() -> VecEnv:
 def minibatches(env: VecEnv, encode_once: bool, trained: Path | None) -> tuple[PPO, list[Any]]:
     """Create a policy and the minibatches of one of its rollouts."""
     th.manual_seed(0)
-    settings = sb3_saf.ppo_settings(env, n_steps=STEPS, policy_kwargs={"encode_once": encode_once}, seed=0)
+    small = load_settings("saf", "TeamSupport-v0", "small").hyperparams["policy_kwargs"]
+    widths = {name: value for name, value in small.items() if name != "features_extractor_class"}
+    policy_kwargs = {**widths, "encode_once": encode_once}
+    settings = sb3_saf.ppo_settings(env, n_steps=STEPS, policy_kwargs=policy_kwargs, seed=0)
     model = PPO("SAFPolicy", env, device="cpu", **settings)
     if trained is not None:
         sb3_saf.load_weights(model, trained)

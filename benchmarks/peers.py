@@ -5,10 +5,11 @@ Train the suites' own baselines, to be compared with ours: ``results/suites_base
 and with its own settings; only the number of game steps is ours. JaxMARL's and EPyMARL's programs are not in their
 packages, so both need a clone: of https://github.com/FLAIROx/JaxMARL and https://github.com/uoe-agents/epymarl.
 Without one its rows are left out. JaxMARL's programs hang on a single core. Requirements conflict with this project's;
-``--python`` names interpreters that have them. ``--rates`` measures only speed: that of JaxMARL's IPPO, of
-Stable-Baselines3's own PPO and of ours on one environment, with equal networks, epochs and minibatches.
+``--python`` names interpreters that have them. ``--rates`` measures only speed: JaxMARL's IPPO, Stable-Baselines3's own
+PPO and ours on one environment, with equal networks, epochs and minibatches; then whole trainings of BenchMARL's and
+EPyMARL's MAPPO, and ours on the same tasks, each with its own settings.
 
-- JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml
+- JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml, safetensors
 - BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
 - EPyMARL: torch, sacred, tensorboard-logger, gymnasium, lbforaging, rware, pyyaml, scipy, pettingzoo
 """
@@ -16,8 +17,10 @@ Stable-Baselines3's own PPO and of ours on one environment, with equal networks,
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import json
+import math
 import os
 import resource
 import subprocess
@@ -99,6 +102,12 @@ PEERS: Final = (
     ),
     Peer("rware/rware-tiny-2ag-v2", "EPyMARL's MAPPO", "epymarl", "rware:rware-tiny-2ag-v2", "mappo", 40_000),
 )
+#: Whole trainings whose time is compared with ours.
+RATED: Final = (
+    Peer("vmas/simple_spread", "BenchMARL's MAPPO", "benchmarl", "SIMPLE_SPREAD", "Mappo", 60_000),
+    next(peer for peer in PEERS if peer.task.startswith("lbf")),
+)
+_ALL: Final = (*PEERS, *RATED)
 
 
 def _open_jaxmarl(algorithm: str, clone: Path, logged: list[Mapping[str, Any]]) -> tuple[Any, dict[str, Any]]:
@@ -250,6 +259,52 @@ def print_rates(clone: Path, python: str) -> None:
         print(f"| {n_games} | " + " | ".join(f"{rate:,.0f}" for rate in rates) + " |", flush=True)
 
 
+def _trained(peer: Peer, seed: int, clones: Mapping[str, Path | None], interpreters: Mapping[str, str]) -> list[Any]:
+    """Train in a process of its own; return its row, empty after an error, which is printed."""
+    words = ["--here", str(_ALL.index(peer)), "--seeds", str(seed)]
+    words += [f"--{kind}={Path(clone).resolve()}" for kind, clone in clones.items() if clone and clone != Path()]
+    command = [interpreters.get(peer.kind, sys.executable), __file__, *words]
+    with tempfile.TemporaryDirectory() as folder:  # BenchMARL writes into the current one
+        done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    if done.returncode:
+        print(f"{peer.task}, {peer.program}, seed {seed}: {(done.stderr or 'failed').strip().splitlines()[-1]}")
+        return []
+    return list(json.loads(done.stdout.strip().splitlines()[-1]))
+
+
+def print_trainings(clones: Mapping[str, Path | None], interpreters: Mapping[str, str]) -> None:
+    """
+    Print return and processor seconds of whole trainings, seed 0, and when ours first had the return of the others.
+
+    Ours are tested on 32 games with drawn actions; the time until a return is that of the training episodes.
+    """
+    suite_results, times = import_module("benchmarks.suite_results"), import_module("benchmarks.time_to_return")
+    print("\n| task | program | game steps | return | processor s | until the first one's return |")
+    print("|" + " --- |" * 6)
+    for peer in RATED:
+        row = _trained(peer, 0, clones, interpreters) if clones[peer.kind] is not None else []
+        if row:
+            _print_row(peer.task, peer.program, row[3], row[4], row[6])
+        task = suite_results.Task(peer.task, peer.game_steps)
+        with tempfile.TemporaryDirectory() as folder:
+            options = argparse.Namespace(methods=("mappo", "ippo", "saf"), folder=Path(folder))
+            with contextlib.redirect_stdout(sys.stderr):
+                suite_results.run(task, 0, options)
+            results = suite_results.read_results(Path(folder, task.name), task.name)
+        for method, tests in results.tests[results.tests["method"] != "random"].groupby("method"):
+            curve = results.curves[results.curves["method"] == method]
+            until = times.reached(curve, float(row[4]))[0] if row else math.nan
+            test = tests.iloc[0]
+            _print_row(
+                peer.task, method.upper(), test["game_steps"], test["return_mean"], test["processor_seconds"], until
+            )
+
+
+def _print_row(task: str, program: str, game_steps: int, value: float, seconds: float, until: float = math.nan) -> None:
+    cells = (f"{game_steps:,}", f"{value:.2f}", f"{seconds:.0f}", "" if math.isnan(until) else f"{until:.0f} s")
+    print(f"| {task} | {program} | {' | '.join(cells)} |", flush=True)
+
+
 def _key(row: Sequence[object]) -> tuple[str, ...]:
     return tuple(map(str, row[:4]))
 
@@ -270,7 +325,7 @@ def main() -> None:
         return _rate_here(options.rate_here, options.jaxmarl)
     clones = {"jaxmarl": options.jaxmarl, "epymarl": options.epymarl, "benchmarl": Path()}
     if options.here is not None:
-        peer = PEERS[options.here]
+        peer = _ALL[options.here]
         return _train_here(peer, options.seeds[0], clones[peer.kind])
     if wrong := [pair for pair in options.python if "=" not in pair]:
         parser.error(f"--python: expected KIND=PATH, such as jaxmarl=/opt/jax/bin/python, got {wrong[0]!r}")
@@ -278,28 +333,20 @@ def main() -> None:
     if options.rates:
         if options.jaxmarl is None:
             parser.error("--rates: give --jaxmarl, a clone of https://github.com/FLAIROx/JaxMARL")
-        return print_rates(options.jaxmarl, interpreters.get("jaxmarl", sys.executable))
+        print_rates(options.jaxmarl, interpreters.get("jaxmarl", sys.executable))
+        return print_trainings(clones, interpreters)
     with FILE.open(encoding="utf-8", newline="") as file:
         rows: list[Sequence[object]] = [*csv.reader(file)][1:]
     for seed in options.seeds:
-        for index, peer in enumerate(PEERS):
+        for peer in PEERS:
             there = any(_key(row) == _key([peer.task, peer.program, seed, peer.game_steps]) for row in rows)
             if there or options.only not in peer.task or clones[peer.kind] is None:
                 continue
-            words = ["--here", str(index), "--seeds", str(seed)]
-            words += [
-                f"--{kind}={Path(clone).resolve()}" for kind, clone in clones.items() if clone and clone != Path()
-            ]
-            command = [interpreters.get(peer.kind, sys.executable), __file__, *words]
-            with tempfile.TemporaryDirectory() as folder:  # BenchMARL writes into the current one
-                done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
-            if done.returncode:
-                print(f"{peer.task}, {peer.program}, seed {seed}: {(done.stderr or 'failed').strip().splitlines()[-1]}")
-                continue
-            rows.append(json.loads(done.stdout.strip().splitlines()[-1]))
-            print(*rows[-1], flush=True)
-            with FILE.open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerows([COLUMNS, *sorted(rows, key=_key)])
+            if row := _trained(peer, seed, clones, interpreters):
+                rows.append(row)
+                print(*row, flush=True)
+                with FILE.open("w", encoding="utf-8", newline="") as file:
+                    csv.writer(file, lineterminator="\n").writerows([COLUMNS, *sorted(rows, key=_key)])
 
 
 if __name__ == "__main__":

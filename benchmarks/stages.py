@@ -1,9 +1,10 @@
 """
 Measure training time by stage: ``python -m benchmarks.stages``.
 
-One table per setting: SAF, MAPPO and IPPO in the ``small`` size of the zoo (light encoder), and SAF with the paper's
-network. A stage excludes the stages inside it: for example, the rollout does not include the games that it steps.
-Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are of the real program and sum to the total.
+One table per setting: SAF, MAPPO and IPPO in the size ``small`` of the zoo with 16 and 128 games, and SAF with the
+paper's network. A stage excludes the stages inside it: for example, the rollout does not include the games that it
+steps. Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are of the real program and sum to the
+total.
 
 On a GPU, ``--device cuda --only "SAF, paper size"`` waits for the device between stages, so that each includes its own
 kernels, and prints the time of 10 million game steps; ``--no-wait`` lets stages overlap as in training.
@@ -14,16 +15,17 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import wraps
-from typing import Any, Final, NamedTuple
+from functools import partial, wraps
+from typing import Any, Final
 
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common import on_policy_algorithm
 
-from sb3_saf import LightEncoder, PaperCNN, TeamRolloutBuffer, make_team_env
+from sb3_saf import PaperCNN, TeamRolloutBuffer, make_team_env
+from sb3_saf.training.settings import load_settings
 
 REST: Final = "all else"
 TRANSFER: Final = "arrays to the device"
@@ -97,49 +99,50 @@ class Stopwatch:
         setattr(owner, method, timed)
 
 
-class Setting(NamedTuple):
-    """Settings of a training: a policy, its games and PPO's arguments."""
-
-    policy: str
-    encoder: type[Any]
-    env: dict[str, Any]
-    n_games: int
-    minibatches: int
-    n_epochs: int
-
-
-_SMALL: Final = {"n_agents": 5, "grid_size": 15, "n_treasures": 25, "coordination": 1}
-SETTINGS: Final = {
-    **{
-        f"{method}, small": Setting(f"{method}Policy", LightEncoder, _SMALL, 64, 8, 4)
-        for method in ("SAF", "MAPPO", "IPPO")
-    },
-    "SAF, paper network, 16 games": Setting("SAFPolicy", PaperCNN, {}, 16, 1, 10),
-}
-#: This size needs a GPU; without one, a rollout takes a minute.
-PAPER_SIZE: Final = {"SAF, paper size": Setting("SAFPolicy", PaperCNN, {}, 128, 1, 10)}
+#: Minibatches by number of games: equal rows in each as in the zoo.
+SMALL_GAMES: Final = {16: 2, 128: 16}
 PAPER_GAME_STEPS: Final = 10_000_000
 
 
-def make_model(setting: Setting, steps: int = 50, device: str = "cpu") -> PPO:
-    """Create the algorithm of a setting, on TeamSupport."""
-    env = make_team_env("TeamSupport", n_envs=setting.n_games, seed=0, **setting.env)
-    rows = steps * env.num_envs
+def small_model(algo: str, n_games: int, device: str) -> PPO:
+    """Create PPO with the zoo's settings of the size ``small``."""
+    sizes = {"n_envs": n_games, "n_minibatches": SMALL_GAMES[n_games]}
+    settings = load_settings(algo, "TeamSupport-v0", "small", overrides=sizes)
+    model = settings.make_model(settings.make_env(0), 0, device=device)
+    assert isinstance(model, PPO)
+    return model
+
+
+def paper_model(n_games: int, device: str) -> PPO:
+    """Create SAF with the paper's games and network."""
+    env = make_team_env("TeamSupport", n_envs=n_games, seed=0)
     return PPO(
-        setting.policy,
+        "SAFPolicy",
         env,
-        n_steps=steps,
-        batch_size=rows // setting.minibatches,
-        n_epochs=setting.n_epochs,
+        n_steps=50,
+        batch_size=50 * env.num_envs,
+        n_epochs=10,
         learning_rate=7e-4,
         gae_lambda=1.0,
         ent_coef=0.01,
         max_grad_norm=9.0,
         rollout_buffer_class=TeamRolloutBuffer,
-        policy_kwargs={"features_extractor_class": setting.encoder},
+        policy_kwargs={"features_extractor_class": PaperCNN},
         seed=0,
         device=device,
     )
+
+
+SETTINGS: Final[Mapping[str, Callable[[str], PPO]]] = {
+    **{
+        f"{algo.upper()}, small, {n_games} games": partial(small_model, algo, n_games)
+        for n_games in SMALL_GAMES
+        for algo in ("saf", "mappo", "ippo")
+    },
+    "SAF, paper network, 16 games": partial(paper_model, 16),
+}
+#: This size needs a GPU; without one, a rollout takes a minute.
+PAPER_SIZE: Final[Mapping[str, Callable[[str], PPO]]] = {"SAF, paper size": partial(paper_model, 128)}
 
 
 def watch(model: Any, wait: bool = True) -> Stopwatch:
@@ -169,9 +172,8 @@ def watch(model: Any, wait: bool = True) -> Stopwatch:
     return watch
 
 
-def profile(setting: Setting, rollouts: int, device: str = "cpu", wait: bool = True) -> tuple[dict[str, float], int]:
+def profile(model: PPO, rollouts: int, wait: bool = True) -> tuple[dict[str, float], int]:
     """Return seconds by stage, and agent-steps, after a rollout and update as warm-up."""
-    model = make_model(setting, device=device)
     assert model.env is not None
     rows = model.n_steps * model.env.num_envs
     model.learn(rows)
@@ -215,8 +217,8 @@ def main() -> None:
         )
     th.set_num_threads(options.threads)
     for name in [options.only] if options.only else SETTINGS:
-        setting = {**SETTINGS, **PAPER_SIZE}[name]
-        seconds, rows = profile(setting, options.rollouts, options.device, not options.no_wait)
+        model = {**SETTINGS, **PAPER_SIZE}[name](options.device)
+        seconds, rows = profile(model, options.rollouts, not options.no_wait)
         whole = sum(seconds.values())
         print(f"\n{name}: {rows / whole:,.0f} agent-steps/s, {options.device}, {options.threads} thread(s)\n")
         print("| stage | us per agent-step | share |\n| --- | --- | --- |")
