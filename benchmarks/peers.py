@@ -11,7 +11,7 @@ EPyMARL's MAPPO, and ours on the same tasks, each with its own settings.
 
 - JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml, safetensors
 - BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
-- EPyMARL: torch, sacred, tensorboard-logger, gymnasium, lbforaging, rware, pyyaml, scipy, pettingzoo
+- EPyMARL: torch, sacred, setuptools < 81, tensorboard-logger, gymnasium, lbforaging, rware, pyyaml, scipy, pettingzoo
 """
 
 from __future__ import annotations
@@ -245,13 +245,13 @@ def _rate_here(n_games: int, clone: Path) -> None:
 
 def print_rates(clone: Path, python: str) -> None:
     """Print agent-steps per processor second of whole training loops, SB3's PPO on the rows of the same VecEnv."""
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"  # before jax is imported, for ours as for theirs
     loop = import_module("benchmarks.loop")
     print("| games | JaxMARL's IPPO | " + " | ".join((loop.SB3, *loop.POLICIES)) + " |")
     print("| --- |" + " --- |" * (2 + len(loop.POLICIES)))
     for n_games in loop.N_STEPS:
         words = [python, __file__, "--rate-here", str(n_games), f"--jaxmarl={clone.resolve()}"]
-        flags = {**os.environ, "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
-        done = subprocess.run(words, capture_output=True, text=True, env=flags)
+        done = subprocess.run(words, capture_output=True, text=True)
         if done.returncode:
             sys.exit(f"JaxMARL's program: {(done.stderr or 'failed').strip().splitlines()[-1]}")
         found = loop.costs(loop.suite_models(_RATE_TASK, n_games), rounds=3)
