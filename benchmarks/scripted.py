@@ -11,8 +11,9 @@ Besides a random team there are two scripted ones, which know the rules, includi
   reaches soonest, by shortest path, and waits there for the rest. In KeyForTreasure one agent of each group fetches a
   key.
 
-Games are those of the zoo's size ``small``, and with twice as many agents at the same density. Means and 95 % intervals
-(Student's t) over games. The scripts know the actions of each zone, so heterogeneity affects only the random team.
+Games are those of the zoo's size ``small``, the same with twice as many agents at the same density, and the paper's.
+Means and 95 % intervals (Student's t) over games. The scripts know the actions of each zone, so heterogeneity affects
+only the random team.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from sb3_saf.evaluation import confidence_interval
 SIZES: Final[tuple[dict[str, int], ...]] = (
     {"n_agents": 5, "grid_size": 15, "n_treasures": 25, "n_keys": 8},
     {"n_agents": 10, "grid_size": 22, "n_treasures": 50, "n_keys": 16},
+    {},  # the paper's: the games' own defaults
 )
 
 
