@@ -146,9 +146,9 @@ def test_the_command_writes_its_table(
     scripted.main()
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * len(TEAMS)
+    assert len(rows) == len(scripted.SIZES) * len(TEAMS)
     assert len(capsys.readouterr().out.splitlines()) == 2 + len(rows)
-    for n_agents in ("5", "10"):
-        means = [float(row["mean"]) for row in rows if row["n_agents"] == n_agents]
+    for grid_size in ("15", "22", "30"):
+        means = [float(row["mean"]) for row in rows if row["grid_size"] == grid_size]
         assert means == sorted(means)
         assert means[0] < means[1] / 2
