@@ -62,7 +62,7 @@ def cluster() -> Iterator[Any]:
 
 class NodeKiller(RayEngine):
     """
-    An engine that kills a node one second after the first cell has finished, when both nodes are busy again.
+    An engine that kills a node as soon as the node runs a cell after the first cell has finished.
 
     :param cluster: with the node
     """
@@ -71,7 +71,7 @@ class NodeKiller(RayEngine):
         super().__init__(cluster.address)
         self.cluster = cluster
         self.lost: list[BaseException] = []
-        self._killer = threading.Timer(1.0, self._kill)
+        self._killer = threading.Thread(target=self._kill, daemon=True)
 
     def submit(self, folder: Path) -> Future[None]:
         future = super().submit(folder)
@@ -81,11 +81,22 @@ class NodeKiller(RayEngine):
     def _note(self, future: Future[None]) -> None:
         if (error := future.exception()) is not None:
             self.lost.append(error)
-        elif not self._killer.is_alive() and not self._killer.finished.is_set():
+        elif self._killer.ident is None:
             self._killer.start()
 
     def _kill(self) -> None:
-        self.cluster.remove_node(self.cluster.list_all_nodes()[-1], allow_graceful=False)
+        node = self.cluster.list_all_nodes()[-1]
+        (raylet,) = (psutil.Process(info.process.pid) for info in node.all_processes["raylet"])
+        wait_until(lambda: any(is_cell(process) for process in raylet.children(recursive=True)))
+        self.cluster.remove_node(node, allow_graceful=False)
+
+
+def is_cell(process: psutil.Process) -> bool:
+    """Return whether a process runs a cell; Ray names workers after the task that they run."""
+    try:
+        return process.name().startswith("ray::_run_on_ray")
+    except psutil.NoSuchProcess:
+        return False
 
 
 def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any, tmp_path: Path) -> None:
@@ -143,7 +154,7 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any,
         before = set(killed.glob("training/checkpoints/*.ckpt"))
         wait_until(lambda: set(killed.glob("training/checkpoints/*.ckpt")) - before)
         for process in psutil.process_iter(["name"]):
-            if process.name().startswith("ray::_run_on_ray"):
+            if is_cell(process):
                 process.kill()
         assert "died" in str(first.exception(timeout=200))
         begun = began(killed)

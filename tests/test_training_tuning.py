@@ -151,3 +151,11 @@ def test_what_is_given_is_not_searched() -> None:
     assert list(sampled["policy_kwargs"]) == ["n_slots"]
     assert "policy_kwargs" not in _sampled("mappo")
     assert list(_sampled("saf-no-ks")["policy_kwargs"]) == ["n_policies"]
+
+
+def test_a_learning_rate_is_constant_or_decreases_to_zero() -> None:
+    assert to_overrides({"learning_rate": 1e-3, "lr_schedule": "linear"}) == {"learning_rate": "lin_0.001"}
+    assert to_overrides({"learning_rate": 1e-3, "lr_schedule": "constant"}) == {"learning_rate": 1e-3}
+    assert to_overrides({"learning_rate": 1e-3}) == {
+        "learning_rate": 1e-3
+    }  # a study made before schedules were sampled

@@ -51,7 +51,7 @@ def _count(low: int, high: int) -> _Suggest:
 #: Arguments of algorithms; those that an algorithm lacks are skipped.
 _SEARCH: Final[dict[str, _Suggest]] = {
     "learning_rate": _log(1e-4, 3e-3),
-    "gamma": _choice(0.95, 0.98, 0.99, 0.995),
+    "gamma": _choice(0.8, 0.9, 0.95, 0.98, 0.99, 0.995),
     "gae_lambda": _choice(0.9, 0.95, 0.98, 1.0),
     "ent_coef": _log(1e-4, 0.05),
     "vf_coef": _log(0.1, 1.0),
@@ -60,6 +60,9 @@ _SEARCH: Final[dict[str, _Suggest]] = {
     "n_epochs": _count(2, 10),
     "n_minibatches": _choice(1, 2, 4, 8),
 }
+#: Whether the learning rate decreases to 0, as RL-Zoo3's ``lin_``.
+_LR_SCHEDULE: Final = "lr_schedule"
+_LINEAR: Final = "linear"
 #: Arguments of policies.
 _POLICY_SEARCH: Final[dict[str, _Suggest]] = {
     "n_policies": _count(2, 8),
@@ -74,6 +77,8 @@ def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[st
         known.add("n_minibatches")
     for name in _open(_SEARCH, known, fixed):
         _SEARCH[name](trial, name)
+    if "learning_rate" in trial.params:
+        trial.suggest_categorical(_LR_SCHEDULE, ("constant", _LINEAR))
     settled = {**spec.policy_kwargs, **fixed.get("policy_kwargs", {})}
     if settled.get("knowledge_source") is False:
         settled["n_slots"] = None  # no slots without a knowledge source
@@ -90,6 +95,8 @@ def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the parameters of a trial to overrides for ``load_settings``."""
     of_policy = {name: value for name, value in params.items() if name in _POLICY_SEARCH}
     others = {name: value for name, value in params.items() if name not in _POLICY_SEARCH}
+    if others.pop(_LR_SCHEDULE, None) == _LINEAR:
+        others["learning_rate"] = f"lin_{others['learning_rate']}"
     return {**others, "policy_kwargs": of_policy} if of_policy else others
 
 
