@@ -36,6 +36,7 @@ from sb3_saf.envs.team_game import EqualSpaces
 from sb3_saf.envs.team_reward import SharedReward
 from sb3_saf.policies.extractors import PaperCNN, PartsEncoder
 from sb3_saf.suites.__main__ import main
+from sb3_saf.suites.meltingpot import MeltingPotTeam
 from sb3_saf.suites.registry import find_task, suites
 from sb3_saf.suites.suite import Suite
 from sb3_saf.training.environments import find_environment
@@ -368,6 +369,34 @@ class PictureEnv(CounterEnv):
 
     def _observation(self, index: int, draw: np.float32) -> Any:
         return {"RGB": np.full((12, 14, 3), 10 * index, np.uint8), "ready": np.float64(self.steps), "left": 3}
+
+
+class SpritesEnv(CounterEnv):
+    """Agents see a picture of 3 x 2 sprites with 8 x 8 random pixels each, and what all are paid."""
+
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        return spaces.Dict(RGB=spaces.Box(0, 255, (24, 16, 3), np.uint8), COLLECTIVE_REWARD=spaces.Box(0, 1))
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        pixels = np.random.default_rng(index).integers(0, 256, (24, 16, 3), np.uint8)
+        return {"RGB": pixels, "COLLECTIVE_REWARD": np.zeros(1, np.float32)}
+
+    def observation_spec(self) -> Any:
+        """Return a substrate's description of what each player and the world show."""
+        return [{"WORLD.RGB": np.zeros((24, 16, 3))}]
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 4, 8])
+def test_sprites_of_melting_pot_are_averaged(pixels: int) -> None:
+    env = SpritesEnv()
+    team = MeltingPotTeam(env, env, pixels_per_sprite=pixels)
+    observations, _ = team.reset(seed=0)
+    block = 8 // pixels
+    for index, agent in enumerate(env.possible_agents):
+        assert observations[agent] in team.observation_space(agent) and list(observations[agent]) == ["RGB"]
+        picture = np.asarray(env._observation(index, np.float32(0))["RGB"])
+        blocks = picture.reshape(3 * pixels, block, 2 * pixels, block, 3)
+        np.testing.assert_array_equal(observations[agent]["RGB"], np.floor(blocks.mean(axis=(1, 3))))
 
 
 def test_pictures_beside_numbers_are_encoded_each_in_their_way(tmp_path: Path) -> None:
