@@ -106,12 +106,12 @@ def test_a_failed_trial_is_never_complete(
 
 
 def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Path) -> None:
-    study = tune(tmp_path)
+    sampled = to_overrides(tune(tmp_path).trials[0].params)
     options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
     for number, trial in enumerate(("0", "best"), start=1):
         zoo_train.main([*SMOKE, *options, "--trial-id", trial])
         saved = config_of(tmp_path / "logs" / "saf" / f"{ENV}_{number}")["hyperparams"]
-        assert saved["learning_rate"] == study.trials[0].params["learning_rate"]
+        assert saved["learning_rate"] == sampled["learning_rate"]
     zoo_train.main([*SMOKE, *options, "--trial-id", "0", "-params", "learning_rate:0.5"])
     assert config_of(tmp_path / "logs" / "saf" / f"{ENV}_3")["hyperparams"]["learning_rate"] == 0.5
 
