@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +27,7 @@ from sb3_saf.experiments.tables import read_results
 from sb3_saf.training.figures import draw_levels
 from sb3_saf.training.statistics import Estimate, mean_over_seeds
 
-METHODS: Final = ("saf", "mappo", "ippo")
+METHODS: Final = ("saf", "mappo", "mappo-separate", "ippo")
 #: Side of the grid by number of agents.
 GRID_SIZES: Final = {2: 10, 5: 15, 10: 21, 20: 30, 50: 47}
 TREASURES_PER_AGENT: Final = 5
@@ -68,12 +68,13 @@ def measured(folder: Path, n_episodes: int) -> pd.DataFrame:
     )
 
 
-def lines(table: pd.DataFrame) -> Iterator[str]:
-    """Yield a Markdown table; differences are taken seed by seed."""
+def lines(table: pd.DataFrame, methods: Sequence[str]) -> Iterator[str]:
+    """Yield a Markdown table, with what the first method gains over each other one, seed by seed."""
     yield "| agents | method | seeds | % of treasures | % while training | explained variance | us per agent-step |"
     yield "|" + " --- |" * 7
     for n_agents, here in table.groupby("n_agents"):
-        by_method = dict(iter(here.groupby("method", sort=False)))
+        rows_of = dict(iter(here.groupby("method")))
+        by_method = {method: rows_of[method] for method in (*methods, RANDOM) if method in rows_of}
         for method, rows in by_method.items():
             trained = "" if method == RANDOM else shown(mean_over_seeds(rows["learning"].to_numpy()))
             means = ["", ""] if method == RANDOM else [f"{rows['explained'].mean():.2f}", f"{rows['cost'].mean():.0f}"]
@@ -116,7 +117,7 @@ def main() -> None:
     for n_agents in [] if options.table else options.agents:
         run(n_agents, options)
     table = pd.concat([measured(options.folder / str(n), options.episodes) for n in options.agents], ignore_index=True)
-    print("\n".join(lines(table)))
+    print("\n".join(lines(table, options.methods)))
     scripted = scripts(options.agents, options.episodes)
     print(
         "\n"

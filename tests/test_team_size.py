@@ -26,11 +26,11 @@ def test_it_trains_what_is_missing_then_draws(
 
 
 def test_differences_are_taken_seed_by_seed() -> None:
-    rows = [("saf", 0, 30.0, 20.0), ("saf", 1, 50.0, 40.0), ("mappo", 1, 44.0, 39.0), ("mappo", 0, 26.0, 18.0)]
+    rows = [("mappo", 1, 44.0, 39.0), ("saf", 0, 30.0, 20.0), ("saf", 1, 50.0, 40.0), ("mappo", 0, 26.0, 18.0)]
     table = pd.DataFrame(rows, columns=["method", "seed", "score", "learning"]).assign(
         n_agents=5, explained=0.5, cost=100.0
     )
-    assert list(team_size.lines(table))[2:] == [
+    assert list(team_size.lines(table, ["saf", "mappo"]))[2:] == [
         "| 5 | saf | 2 | 40.0 [-87.1, 167.1] | 30.0 [-97.1, 157.1] | 0.50 | 100 |",
         "| 5 | mappo | 2 | 35.0 [-79.4, 149.4] | 28.5 [-104.9, 161.9] | 0.50 | 100 |",
         "| 5 | saf minus mappo | 2 | 5.0 [-7.7, 17.7] | 1.5 [-4.9, 7.9] | | |",
