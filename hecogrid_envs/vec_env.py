@@ -142,13 +142,22 @@ class NativeVecEnv(TeamVecEnv):
     :param batch: the games
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
     :param render_mode: as in :func:`hecogrid_envs.parallel_env`
+    :param stagger: whether episodes begun by :meth:`reset` end at different times: that of game ``e`` is shorter by
+        ``e / E`` of its length
     """
 
-    def __init__(self, batch: GameBatch, seed: int | None = None, render_mode: RenderMode | None = None):
+    def __init__(
+        self,
+        batch: GameBatch,
+        seed: int | None = None,
+        render_mode: RenderMode | None = None,
+        stagger: bool = False,
+    ):
         self.batch = batch
         self.params = batch.params
         env_class = TASKS[batch.task]
         self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
+        self._stagger = stagger
         self._actions: U8 | None = None
         self._running = False
         own_space = observation_space(batch.task, batch.params)
@@ -161,6 +170,8 @@ class NativeVecEnv(TeamVecEnv):
         options = enumerate(self._options[:: self.n_agents])
         states = {game: state_option(given, self.params) for game, given in options if given}
         self.batch.reset(seeds=self._next_seeds)
+        if self._stagger:
+            self.batch.steps[:] = np.arange(self.n_games) * self.params.max_cycles // self.n_games
         for game, state in states.items():
             if state is not None:
                 self.batch.set_state(state, game)
@@ -310,6 +321,7 @@ def make_vec_env(
     render_mode: RenderMode | None = None,
     n_threads: int = 1,
     n_cpus: int = 1,
+    stagger: bool = False,
     **params: Any,
 ) -> VecEnv:
     """
@@ -325,15 +337,18 @@ def make_vec_env(
     :param render_mode: as in :func:`hecogrid_envs.parallel_env`
     :param n_threads: threads of the native backend
     :param n_cpus: worker processes of the SuperSuit backend
+    :param stagger: whether the first episodes of the native backend end at different times (:class:`NativeVecEnv`)
     :param params: fields of :class:`~hecogrid_envs.params.HECOGridParams`
     :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
     :raises ValueError: for an unknown task, backend or parameter, or a value out of range
     """
     if backend not in get_args(Backend):
         raise ValueError(f"backend must be 'native' or 'supersuit', got {backend!r}")
+    if stagger and backend != "native":
+        raise ValueError(f"stagger=True needs backend='native', got {backend!r}; leave it out")
     batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
     if backend == "native":
-        return NativeVecEnv(batch, seed, render_mode)
+        return NativeVecEnv(batch, seed, render_mode, stagger)
     # Only this backend needs sb3_saf.
     from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 

@@ -190,3 +190,29 @@ def test_a_step_that_nobody_started(env: Any) -> None:
     venv.step(np.zeros(venv.num_envs, dtype=int))
     with pytest.raises(RuntimeError, match=r"no step has been started: call step_async\(actions\) before step_wait"):
         venv.step_wait()
+
+
+def test_staggered_games_end_at_different_times_and_play_whole_episodes_then() -> None:
+    env = make_team_env(
+        "TeamSupport", n_envs=5, seed=0, stagger=True, n_agents=2, grid_size=8, n_treasures=2, max_cycles=10
+    )
+    env.reset()
+    ends: list[list[int]] = [[] for _ in range(5)]
+    for step in range(1, 21):
+        env.step_async(np.zeros(10, dtype=np.int64))
+        dones = env.step_wait()[2]
+        for game in np.flatnonzero(dones[::2]):
+            ends[game].append(step)
+    assert ends == [[10, 20], [8, 18], [6, 16], [4, 14], [2, 12]]
+
+
+@pytest.mark.parametrize(
+    ("env", "kwargs", "message"),
+    [
+        ("TeamSupport", {"backend": "supersuit"}, "stagger=True needs backend='native', got 'supersuit'"),
+        (lambda: None, {}, "stagger=True needs HECOGrid's compiled games"),
+    ],
+)
+def test_only_compiled_games_are_staggered(env: Any, kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_team_env(env, stagger=True, **kwargs)

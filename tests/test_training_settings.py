@@ -112,7 +112,7 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
     settings = load_settings("saf", ENV, "small", {"coordination": 2, "n_agents": 4}, overrides)
     assert settings.n_envs == 8
     assert settings.hyperparams["n_epochs"] == 3
-    assert settings.hyperparams["batch_size"] == 8 * 4 * 50 // 2  # still halves of a rollout
+    assert settings.hyperparams["batch_size"] == 8 * 4 * 10 // 2  # still halves of a rollout
     schedule = settings.hyperparams["learning_rate"]
     assert isinstance(schedule, LinearSchedule)
     assert schedule(0.5) == pytest.approx(3.5e-4)

@@ -59,6 +59,7 @@ def make_team_env(
     state: bool = False,
     team_reward: TeamReward | None = None,
     curriculum: Sequence[Stage] = (),
+    stagger: bool = False,
     **params: Any,
 ) -> CentralizedValueWrapper:
     """
@@ -100,6 +101,8 @@ def make_team_env(
         the agents of its team; None for the suite's default, ``"given"`` without a suite. Logs and evaluation always
         report the games' rewards, in the suite's unit
     :param curriculum: stages before the games with ``params``, see :class:`~sb3_saf.Curriculum`
+    :param stagger: whether the first episodes are cut to different lengths, evenly spread, so that games do not all end
+        together and a rollout shorter than an episode has all its phases; HECOGrid with ``backend="native"`` only
     :param params: parameters of the task or the factory, such as ``n_agents=5``
     :raises ValueError: if the arguments do not fit together, with a fix
     """
@@ -114,12 +117,14 @@ def make_team_env(
     if isinstance(env, str) and _NAMES_OF_CODE.intersection(env):
         env = _imported(env)
     make: Callable[[int | None, dict[str, Any]], VecEnv]
+    if stagger and (task is not None or not isinstance(env, str)):
+        raise ValueError("stagger=True needs HECOGrid's compiled games, a task named by a string; leave it out")
     if task is not None:
         task.warn_if_competitive()
         make = partial(_suite, task, request)
     elif isinstance(env, str):
         _refuse_signals(active, action_masks, state)
-        make = partial(_hecogrid, env, request)
+        make = partial(_hecogrid, env, request, stagger)
     else:
         make = partial(_foreign, env, request)
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
@@ -173,7 +178,7 @@ def _in_stages(
     return staged
 
 
-def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
+def _hecogrid(task: str, request: Request, stagger: bool, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """Make the games of a HECOGrid task."""
     from hecogrid_envs.task import check_task
     from hecogrid_envs.vec_env import make_vec_env
@@ -193,7 +198,8 @@ def _hecogrid(task: str, request: Request, seed: int | None, params: dict[str, A
                 "games at once; leave n_cpus out (native has n_threads) or use backend='supersuit'"
             )
         params = {**params, "n_cpus": request.n_cpus}
-    return make_vec_env(name, request.n_envs, seed=seed, backend=backend, **{"observation": "tiles", **params})
+    params = {"observation": "tiles", **params}
+    return make_vec_env(name, request.n_envs, seed=seed, backend=backend, stagger=stagger, **params)
 
 
 def _suite(one: SuiteTask, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:

@@ -276,16 +276,18 @@ class TeamRowsPolicy(BasePolicy):
         self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
     ) -> th.Tensor:
         """Return outputs (K, ...) of a module for preprocessed observations (K, *shape)."""
-        size = self._chunk_size_of(module) if observations.device.type == "cpu" else None
+        size = self._chunk_size_of(module, len(observations)) if observations.device.type == "cpu" else None
         if size is None or len(observations) <= size:
             return module(preprocess_obs(observations, space, self.normalize_images))
         parts = th.split(observations, size)
         results = [module(preprocess_obs(part, space, self.normalize_images)) for part in parts]
         return th.cat(results)
 
-    def _chunk_size_of(self, module: object) -> int | None:
+    def _chunk_size_of(self, module: object, n_observations: int) -> int | None:
         if self.chunk_size != "auto":
             return self.chunk_size
+        if n_observations <= _CHUNK_OF_CONVOLUTIONS:
+            return None
         has_convolutions = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
         return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
 

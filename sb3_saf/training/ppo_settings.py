@@ -27,8 +27,9 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
 
     They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
     same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
-    its discount, and a learning rate that decreases to 0. Layer sizes are not set: those of ``small`` train faster
-    (``policy_kwargs={"net_arch": [64, 64]}``, for SAF also ``"projection_arch": [64], "latent_dim": 32``).
+    its discount, normalised values, and a learning rate that decreases to 0. Layer sizes are not set: those of
+    ``small`` train faster (``policy_kwargs={"net_arch": [64]}``, for SAF also ``"projection_arch": [], "latent_dim":
+    32``).
 
     :param env: from ``make_team_env``, with any number of games
     :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
@@ -48,7 +49,7 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
     n_steps = max(source["n_steps"], -(-rollout // (n_games * n_minibatches)) * n_minibatches)
     teams = int(overrides.get("n_steps", n_steps)) * n_games
     found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
-    policy_kwargs = {} if encoder is None else {"features_extractor_class": encoder}
+    policy_kwargs = {} if encoder is None else {"features_extractor_class": encoder, "normalize_values": True}
     policy_kwargs |= overrides.get("policy_kwargs") or {}
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
 

@@ -136,6 +136,7 @@ class Settings:
             curriculum=() if evaluation else stages_of(self.wrapping, self.game_steps),
             team_reward=self.wrapping.get("team_reward"),
             state=self.wrapping.get("state", False),
+            stagger=not evaluation and isinstance(source, str) and self.wrapping.get("stagger", False),
             **params,
         )
         return wrap_rows(env, self.wrapping, float(self.plain.get("gamma", 0.99)), is_training=not evaluation)

@@ -39,6 +39,7 @@ WRAPPER_KEYS: Final[dict[str, Any]] = {
     "curriculum": list[Any],
     "team_reward": TeamReward,
     "state": bool,
+    "stagger": bool,
     "algorithm": str,
 }
 NORMALIZATION_FILE: Final = "vecnormalize.npz"
