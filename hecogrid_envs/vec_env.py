@@ -143,7 +143,7 @@ class NativeVecEnv(TeamVecEnv):
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
     :param render_mode: as in :func:`hecogrid_envs.parallel_env`
     :param stagger: whether episodes begun by :meth:`reset` end at different times: that of game ``e`` is shorter by
-        ``e / E`` of its length
+        ``e / E`` of its length, and its last info has ``"staggered"``
     """
 
     def __init__(
@@ -158,6 +158,8 @@ class NativeVecEnv(TeamVecEnv):
         env_class = TASKS[batch.task]
         self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
         self._stagger = stagger
+        #: Games in an episode that is shorter than others, (E,).
+        self._is_short = np.zeros(batch.n_games, dtype=bool)
         self._actions: U8 | None = None
         self._running = False
         own_space = observation_space(batch.task, batch.params)
@@ -172,6 +174,7 @@ class NativeVecEnv(TeamVecEnv):
         self.batch.reset(seeds=self._next_seeds)
         if self._stagger:
             self.batch.steps[:] = np.arange(self.n_games) * self.params.max_cycles // self.n_games
+            self._is_short = self.batch.steps > 0
         for game, state in states.items():
             if state is not None:
                 self.batch.set_state(state, game)
@@ -221,7 +224,10 @@ class NativeVecEnv(TeamVecEnv):
         last = self._rows(self._last)
         for row in np.flatnonzero(dones):
             infos[row] = {"TimeLimit.truncated": True, "terminal_observation": last[row].copy()}
+            if self._is_short[row // self.n_agents]:
+                infos[row]["staggered"] = True
             self.reset_infos[row] = {}
+        self._is_short &= ~over
         return self._rows(views), rewards, dones, infos
 
     def checkpoint_state(self) -> dict[str, Any]:

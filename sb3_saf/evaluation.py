@@ -19,7 +19,16 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wr
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.teams import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, Array, check_count, find_n_agents, team_dones
+from sb3_saf.envs.teams import (
+    ACTION_MASK_KEY,
+    AGENT_KEY,
+    IS_SUCCESS,
+    STAGGERED,
+    Array,
+    check_count,
+    find_n_agents,
+    team_dones,
+)
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -203,13 +212,19 @@ class _GameRows(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         returns = rewards.reshape(-1, self._n_agents).sum(axis=1, dtype=np.float64)
-        return obs, returns, team_dones(dones, self._n_agents), infos[:: self._n_agents]
+        of_games = [_whole(info) for info in infos[:: self._n_agents]]
+        return obs, returns, team_dones(dones, self._n_agents), of_games
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Return True for SB3's Monitor if there is a TeamMonitor, so that SB3 uses its unmodified episodes."""
         return [self._monitored and wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+
+def _whole(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the info without its episode if that was cut short: only whole episodes count."""
+    return {key: value for key, value in info.items() if key != "episode"} if STAGGERED in info else info
 
 
 class _GamePredictor:

@@ -204,6 +204,8 @@ def test_staggered_games_end_at_different_times_and_play_whole_episodes_then() -
         for game in np.flatnonzero(dones[::2]):
             ends[game].append(step)
     assert ends == [[10, 20], [8, 18], [6, 16], [4, 14], [2, 12]]
+    result = evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7)
+    assert result.lengths == [10] * 7  # short episodes do not count
 
 
 @pytest.mark.parametrize(

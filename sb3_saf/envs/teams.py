@@ -36,6 +36,8 @@ OptionalKey = Literal["active", "action_mask", "state"]
 
 #: SB3's key of infos for success of an episode, logged as ``rollout/success_rate``.
 IS_SUCCESS: Final = "is_success"
+#: Entry of the last info of an episode that was cut short (``make_team_env(..., stagger=True)``).
+STAGGERED: Final = "staggered"
 
 #: Which agents of the row's team take part, in index order.
 ACTIVE_KEY: Final = "active"

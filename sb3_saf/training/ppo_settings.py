@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.teams import TeamSpaces, require_n_agents
 
-#: Settings of ``sb3_saf.train --algo saf --size small`` that also apply to scripts.
+#: Settings of ``sb3_saf.train --algo mappo --size small`` that also apply to scripts.
 _TAKEN: Final = (
     *("learning_rate", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
     "rollout_buffer_class",
@@ -25,11 +25,10 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
 
         model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env))
 
-    They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
-    same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
-    its discount, normalised values, and a learning rate that decreases to 0. Layer sizes are not set: those of
-    ``small`` train faster (``policy_kwargs={"net_arch": [64]}``, for SAF also ``"projection_arch": [], "latent_dim":
-    32``).
+    They are those of ``sb3_saf.train --algo mappo --size small``: ``TeamRolloutBuffer``, and a few minibatches per
+    rollout with the same number of game steps for any number of games. HECOGrid with tile codes has its own settings:
+    the light encoder, narrow heads, normalised values, its discount, and a learning rate that decreases to 0. SAF
+    trains a third faster with ``policy_kwargs={"projection_arch": [], "latent_dim": 32}``, as in ``--algo saf``.
 
     :param env: from ``make_team_env``, with any number of games
     :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
@@ -41,7 +40,7 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
 
     n_agents = require_n_agents(env)
     n_games, encoder = env.num_envs // n_agents, _encoder_of(env)
-    source = entry_of(read_config("saf"), ("default",) if encoder is None else ("default", HECOGRID), "small")
+    source = entry_of(read_config("mappo"), ("default",) if encoder is None else ("default", HECOGRID), "small")
     hints, taken = algorithm_arguments(PPO), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
     found = {key: resolve(key, source[key], hints[key]) for key in taken}
     rollout = source["n_steps"] * source["n_envs"]  # game steps, in all games
@@ -49,7 +48,7 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
     n_steps = max(source["n_steps"], -(-rollout // (n_games * n_minibatches)) * n_minibatches)
     teams = int(overrides.get("n_steps", n_steps)) * n_games
     found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
-    policy_kwargs = {} if encoder is None else {"features_extractor_class": encoder, "normalize_values": True}
+    policy_kwargs = {} if encoder is None else {**source["policy_kwargs"], "features_extractor_class": encoder}
     policy_kwargs |= overrides.get("policy_kwargs") or {}
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
 
