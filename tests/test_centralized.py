@@ -425,6 +425,27 @@ def test_silent_garbage_is_not_passed_on(fault: Callable[[Broken], None], messag
         step_twice(env)
 
 
+def test_games_that_end_together_have_their_own_last_observations() -> None:
+    env = CentralizedValueWrapper(TeamVenv(lengths=(3, 2, 2)))
+    env.reset()
+    env.step(still(env))
+    *_, infos = env.step(still(env))
+    for row in range(3, 9):
+        last = infos[row]["terminal_observation"]
+        np.testing.assert_array_equal(last["obs"], see_where(*divmod(row, 3), 0, 2))
+        np.testing.assert_array_equal(last["team"], [see_where(row // 3, i, 0, 2) for i in range(3)])
+        assert last["agent"] == row % 3 and "terminal_observation" not in infos[row % 3]
+
+    def short_in_game_2(venv: Broken) -> None:
+        for info in venv.infos[6:]:
+            info["terminal_observation"] = np.zeros(3, dtype=np.float32)
+
+    env = CentralizedValueWrapper(Broken(short_in_game_2, lengths=(3, 2, 2)))
+    env.reset()
+    with pytest.raises(ValueError, match=r"one shape for the agents of game 2, got \[\(3,\), \(4,\)\]"):
+        step_twice(env)
+
+
 def test_numbers_of_a_larger_kind_are_cast_to_the_space() -> None:
     def wider(venv: Broken) -> None:
         venv.obs = venv.obs.astype(np.float64)

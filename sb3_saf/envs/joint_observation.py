@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -190,46 +190,51 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._masks_shown = parts.get(ACTION_MASK_KEY)
         return joint
 
-    def _checked_parts(self, obs: Any, what: str, game: int | None = None) -> dict[str, Array]:
+    def _checked_parts(self, obs: Any, what: str, games: Sequence[int] | None = None) -> dict[str, Array]:
         """
-        Check and copy the parts of the rows of all games, or of one.
+        Check and copy the parts of the rows of all games, or of some whose episodes ended.
 
         :return: own observations (B, *shape); if present, active agents (E, N), action masks (B, A), states (B, *state)
         """
         raw, team = self._raw, self.team_spaces
         entries = raw.entries(obs, what)
-        parts = {OBS_KEY: self._rows(entries[OBS_KEY], raw.own, team.own, what, game)}
+        parts = {OBS_KEY: self._rows(entries[OBS_KEY], raw.own, team.own, what, games)}
         if raw.active:
             parts[ACTIVE_KEY] = np.asarray(entries[ACTIVE_KEY]).reshape(-1, self.n_agents).astype(np.int8)
         if raw.n_masked_actions is not None:
-            parts[ACTION_MASK_KEY] = self._masks(entries[ACTION_MASK_KEY], parts.get(ACTIVE_KEY), game)
+            parts[ACTION_MASK_KEY] = self._masks(entries[ACTION_MASK_KEY], parts.get(ACTIVE_KEY), games is not None)
         if raw.state is not None:
             assert team.state is not None
-            parts[STATE_KEY] = self._rows(entries[STATE_KEY], raw.state, team.state, f"states in {what}", game)
+            parts[STATE_KEY] = self._rows(entries[STATE_KEY], raw.state, team.state, f"states in {what}", games)
         return parts
 
     def _rows(
-        self, obs: object, raw: spaces.Space[Any], stored: spaces.Space[Any], what: str, game: int | None = None
+        self,
+        obs: object,
+        raw: spaces.Space[Any],
+        stored: spaces.Space[Any],
+        what: str,
+        games: Sequence[int] | None = None,
     ) -> Array:
         """Check and copy one entry of rows, channels first: (B, *raw shape) -> (B, *shape)."""
         rows = np.asarray(obs)
-        expected = (self.num_envs if game is None else self.n_agents, *(raw.shape or ()))
+        expected = (self.num_envs if games is None else len(games) * self.n_agents, *(raw.shape or ()))
         if rows.shape != expected or not np.can_cast(rows.dtype, raw.dtype or rows.dtype, "same_kind"):
             raise ValueError(
                 f"expected {what} of shape {expected} and dtype {raw.dtype} as in {raw}, got "
                 f"shape {rows.shape} and dtype {rows.dtype}; make the environment return what its space promises"
             )
-        check_finite(what, rows, self.n_agents, self._n_steps, first_game=game or 0)
+        check_finite(what, rows, self.n_agents, self._n_steps, games)
         if raw is not stored:
             rows = np.moveaxis(rows, -1, 1)
         return np.array(rows, dtype=raw.dtype, order="C")
 
-    def _masks(self, masks: object, active: Array | None, game: int | None) -> Array:
+    def _masks(self, masks: object, active: Array | None, are_last: bool) -> Array:
         """Check and copy action masks. Inactive rows, and last observations without masks, get action 0."""
         rows = np.array(masks, dtype=np.int8)
         idle = np.zeros(len(rows), dtype=bool) if active is None else active.reshape(-1) == 0
         stuck = ~idle & ~rows.any(axis=1)
-        if stuck.any() and game is None:
+        if not are_last and stuck.any():
             row = int(np.flatnonzero(stuck)[0])
             raise ValueError(
                 f"expected at least one legal action in the {ACTION_MASK_KEY!r} of an agent that takes part, got none "
@@ -241,48 +246,54 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     def _complete_infos(self, infos: list[dict[str, Any]], ended: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:
         infos = list(infos)
-        for game in np.flatnonzero(ended).tolist():
-            first = game * self.n_agents
-            last = self._terminal_parts(infos[first : first + self.n_agents], game)
-            for agent in range(self.n_agents):
-                infos[first + agent] = self._terminal_info(infos[first + agent], last, agent)
+        if not ended.any():
+            return infos
+        rows = np.flatnonzero(ended.repeat(self.n_agents)).tolist()
+        last = self._terminal_parts([infos[row] for row in rows], np.flatnonzero(ended).tolist())
+        for index, row in enumerate(rows):
+            infos[row] = self._terminal_info(infos[row], last, index)
         return infos
 
-    def _terminal_parts(self, infos: list[dict[str, Any]], game: int) -> dict[str, Array]:
-        """Return the parts of the last observations of a team whose episode ended, as in :meth:`_checked_parts`."""
+    def _terminal_parts(self, infos: list[dict[str, Any]], games: list[int]) -> dict[str, Array]:
+        """Return the parts of the last observations of ended games, as in :meth:`_checked_parts`, and their teams."""
         observations: list[Any] = [info.get(TERMINAL_OBSERVATION) for info in infos]
-        missing = [agent for agent, observation in enumerate(observations) if observation is None]
+        missing = [divmod(index, self.n_agents) for index, seen in enumerate(observations) if seen is None]
         if missing:
+            first = missing[0][0]
             raise ValueError(
-                f"expected infos[row]['{TERMINAL_OBSERVATION}'] for all {self.n_agents} agents of game {game}, whose "
-                f"episode ended at step {self._n_steps}, got none for agents {missing}; every row of a done team must "
-                "carry its last observation, as SB3's VecEnvs do"
+                f"expected infos[row]['{TERMINAL_OBSERVATION}'] for all {self.n_agents} agents of game {games[first]}, "
+                f"whose episode ended at step {self._n_steps}, got none for agents "
+                f"{[agent for game, agent in missing if game == first]}; every row of a done team must carry its last "
+                "observation, as SB3's VecEnvs do"
             )
-        if not self._raw.is_dict:
-            return self._checked_parts(_stacked(observations, game), "terminal observations", game)
-        entries = [self._raw.entries(observation, "terminal observations") for observation in observations]
-        stacked = {key: _stacked([entry[key] for entry in entries], game) for key in entries[0]}
-        return self._checked_parts(stacked, "terminal observations", game)
+        space: Any = self.venv.observation_space
+        stacked: Any
+        if self._raw.is_dict:
+            entries = [self._raw.entries(observation, "terminal observations") for observation in observations]
+            stacked = {key: self._stacked([entry[key] for entry in entries], games, space[key]) for key in entries[0]}
+        else:
+            stacked = self._stacked(observations, games, space)
+        parts = self._checked_parts(stacked, "terminal observations", games)
+        return {**parts, TEAM_KEY: parts[OBS_KEY].reshape(len(games), *self.team_spaces.team.shape)}
 
-    def _terminal_info(self, info: dict[str, Any], last: dict[str, Array], agent: int) -> dict[str, Any]:
-        row = {key: part[agent] for key, part in last.items() if key != ACTIVE_KEY}
-        row |= {TEAM_KEY: last[OBS_KEY], AGENT_KEY: np.int64(agent)}
-        if ACTIVE_KEY in last:
-            row[ACTIVE_KEY] = last[ACTIVE_KEY][0]
-        info = {**info, TERMINAL_OBSERVATION: row}
+    def _stacked(self, observations: list[Any], games: list[int], space: spaces.Space[Any]) -> Array:
+        try:
+            return np.array(observations)
+        except ValueError:
+            shapes = [np.shape(observation) for observation in observations]
+            odd = next((index for index, shape in enumerate(shapes) if shape != space.shape), 0)
+            raise ValueError(
+                f"expected terminal observations of one shape for the agents of game {games[odd // self.n_agents]}, "
+                f"got {sorted(set(shapes))}; make the environment return what its space promises"
+            ) from None
+
+    def _terminal_info(self, info: dict[str, Any], last: dict[str, Array], index: int) -> dict[str, Any]:
+        game, agent = divmod(index, self.n_agents)
+        row = {key: part[game if key in (TEAM_KEY, ACTIVE_KEY) else index] for key, part in last.items()}
+        info = {**info, TERMINAL_OBSERVATION: {**row, AGENT_KEY: np.int64(agent)}}
         if self.time_limit == "terminal" and TRUNCATED in info:
             info[TRUNCATED] = False
         return info
-
-
-def _stacked(observations: list[Any], game: int) -> Array:
-    shapes = {np.shape(observation) for observation in observations}
-    if len(shapes) > 1:
-        raise ValueError(
-            f"expected terminal observations of one shape for the agents of game {game}, got {sorted(shapes)}; "
-            "make the environment return what its space promises"
-        )
-    return np.stack(observations)
 
 
 class DictRows(TeamVecEnvWrapper):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -20,7 +20,7 @@ from sb3_saf.envs.teams import (
     check_masks,
 )
 
-_ROW_KEYS = {OBS_KEY, *OPTIONAL_KEYS}
+_ROW_KEYS: Final = (OBS_KEY, *OPTIONAL_KEYS)
 
 
 class RowSpaces(NamedTuple):
@@ -63,7 +63,7 @@ class RowSpaces(NamedTuple):
                 "expected a VecEnv of own observations, got one that already has the Dict observation of "
                 "CentralizedValueWrapper; wrap it once (sb3_saf.make_team_env has done so)"
             )
-        if OBS_KEY not in keys or not keys <= _ROW_KEYS:
+        if OBS_KEY not in keys or not keys <= set(_ROW_KEYS):
             return cls(space)  # an own observation of an unknown form, which TeamSpaces refuses
         active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
         if active is not None and active != spaces.Discrete(2):
@@ -95,16 +95,16 @@ class RowSpaces(NamedTuple):
         """
         if not self.is_dict:
             return {OBS_KEY: obs}
-        told = {
-            ACTIVE_KEY: self.active,
-            ACTION_MASK_KEY: self.n_masked_actions is not None,
-            STATE_KEY: self.state is not None,
-        }
-        keys = [OBS_KEY, *(key for key, is_told in told.items() if is_told)]
-        if not isinstance(obs, Mapping) or not set(keys) <= set(obs):
+        keys = self._keys
+        if not isinstance(obs, Mapping) or any(key not in obs for key in keys):
             got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__
             raise ValueError(f"expected {what} to be a dict with the keys {keys}, got {got}")
         return {key: obs[key] for key in keys}
+
+    @property
+    def _keys(self) -> list[str]:
+        told = (True, self.active, self.n_masked_actions is not None, self.state is not None)
+        return [key for key, is_told in zip(_ROW_KEYS, told, strict=True) if is_told]
 
 
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:

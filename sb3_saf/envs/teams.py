@@ -354,7 +354,7 @@ def game_seeds_of(venv: VecEnv) -> tuple[int | None, ...] | None:
     return getattr(innermost, "seeded_with", None)
 
 
-def check_finite(name: str, values: Array, n_agents: int, step: int, first_game: int = 0) -> None:
+def check_finite(name: str, values: Array, n_agents: int, step: int, games: Sequence[int] | None = None) -> None:
     """
     Raise NonFiniteError for NaN and infinity; integers are not read.
 
@@ -362,16 +362,18 @@ def check_finite(name: str, values: Array, n_agents: int, step: int, first_game:
     :param values: (B, ...) one entry per row
     :param n_agents: N
     :param step: steps since the environment was made, for the message
-    :param first_game: game of the first row, for the message
+    :param games: games of the rows, for the message; None for all
     :raises NonFiniteError: naming step, game and agent of the first bad row
     """
     if values.dtype.kind not in "fc" or np.isfinite(values).all():
         return
     bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
     row = int(np.flatnonzero(bad)[0])
+    game, agent = divmod(row, n_agents)
+    game = game if games is None else games[game]
     raise NonFiniteError(
-        f"{name} must be finite, got {_short(values[row])} at step {step} for agent {row % n_agents} of game "
-        f"{first_game + row // n_agents}{_others(int(bad.sum()) - 1)}; repair the environment, learning from it would "
+        f"{name} must be finite, got {_short(values[row])} at step {step} for agent {agent} of game {game}"
+        f"{_others(int(bad.sum()) - 1)}; repair the environment, learning from it would "
         "ruin the model"
     )
 

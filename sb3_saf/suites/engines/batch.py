@@ -157,22 +157,26 @@ class BatchVecEnv(TeamVecEnv):
         actions = self._actions.reshape(self.n_games, self.n_agents, *self._actions.shape[1:])
         self._actions = None
         step = self.batch.step(actions)
-        infos: list[dict[str, Any]] = [{}] * self.num_envs
-        for game in np.flatnonzero(step.ended).tolist():
-            self._end(infos, step, game)
         rewards = np.array(step.rewards, dtype=np.float32).reshape(self.num_envs)
-        return step.rows, rewards, np.repeat(step.ended, self.n_agents), infos
+        dones = step.ended.repeat(self.n_agents)
+        return step.rows, rewards, dones, self._infos(step, dones)
 
-    def _end(self, infos: list[dict[str, Any]], step: BatchStep, game: int) -> None:
-        """Fill in the infos of a game whose episode ended."""
-        first = game * self.n_agents
-        truncated = bool(step.truncated[game])
-        parts = zip(*(part[first : first + self.n_agents] for part in step.last.values()), strict=True)
-        for row, last in enumerate(parts, first):
-            infos[row] = {TRUNCATED: truncated, TERMINAL_OBSERVATION: dict(zip(step.last, last, strict=True))}
+    def _infos(self, step: BatchStep, dones: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:
+        infos: list[dict[str, Any]] = [{}] * self.num_envs
+        if not dones.any():
+            return infos
+        last = zip(*(part[dones] for part in step.last.values()), strict=True)
+        for row in dones.nonzero()[0].tolist():
+            game, agent = divmod(row, self.n_agents)
+            info = {
+                TRUNCATED: bool(step.truncated[game]),
+                TERMINAL_OBSERVATION: dict(zip(step.last, next(last), strict=True)),
+            }
+            if step.won is not None and agent == 0:
+                info[IS_SUCCESS] = bool(step.won[game])
+            infos[row] = info
             self.reset_infos[row] = {}
-        if step.won is not None:
-            infos[first][IS_SUCCESS] = bool(step.won[game])
+        return infos
 
     def close(self) -> None:
         """Do nothing: engines hold memory only."""

@@ -60,20 +60,33 @@ class Game(NamedTuple):
     active: Any
 
 
-class Ends(NamedTuple):
+class Packing:
     """
-    Rewards and ends of a step, of one game or all.
+    Joins the arrays of a game to one buffer for each item size: XLA takes time for every array at every call.
 
-    :param rewards: (N,)
-    :param ended: whether the episode is over
-    :param truncated: whether only a time limit ended it
-    :param won: whether it was won, None if not reported
+    :param form: shapes and dtypes of a game
     """
 
-    rewards: Any
-    ended: Any
-    truncated: Any
-    won: Any
+    def __init__(self, form: Game) -> None:
+        self._forms, self._tree = jax.tree.flatten(form)
+        self._sizes = sorted({leaf.dtype.itemsize for leaf in self._forms})
+
+    def pack(self, game: Game) -> list[Any]:
+        """Return buffers of unsigned integers, (K,) each."""
+        parts: dict[int, list[Any]] = {size: [] for size in self._sizes}
+        for leaf, form in zip(jax.tree.leaves(game), self._forms, strict=True):
+            parts[form.dtype.itemsize].append(jnp.asarray(leaf, form.dtype).ravel().view(f"u{form.dtype.itemsize}"))
+        return [jnp.concatenate(part) for part in parts.values()]
+
+    def unpack(self, buffers: Sequence[Any]) -> Game:
+        """Return the game, or all games, in buffers (..., K) of NumPy or JAX."""
+        left, leaves = dict(zip(self._sizes, buffers, strict=True)), []
+        for form in self._forms:
+            size, buffer = form.size, left[form.dtype.itemsize]
+            leaves.append(buffer[..., :size].view(form.dtype).reshape(*buffer.shape[:-1], *form.shape))
+            left[form.dtype.itemsize] = buffer[..., size:]
+        game: Game = jax.tree.unflatten(self._tree, leaves)
+        return game
 
 
 class JaxPrograms:
@@ -104,6 +117,8 @@ class JaxPrograms:
             state=self._world_space(observations),
             is_dict=True,
         )
+        active = jax.ShapeDtypeStruct((len(self.agents),), np.bool_)
+        self.packing = Packing(Game(jax.eval_shape(lambda: key), self._state_form, active))
         self.begin = jax.jit(jax.vmap(self._begin))
         self.step = jax.jit(self._step_all)
 
@@ -174,34 +189,36 @@ class JaxPrograms:
 
     # ---- all games
 
-    def _step_all(
-        self, games: Game, actions: Any, extra_weight: Any
-    ) -> tuple[Game, dict[str, Any], dict[str, Any], Ends]:
+    def _step_all(self, games: list[Any], actions: Any, extra_weight: Any) -> Any:
         """
         Step, and begin new episodes of ended games, if there are any.
 
-        :param games: E games
+        :param games: E packed games
         :param actions: (E, N, ...)
         :param extra_weight: see :class:`JaxGames`
-        :return: games; (E, N, ...) their rows, and those before new episodes began; ends of episodes
+        :return: games; (E, N, ...) their rows, and those before new episodes began; (E, R) see :meth:`_step`
         """
-        games, last, ends = jax.vmap(self._step, in_axes=(0, 0, None))(games, actions, extra_weight)
+        games, last, results = jax.vmap(self._step, in_axes=(0, 0, None))(games, actions, extra_weight)
+        ended = results[:, len(self.agents)] != 0
 
-        def begin_where_ended(games: Game, last: dict[str, Any]) -> Any:
-            return jax.vmap(_choose)(jax.vmap(self._begin)(games.key), games, last, ends.ended)
+        def begin_where_ended(games: list[Any], last: dict[str, Any]) -> Any:
+            fresh = jax.vmap(self._begin)(self.packing.unpack(games).key)
+            return jax.vmap(_choose)(fresh, (games, last), ended)
 
-        games, rows = jax.lax.cond(ends.ended.any(), begin_where_ended, lambda games, last: (games, last), games, last)
-        return games, rows, last, ends
+        games, rows = jax.lax.cond(ended.any(), begin_where_ended, lambda *same: same, games, last)
+        return games, rows, last, results
 
     # ---- one game
 
-    def _begin(self, key: Any) -> tuple[Game, dict[str, Any]]:
+    def _begin(self, key: Any) -> tuple[list[Any], dict[str, Any]]:
         key, now = jax.random.split(key)
         observations, state = self.env.reset(now)
         active = jnp.ones(len(self.agents), dtype=bool)
-        return Game(key, state, active), self._rows(observations, state, active, active)
+        return self.packing.pack(Game(key, state, active)), self._rows(observations, state, active, active)
 
-    def _step(self, game: Game, actions: Any, extra_weight: Any) -> tuple[Game, dict[str, Any], Ends]:
+    def _step(self, buffers: list[Any], actions: Any, extra_weight: Any) -> tuple[list[Any], dict[str, Any], Any]:
+        """Return the game, its rows, and in one vector rewards (N,), ended, truncated and, if reported, won."""
+        game = self.packing.unpack(buffers)
         key, now = jax.random.split(game.key)
         observations, state, rewards, dones, infos = self.env.step_env(now, game.state, self._chosen(game, actions))
         ended = dones[_ALL]
@@ -214,9 +231,10 @@ class JaxPrograms:
         if self.rules.extra_reward is not None:
             extra = self.rules.extra_reward(infos)
             team = team + extra_weight * jnp.stack([extra[agent] for agent in self.agents])
-        won = None if self.rules.is_won is None else self.rules.is_won(self.env, state)
+        won = [] if self.rules.is_won is None else [self.rules.is_won(self.env, state)]
+        results = jnp.concatenate([team, jnp.stack([ended, truncated, *won])], dtype=np.float32)
         rows = self._rows(observations, state, active, active | (ended & game.active))
-        return Game(key, state, active), rows, Ends(team.astype(jnp.float32), ended, truncated, won)
+        return self.packing.pack(Game(key, state, active)), rows, results
 
     def _chosen(self, game: Game, actions: Any) -> dict[str, Any]:
         """Return the agents' actions, limited to their own spaces; a padded action becomes the first legal one."""
@@ -272,9 +290,9 @@ class JaxPrograms:
         return jnp.ravel(world).astype(jnp.float32)
 
 
-def _choose(fresh: tuple[Game, dict[str, Any]], game: Game, rows: dict[str, Any], ended: Any) -> Any:
+def _choose(fresh: Any, old: Any, ended: Any) -> Any:
     """Select the new episode for ended games."""
-    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, (game, rows))
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, old)
 
 
 def _size(form: Any) -> int:
@@ -304,28 +322,31 @@ class JaxGames(ResumableBatch):
         self._extra_weight = extra_weight
         self._extra_steps = extra_steps
         self._n_steps = 0
-        #: All games; None before the first reset.
-        self.games: Game | None = None
+        #: All games, packed; None before the first reset.
+        self._buffers: list[Any] | None = None
+
+    @property
+    def games(self) -> Game:
+        """All games, on the host."""
+        assert self._buffers is not None, "the games have begun"
+        return self._programs.packing.unpack([np.asarray(buffer) for buffer in self._buffers])
 
     def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
         """Begin an episode in every game (see the base class)."""
-        if seeds is None:
-            assert self.games is not None, "the first reset has seeds"
-            keys = self.games.key
-        else:
-            keys = np.array([divmod(seed, 2**32) for seed in seeds], dtype=np.uint32)
-        self.games, rows = self._programs.begin(keys)
+        keys = self.games.key if seeds is None else np.array([divmod(s, 2**32) for s in seeds], dtype=np.uint32)
+        self._buffers, rows = self._programs.begin(keys)
         return self._on_host(rows)
 
     def step(self, actions: Array) -> BatchStep:
         """Step every game (see the base class)."""
         narrow = actions.astype(np.int32) if actions.dtype.kind == "i" else actions
-        self.games, rows, last, ends = self._programs.step(self.games, narrow, self._weight())
+        self._buffers, rows, last, results = self._programs.step(self._buffers, narrow, self._weight())
         self._n_steps += self.n_games
-        rewards, ended, truncated = (np.asarray(part) for part in ends[:3])
-        won = None if ends.won is None else np.asarray(ends.won)
+        rewards = np.asarray(results)
+        ended, truncated, *won = (rewards[:, len(self.agents) :] != 0).T
         shown = self._on_host(rows)
-        return BatchStep(shown, rewards, ended, truncated, self._on_host(last) if ended.any() else shown, won)
+        last_shown = self._on_host(last) if ended.any() else shown
+        return BatchStep(shown, rewards[:, : len(self.agents)], ended, truncated, last_shown, *won)
 
     def _weight(self) -> np.float32:
         left = 1.0 if self._extra_steps is None else max(0.0, 1.0 - self._n_steps / self._extra_steps)
@@ -340,8 +361,7 @@ class JaxGames(ResumableBatch):
         """Return JaxMARL's picture of a game (see the base class)."""
         if self._programs.rules.draw is None:
             raise ValueError(f"JaxMARL draws no pictures of {type(self.env).__name__}; leave render_mode out")
-        assert self.games is not None, "the games have begun"
-        state = jax.tree.map(lambda leaf: np.asarray(leaf[game]), self.games.state)
+        state = jax.tree.map(lambda leaf: leaf[game], self.games.state)
         return self._programs.rules.draw(self.env, state)
 
     def snapshot(self) -> dict[str, Array]:
@@ -352,9 +372,9 @@ class JaxGames(ResumableBatch):
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Restore a snapshot (see the base class)."""
-        if self.games is None:
+        if self._buffers is None:
             self.reset([0] * self.n_games)
-        own = jax.tree_util.tree_leaves_with_path(self.games)
-        leaves = [jnp.array(state[jax.tree_util.keystr(path)]) for path, _ in own]
-        self.games = jax.tree.unflatten(jax.tree.structure(self.games), leaves)
+        own, tree = jax.tree_util.tree_flatten_with_path(self.games)
+        games = jax.tree.unflatten(tree, [jnp.array(state[jax.tree_util.keystr(path)]) for path, _ in own])
+        self._buffers = jax.vmap(self._programs.packing.pack)(games)
         self._n_steps = int(state["n_steps"])

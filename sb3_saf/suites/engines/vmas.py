@@ -47,8 +47,8 @@ class VmasGames(Batch):
         self._random: list[Any] = list(Environment.vmas_random_state)
         agents = [agent.name for agent in env.agents]
         self._action_spaces = [env.get_agent_action_space(agent) for agent in env.agents]
-        self._widths = [sum(_flat(part).shape[1] for part in _parts(one)) for one in _observe(env)]
-        own = spaces.Box(-np.inf, np.inf, (max(self._widths),), np.float32)
+        self._width = max(sum(_flat(part).shape[1] for part in _parts(one)) for one in _observe(env))
+        own = spaces.Box(-np.inf, np.inf, (self._width,), np.float32)
         action_space, self._masks = _row_actions(self._action_spaces)
         n_masked = None if self._masks is None else self._masks.shape[1]
         super().__init__(env.num_envs, agents, RowSpaces(own, True, n_masked, is_dict=True), action_space, env)
@@ -92,23 +92,20 @@ class VmasGames(Batch):
     def _chosen(self, actions: Array) -> list[th.Tensor]:
         """Return the agents' actions, limited to their own spaces; actions that an agent lacks become its first."""
         chosen = []
-        for index, space in enumerate(self._action_spaces):
-            own = th.from_numpy(np.ascontiguousarray(actions[:, index]))
+        by_agent = th.from_numpy(actions).to(self.env.device).unbind(1)
+        for own, space in zip(by_agent, self._action_spaces, strict=True):
             if self._masks is not None:
                 own = th.where(own < space.n, own, 0)
             chosen.append(own[:, : space.shape[0]] if space.shape else own.unsqueeze(1))
-        return [one.to(self.env.device) for one in chosen]
+        return chosen
 
     def _rows(self, observations: Sequence[Any], active: npt.NDArray[np.bool_]) -> dict[str, Array]:
         """Return rows (B, ...); in each game either all agents are active or none."""
-        width = max(self._widths)
-        padded = [
-            th.nn.functional.pad(th.cat([_flat(part) for part in _parts(one)], dim=1), (0, width - own))
-            for one, own in zip(observations, self._widths, strict=True)
-        ]
-        n_rows = self.n_games * len(self.agents)
-        own = th.stack(padded, dim=1).reshape(n_rows, width).float().numpy(force=True)
-        rows = {OBS_KEY: own, ACTIVE_KEY: np.repeat(active, len(self.agents))}
+        own = np.zeros((self.n_games, len(self.agents), self._width), dtype=np.float32)
+        for index, one in enumerate(observations):
+            parts = [_flat(part).numpy(force=True) for part in _parts(one)]
+            np.concatenate(parts, axis=1, out=own[:, index, : sum(part.shape[1] for part in parts)])
+        rows = {OBS_KEY: own.reshape(-1, self._width), ACTIVE_KEY: active.repeat(len(self.agents))}
         if self._masks is not None:
             rows[ACTION_MASK_KEY] = np.tile(self._masks, (self.n_games, 1))
         return rows
