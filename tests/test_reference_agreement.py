@@ -75,7 +75,7 @@ def crowded(state: StateMapping, rng: np.random.Generator) -> StateMapping:
 @pytest.mark.parametrize("task", TASK_NAMES)
 # Thirty examples do not detect that released support is counted from the previous cell; a hundred do.
 @settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
-@given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(5, 15))
+@given(params=configurations(), seed=st.integers(0, 2**32), n_steps=st.integers(5, 25))
 def test_kernels_agree_with_the_reference(task: str, params: dict[str, Any], seed: int, n_steps: int) -> None:
     batch = GameBatch(task, HECOGridParams(**params))
     batch.reset(seeds=[seed])

@@ -472,6 +472,7 @@ def test_what_ends_it_saves_and_says_how_to_go_on(
 #: All algorithms in one process, whose children have its imports and compiled code.
 KILLS = """
 import json
+import torch.utils.tensorboard
 from tests.kill_harness import ALGOS, Games, Moment, kill_in_a_row, make_run
 
 moments = [Moment("rollout", 40), Moment("update", 6), Moment("writing", 5)]
