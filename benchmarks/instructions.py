@@ -115,14 +115,14 @@ def _draw_levels(batch: GameBatch) -> None:
 
 def _play() -> None:
     """Run each work under its name within Valgrind; kernels are compiled and loaded beforehand."""
-    request = _requests()
-    for name, work in _works():
-        request(_START_INSTRUMENTATION)
+    request, works = _requests(), list(_works())
+    request(_START_INSTRUMENTATION)  # once: Valgrind then translates all code anew
+    for name, work in works:
         request(_ZERO_STATS)
         for _ in range(STEPS):
             work()
         request(_DUMP_STATS_AT, name)
-        request(_STOP_INSTRUMENTATION)
+    request(_STOP_INSTRUMENTATION)
 
 
 def _requests() -> Callable[..., None]:

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import multiprocessing as mp
 import os
 import random
@@ -276,7 +275,7 @@ def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: in
 
 
 def main() -> None:
-    """Run the harness, or a single run."""
+    """Run the harness."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
     parser.add_argument("--algo", choices=ALGOS, default="saf")
     parser.add_argument("--game", choices=GAMES, default="hecogrid")
@@ -284,20 +283,10 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--rollouts", type=int, default=40, help="length of the run")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--at", nargs="+", default=[], metavar="KIND:NUMBER", help="kill one run at these, in a row")
-    parser.add_argument("--train", type=Path, metavar="FOLDER", help="only train, in this process")
     options = parser.parse_args()
     games = Games(options.game, options.cpus)
-    if options.train is not None:
-        train(options.algo, games, options.train, options.rollouts, Watch())
-        return
     if games.start_method == "fork":
         make_run(options.algo, None, games).warm_up()  # they inherit compiled code
-    if options.at:
-        moments = [Moment(kind, int(number)) for kind, number in (text.split(":") for text in options.at)]
-        doing, is_equal = kill_in_a_row(options.algo, games, options.rollouts, moments)
-        print(json.dumps({"killed": doing, "equal": is_equal}))
-        return
     done, equal = kill_one_by_one(options.algo, games, options.rollouts, options.kills, options.seed)
     for kind in (*KINDS, CLOCK):
         print(f"{options.algo}, {kind}: {equal[kind]} of {done[kind]} end bit-equal")

@@ -29,10 +29,9 @@ def start(package: Path) -> tuple[str, bool]:
 
 
 def test_kernels_are_compiled_once_and_anew_after_a_change(tmp_path: Path) -> None:
-    package = tmp_path / "hecogrid_envs"
-    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    assert start(package) == ("0", True)
-    assert start(package)[0] == "1"
+    package = shutil.copytree(PACKAGE, tmp_path / "hecogrid_envs")
+    start(package)  # loads what other tests have compiled; where there is none, compiles
     with (package / "tasks" / "team_support.py").open("a") as file:
         file.write("# Another condition.\n")
-    assert start(package)[0] == "0"
+    assert start(package) == ("0", True)
+    assert start(package)[0] == "1"

@@ -27,6 +27,7 @@ from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
 from sb3_saf.training.seeds import evaluation_seed
+from sb3_saf.training.train import main as train_main
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 
 SMOKE = RunConfig("smoke")
@@ -104,7 +105,7 @@ def test_the_command_trains_the_same_model(undisturbed: Path, tmp_path: Path) ->
     command = (cell_of(undisturbed) / "command.txt").read_text().split()
     assert command[:3] == ["python", "-m", "sb3_saf.train"]
     extra = ["-f", str(tmp_path), "--num-threads", "1", "--no-progress"]
-    subprocess.run([sys.executable, *command[1:], *extra], check=True, capture_output=True)
+    train_main([*command[3:], *extra])
     (trained,) = tmp_path.glob("mappo/*/TeamSupport-v0.zip")
     assert_same_weights(trained, cell_of(undisturbed) / "model.zip")
 
@@ -125,9 +126,9 @@ def test_finished_cells_are_never_run_again(undisturbed: Path) -> None:
 def test_cells_depend_on_nothing_but_themselves(undisturbed: Path, tmp_path: Path) -> None:
     """In reverse order, in two parts, after other cells: the same numbers."""
     for number in (2, 1):
-        run_inline(tmp_path, replace(TWO, seeds=(1, 0), methods=("mappo", "ippo")), shard=Shard(number, 2))
+        run_inline(tmp_path, Selection((1, 0), ("mappo", "ippo"), (), ("3",)), shard=Shard(number, 2))
     ours, theirs = (read_table(folder / "joint" / "table.csv") for folder in (tmp_path, undisturbed))
-    assert sorted(map(str, ours)) == sorted(map(str, theirs))
+    assert sorted(map(str, ours)) == sorted(str(row) for row in theirs if row["coordination"] == "3")
 
 
 def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path: Path) -> None:
@@ -186,11 +187,9 @@ def job_in(folder: Path, method: str = "ippo", tests: int = 1, **options: Any) -
 
 def test_tensorboard_of_a_cell_has_the_inside_of_its_policy(tmp_path: Path) -> None:
     short = replace(SMOKE, overrides={"game_steps": 40})
-    for name, tensorboard in (("with", True), ("without", False)):
-        run_job(job_in(tmp_path / name, config=short, tensorboard=tensorboard))
-    (file,) = (tmp_path / "with" / "result").rglob("events.*")
+    run_job(job_in(tmp_path / "cell", config=short, tensorboard=True))
+    (file,) = (tmp_path / "cell" / "result").rglob("events.*")
     assert "critic/explained_variance" in EventAccumulator(str(file)).Reload().Tags()["scalars"]
-    assert_same_weights(*(tmp_path / name / "result" / "model.zip" for name in ("with", "without")))
 
 
 def work_badly(folder: Path) -> None:
@@ -295,21 +294,34 @@ def test_runs_at_once_divide_the_cells(undisturbed: Path, tmp_path: Path, capsys
 DAMAGED = ["", "[]", "{}", '{"state": 1}', "[" * 100_000, "\x00", "not JSON"]
 
 
+@pytest.mark.parametrize("content", DAMAGED)
 @pytest.mark.parametrize("name", ["status.json", "config.json", "tests/c2-h2.json"])
+def test_damaged_files_are_read_as_missing(name: str, content: str, undisturbed: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(undisturbed, tmp_path / "copy")
+    level = Level.of(coordination=2, heterogeneity=2)
+    cell, path = Cell("mappo", "TeamSupport-v0", level, 1, (level,)), cell_of(folder) / name
+    assert not Results(folder).missing_tests(cell)
+    path.write_text(content)
+    results = Results(folder)
+    assert results.missing_tests(cell) == (level,) and list(results.damaged) == [path]
+
+
 def test_damaged_files_are_named_and_their_cells_run_again(
-    name: str, undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = shutil.copytree(undisturbed, tmp_path / "copy")
-    for content, seed, method in zip(DAMAGED, [0, 1, 0, 1], ["ippo", "ippo", "mappo", "mappo"], strict=False):
-        (cell_of(folder, method, seed) / name).write_text(content)
+    names = ("status.json", "config.json", "tests/c2-h2.json")
+    damaged = [cell_of(folder, "ippo", 0) / names[0], cell_of(folder, "ippo", 1) / names[1], cell_of(folder) / names[2]]
+    for path in damaged:
+        path.write_text("not JSON")
     capsys.readouterr()
     summary, engine = run_inline(folder)
-    assert summary == Summary(4, [], [])
+    assert summary == Summary(3, [], [])
     printed = capsys.readouterr().out
-    assert all(str(cell_of(folder, method, seed) / name) in printed for method in ("ippo", "mappo") for seed in (0, 1))
-    assert engine.with_model == [name.startswith("tests")] * 4
+    assert all(str(path) in printed for path in damaged)
+    assert sorted(engine.with_model) == [False, False, True]
     assert read_table(folder / "joint" / "table.csv") == read_table(undisturbed / "joint" / "table.csv")
-    assert_same_weights(cell_of(folder) / "model.zip", cell_of(undisturbed) / "model.zip")
+    assert_same_weights(cell_of(folder, "ippo", 0) / "model.zip", cell_of(undisturbed, "ippo", 0) / "model.zip")
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[" * 100_000])
@@ -381,7 +393,8 @@ def attempt(folder: Path, step: int | None = None) -> int:
 
 @pytest.mark.parametrize("method", ["saf", "qplex"])
 def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(method: str, tmp_path: Path) -> None:
-    whole, killed = (job_in(tmp_path / name, method, tests=2) for name in ("whole", "killed"))
+    short = replace(SMOKE, overrides={"game_steps": 200})
+    whole, killed = (job_in(tmp_path / name, method, tests=2, config=short) for name in ("whole", "killed"))
     n_steps = attempt(whole)
     n_tested = 2 * 10  # two tests, episodes of 10 steps
     first = attempt(killed, (n_steps - n_tested) * 2 // 3)

@@ -194,14 +194,15 @@ def test_a_saved_loaded_and_exported_model_predicts_the_same(tmp_path: Path) -> 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[TeamActorCriticPolicy, Path]]:
     """Create exports with ONNX, one for each kind of graph."""
-    cases: dict[str, tuple[str, spaces.Space[Any], str, dict[str, Any]]] = {
-        "mixture": ("codes", CodeSpace(), "discrete", {}),
-        "mixture of pairs": ("picture", PICTURE, "multi-discrete", {"features_extractor_class": LightEncoder}),
-        "gumbel": ("vector", VECTOR, "box", {}),
-        "per agent": ("multi-discrete", OWN["multi-discrete"], "multi-binary", {}),
+    pairs = {"features_extractor_class": LightEncoder, "actor_identity": True}
+    cases: dict[str, tuple[spaces.Space[Any], str, dict[str, Any]]] = {
+        "mixture": (CodeSpace(), "discrete", {}),
+        "mixture of pairs": (PICTURE, "multi-discrete", pairs),
+        "gumbel": (VECTOR, "box", {}),
+        "per agent": (OWN["multi-discrete"], "multi-binary", {}),
     }
     made = {}
-    for name, (_, own, action, kwargs) in cases.items():
+    for name, (own, action, kwargs) in cases.items():
         policy_class, sizes = ACTORS[name.partition(" of ")[0]]
         policy = make_policy(policy_class, own, ACTIONS[action], noise=0.6, **sizes, **kwargs)
         made[name] = policy, export_actors(policy, tmp_path_factory.mktemp("onnx") / "actor")
@@ -257,7 +258,7 @@ class OwnEncoder(BaseFeaturesExtractor):
 
 def test_encoders_of_ones_own_are_exported_as_onnx_alone(tmp_path: Path) -> None:
     policy = make_policy(
-        SAFPolicy, noise=0.6, features_extractor_class=OwnEncoder, features_extractor_kwargs={"features_dim": 6}
+        MAPPOPolicy, noise=0.6, features_extractor_class=OwnEncoder, features_extractor_kwargs={"features_dim": 6}
     )
     with pytest.raises(ExportError, match="OwnEncoder with Tanh can be exported as ONNX only"):
         exported(policy, tmp_path / "actor")
@@ -306,30 +307,36 @@ def test_weights_saved_by_an_earlier_version_are_read() -> None:
 @pytest.mark.parametrize("policy_class", [MAPPOPolicy, SAFPolicy])
 def test_an_actor_that_reads_who_acts_is_told(policy_class: type[TeamActorCriticPolicy], tmp_path: Path) -> None:
     policy = make_policy(policy_class, noise=0.6, actor_identity=True)
-    folder, obs = export_actors(policy, tmp_path / "actor"), samples(VECTOR, 20)
+    folder, obs = exported(policy, tmp_path / "actor"), samples(VECTOR, 20)
     with pytest.raises(ValueError, match="say which one acts"):
         Actor.load(folder)
     probabilities = []
     for agent in range(3):
-        actors = Actor.load(folder, agent=agent), Actor.load(folder, agent=agent, runtime="onnx")
+        actor = Actor.load(folder, agent=agent)
         rows = {"obs": th.as_tensor(obs), "agent": th.full((20,), agent)}
         with th.no_grad():
             expected = cast(Any, policy.get_distribution(rows)).distribution.probs
-        for actor in actors:
-            np.testing.assert_allclose(actor.probabilities(obs), expected, atol=1e-5)
-            np.testing.assert_array_equal(actor.act(obs), predicted(policy, obs, agent))
+        np.testing.assert_allclose(actor.probabilities(obs), expected, atol=1e-5)
+        np.testing.assert_array_equal(actor.act(obs), predicted(policy, obs, agent))
         probabilities.append(expected.numpy())
     assert np.abs(probabilities[0] - probabilities[2]).max() > 0.01
 
 
 @pytest.mark.parametrize("encoder", [None, LightEncoder, MLPEncoder])
-def test_an_actor_of_tile_codes_takes_pixels(encoder: type[BaseFeaturesExtractor] | None, tmp_path: Path) -> None:
+def test_an_actor_of_tile_codes_takes_pixels(
+    encoder: type[BaseFeaturesExtractor] | None,
+    folders: dict[str, tuple[TeamActorCriticPolicy, Path]],
+    tmp_path: Path,
+) -> None:
     space = CodeSpace()
-    kwargs: dict[str, Any] = {} if encoder is None else {"features_extractor_class": encoder}
-    folder = export_actors(make_policy(SAFPolicy, space, noise=0.6, **kwargs), tmp_path / "actor", onnx=encoder is None)
+    if encoder is None:
+        folder, runtimes = folders["mixture"][1], ["torch", "onnx"]
+    else:
+        policy = make_policy(SAFPolicy, space, noise=0.6, features_extractor_class=encoder)
+        folder, runtimes = exported(policy, tmp_path / "actor"), ["torch"]
     codes = samples(space, 10)
     pictures = space.atlas[codes].swapaxes(2, 3).reshape(10, 12, 12, 3)
-    for runtime in ("torch", "onnx") if encoder is None else ("torch",):
+    for runtime in runtimes:
         actor = Actor.load(folder, runtime=cast(Any, runtime))
         np.testing.assert_array_equal(actor.act(pictures), actor.act(codes))
         np.testing.assert_array_equal(actor.act(np.moveaxis(pictures, -1, 1)), actor.act(codes))
@@ -363,18 +370,11 @@ class LoneAgent:
         return answer
 
 
-@pytest.mark.parametrize(
-    ("policy", "observation", "runtimes", "kwargs"),
-    [
-        ("SAFPolicy", "tiles", ["torch", "onnx"], {}),
-        ("MAPPOPolicy", "rgb", ["onnx", "onnx"], {"heads": "per_agent"}),
-    ],
-)
-def test_agents_in_processes_of_their_own_play_an_episode_as_the_model_would(
-    policy: str, observation: str, runtimes: list[str], kwargs: dict[str, Any], tmp_path: Path
-) -> None:
-    level: dict[str, Any] = {"n_agents": len(runtimes), "grid_size": 9, "n_treasures": 6, "observation": observation}
-    model = PPO(policy, make_team_env("TeamSupport", n_envs=1, **level), policy_kwargs=kwargs, seed=0, device="cpu")
+def test_agents_in_processes_of_their_own_play_an_episode_as_the_model_would(tmp_path: Path) -> None:
+    runtimes = ["torch", "onnx"]
+    level: dict[str, Any] = {"n_agents": len(runtimes), "grid_size": 9, "n_treasures": 6}
+    games, heads = make_team_env("TeamSupport", n_envs=1, **level), {"heads": "per_agent"}
+    model = PPO("MAPPOPolicy", games, policy_kwargs=heads, seed=0, device="cpu")
     with th.no_grad():
         for parameter in model.policy.actor.parameters():  # type: ignore[union-attr]
             parameter.add_(0.2 * th.randn_like(parameter))

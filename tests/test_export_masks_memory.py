@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import PPO
 
 from sb3_saf import Actor, ExportError, MAPPOPolicy, SAFPolicy, export_actors, make_team_env
 from sb3_saf.envs.teams import TeamSpaces
@@ -256,24 +255,15 @@ def test_onnx_with_masks(tmp_path: Path) -> None:
 # --- processes with only their own observation ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "policy", "runtime"),
-    [
-        (PPO, "SAFPolicy", "torch"),
-        (RecurrentPPO, "SAFLstmPolicy", "onnx"),  # with masks and memory
-    ],
-)
-def test_agents_in_processes_of_their_own_play_as_the_model_would(
-    algorithm: Any, policy: str, runtime: str, tmp_path: Path
-) -> None:
+def test_agents_in_processes_of_their_own_play_as_the_model_would(tmp_path: Path) -> None:
+    """With masks and memory, one agent by torch, one by ONNX."""
     env = make_team_env(lambda: TellingEnv(n_agents=2, max_cycles=6), n_envs=1, seed=0)
-    sizes = {"lstm_hidden_size": 8} if algorithm is RecurrentPPO else {}
-    model = algorithm(policy, env, seed=0, device="cpu", policy_kwargs=sizes)
+    model = RecurrentPPO("SAFLstmPolicy", env, seed=0, device="cpu", policy_kwargs={"lstm_hidden_size": 8})
     with th.no_grad():
         for parameter in cast(Any, model.policy).actor.parameters():
             parameter.add_(0.3 * th.randn_like(parameter))
-    folder = export_actors(model, tmp_path / "actor", onnx=runtime == "onnx")
-    agents = [LoneAgent(folder, runtime, agent) for agent in range(2)]
+    folder = export_actors(model, tmp_path / "actor")
+    agents = [LoneAgent(folder, runtime, agent) for agent, runtime in enumerate(("torch", "onnx"))]
     rows, state, starts = env.reset(), None, np.ones(2, bool)
     seen = []
     for _ in range(12):  # two episodes

@@ -51,15 +51,15 @@ def _trained(algorithm: type[Any], policy: str, **kwargs: Any) -> th.Tensor:
     model = algorithm(policy, env, seed=0, policy_kwargs=policy_kwargs, device="cpu", **kwargs)
     parameters = list(model.policy.parameters())
     before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
-    model.learn(8_000)
+    model.learn(4_000)
     after = th.nn.utils.parameters_to_vector(parameters).detach()
     assert not th.equal(before, after)
     return after
 
 
-_PPO = {"n_steps": 50, "batch_size": 4_000, "n_epochs": 4, "rollout_buffer_class": TeamRolloutBuffer}
-_RECURRENT: dict[str, Any] = {"n_steps": 50, "batch_size": 4_000, "n_epochs": 2}
-_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 1_300}
+_PPO = {"n_steps": 25, "batch_size": 4_000, "n_epochs": 1, "rollout_buffer_class": TeamRolloutBuffer}
+_RECURRENT: dict[str, Any] = {"n_steps": 25, "batch_size": 4_000, "n_epochs": 1}
+_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 600}
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -120,14 +120,14 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> EventAccumulator:
     env = make_team_env("TeamSupport", n_envs=4, seed=0, **LEVEL)
     eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
     callback = InspectionCallback(eval_env, every_game_steps=20, n_eval_episodes=3, hparams={"task": "TeamSupport"})
-    learn(folder, callback, env=env, n_updates=3)
+    learn(folder, callback, env=env, n_updates=2)
     return events(folder)
 
 
 class TestInHand:
     def test_is_what_the_callback_writes(self, tmp_path: Path) -> None:
         eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
-        model = learn(tmp_path, InspectionCallback(eval_env, n_eval_episodes=3), env=level_games())
+        model = learn(tmp_path, InspectionCallback(eval_env, n_eval_episodes=3), env=level_games(), n_updates=1)
         before = th.get_rng_state()
         look = inspect_team(model, eval_env, n_eval_episodes=3)
         assert th.equal(th.get_rng_state(), before)
@@ -184,7 +184,7 @@ class TestPage:
         assert (movie.format, movie.n_frames) == ("GIF", LEVEL["max_cycles"])  # type: ignore[attr-defined]
 
     def test_returns_of_episodes(self, page: EventAccumulator) -> None:
-        assert [event.histogram_value.num for event in page.Histograms("team/return_of_each_episode")] == [3] * 4
+        assert [event.histogram_value.num for event in page.Histograms("team/return_of_each_episode")] == [3] * 3
         assert "rollout/team_return_of_each_episode" in page.Tags()["histograms"]
 
     def test_layout_and_hyperparameters(self, page: EventAccumulator) -> None:
@@ -202,8 +202,8 @@ class TestPage:
 
     def test_before_during_and_after_training(self, page: EventAccumulator) -> None:
         # A rollout has 20 game steps; what SB3 logs is on the same axis.
-        assert [event.step for event in page.Scalars("team/return")] == [0, 20, 40, 60]
-        assert [event.step for event in page.Scalars("time/fps")] == [20, 40, 60]
+        assert [event.step for event in page.Scalars("team/return")] == [0, 20, 40]
+        assert [event.step for event in page.Scalars("time/fps")] == [20, 40]
 
     def test_the_same_episodes_every_time(self, tmp_path: Path) -> None:
         still = InspectionCallback(ToyTeams(), every_game_steps=20, n_eval_episodes=6, pictures=False)
@@ -245,13 +245,10 @@ def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settin
 @pytest.mark.parametrize(
     ("algorithm", "policy", "settings", "expected"),
     [
-        (PPO, "SAFPolicy", {}, {"pool", "knowledge_source", "message"}),
         (A2C, "SAFPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
         (PPO, "SAFPolicy", {"n_policies": 1}, {"knowledge_source", "message"}),
         (PPO, "SAFPolicy", {"knowledge_source": False}, {"pool"}),
         (PPO, "MAPPOPolicy", {}, set()),
-        (PPO, "IPPOPolicy", {"heads": "per_agent"}, set()),
-        (RecurrentPPO, "SAFLstmPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
         (RecurrentPPO, "SAFLstmPolicy", {"enable_critic_lstm": False}, {"pool", "knowledge_source", "message"}),
         (RecurrentPPO, "IPPOLstmPolicy", {}, set()),
         (MaskablePPO, "SAFMaskablePolicy", {}, {"pool", "knowledge_source", "message"}),

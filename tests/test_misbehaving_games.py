@@ -199,8 +199,12 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("n_cpus", [1, 2])
-@pytest.mark.parametrize(("fault", "message"), FAULTS, ids=[message[:70] for _, message in FAULTS])
+@pytest.mark.parametrize(
+    ("fault", "message", "n_cpus"),
+    # Whether a worker's errors arrive does not depend on their words.
+    [*((*fault, 1) for fault in FAULTS), *((*fault, 2) for fault in FAULTS[::10])],
+    ids=lambda value: value[:70] if isinstance(value, str) else "",
+)
 def test_each_fault_is_named(fault: dict[str, Any], message: str, n_cpus: int) -> None:
     with contextlib.ExitStack() as stack, pytest.raises(ValueError, match=re.escape(message)):
         play_two_steps(stack, n_cpus, fault)

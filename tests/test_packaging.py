@@ -101,23 +101,27 @@ def test_version_is_written_once() -> None:
         assert getattr(importlib.import_module(package), "__version__", version) == version
 
 
-def _modules_after(statement: str) -> set[str]:
-    """Return the top-level modules loaded by a new interpreter after ``statement``."""
-    code = f"{statement}\nimport sys\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
+def _modules_after(*statements: str) -> list[set[str]]:
+    """Return the top-level modules loaded by a new interpreter after each statement."""
+    code = "import sys\n" + "\n".join(
+        f"{one}\nprint(*{{n.partition('.')[0] for n in sys.modules}})" for one in statements
+    )
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    return set(result.stdout.split())
+    return [set(line.split()) for line in result.stdout.splitlines()]
 
 
 def test_the_game_needs_neither_torch_nor_stable_baselines() -> None:
-    modules = _modules_after("import hecogrid_envs.rendering, hecogrid_envs.text, hecogrid_envs.play")
+    (modules,) = _modules_after("import hecogrid_envs.rendering, hecogrid_envs.text, hecogrid_envs.play")
     assert "hecogrid_envs" in modules
-    assert modules.isdisjoint({"torch", "stable_baselines3", "sb3_contrib", "sb3_saf", "tensorboard", "pygame", "PIL"})
+    learning = {"torch", "stable_baselines3", "supersuit", "sb3_contrib", "sb3_saf", "tensorboard"}
+    assert modules.isdisjoint({*learning, "pygame", "PIL"})
 
 
-def test_the_learning_does_not_need_the_game() -> None:
-    modules = _modules_after("import sb3_saf")
-    assert "stable_baselines3" in modules
-    assert modules.isdisjoint({"hecogrid_envs", "matplotlib", "pygame", "rl_zoo3", "ray"})
+def test_the_learning_does_not_need_the_game_and_settings_need_neither_rl_zoo_nor_optuna() -> None:
+    learning, settings = _modules_after("import sb3_saf", "import sb3_saf.training.settings")
+    assert "stable_baselines3" in learning
+    assert learning.isdisjoint({"hecogrid_envs", "matplotlib", "pygame", "rl_zoo3", "ray"})
+    assert settings.isdisjoint({"rl_zoo3", "optuna", "matplotlib", "pandas"})
 
 
 def _make_commands(text: str) -> list[str]:

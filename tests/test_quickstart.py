@@ -14,8 +14,10 @@ from tests.test_replay import data_of
 
 
 def test_it_leaves_a_model_that_can_be_replayed_a_curve_a_video_and_logs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(quickstart, "N_EPISODES", 8)
+    monkeypatch.setattr(quickstart, "N_INSPECTIONS", 1)
     output = tmp_path / "run"
     quickstart.main(["--game-steps", "1600", "--output", str(output), "--no-progress-bar", "--coordination", "1"])
     printed = capsys.readouterr().out

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
 #: Rollouts of a run; two interruptions fit into it.
-ROLLOUTS = 6
+ROLLOUTS = 4
 WHOLE = ROLLOUTS * ROLLOUT
 TASK: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 7, "n_treasures": 3, "coordination": 1, "max_cycles": 10}
 LIGHT = {"features_extractor_class": sb3_saf.LightEncoder, "net_arch": [8]}
@@ -54,9 +53,9 @@ def _close_what_was_made() -> Iterator[None]:
 
 
 class Lightning(BaseCallback):
-    """Ends training in the middle of a rollout, as a crash would."""
+    """Ends training in the middle of a rollout, as a crash or a signal would."""
 
-    def __init__(self, after_calls: int, error: type[BaseException] = RuntimeError) -> None:
+    def __init__(self, after_calls: int, error: type[BaseException] | signal.Signals = RuntimeError) -> None:
         super().__init__()
         self.strikes_in = after_calls
         self.error = error
@@ -64,7 +63,10 @@ class Lightning(BaseCallback):
     def _on_step(self) -> bool:
         self.strikes_in -= 1
         if self.strikes_in == 0:
-            raise self.error
+            if isinstance(self.error, signal.Signals):
+                signal.raise_signal(self.error)
+            else:
+                raise self.error
         return True
 
 
@@ -123,8 +125,14 @@ def go_on(folder: Path, model: Any, others: Any = (), rollouts: int = ROLLOUTS) 
     )
 
 
+@functools.cache
+def undisturbed() -> dict[str, bytes]:
+    """Return the weights of a whole run of PPO without checkpoints."""
+    return weights(make().learn(WHOLE))
+
+
 def qplex(policy: str, **parts: Any) -> Any:
-    """Create QPLEX, whose replay buffer holds a third of the run."""
+    """Create QPLEX, whose replay buffer holds half of the run."""
     settings: dict[str, Any] = {
         "buffer_size": 48,
         "learning_starts": 12,
@@ -190,14 +198,14 @@ MODELS: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: Path) -> None:
-    undisturbed = go_on(tmp_path / "undisturbed", MODELS[name]())
-    struck(tmp_path / "run", MODELS[name], after_calls=3 * N_STEPS + 2)
-    struck(tmp_path / "run", MODELS[name], after_calls=2 * N_STEPS + 1)
+    whole = go_on(tmp_path / "whole", MODELS[name]())
+    struck(tmp_path / "run", MODELS[name], after_calls=2 * N_STEPS + 2)
+    struck(tmp_path / "run", MODELS[name], after_calls=N_STEPS + 1)
     np.random.seed(77)  # noqa: NPY002 - another process has other states
     th.manual_seed(77)
     model = go_on(tmp_path / "run", MODELS[name]())
-    assert model.num_timesteps == WHOLE and model._n_updates == undisturbed._n_updates
-    assert weights(model) == weights(undisturbed)
+    assert model.num_timesteps == WHOLE and model._n_updates == whole._n_updates
+    assert weights(model) == weights(whole)
     assert weights(model) != weights(MODELS[name]())
 
 
@@ -210,7 +218,7 @@ def test_what_agents_remember_goes_on(tmp_path: Path) -> None:
 
 
 def test_checkpoints_do_not_change_the_run(tmp_path: Path) -> None:
-    assert weights(go_on(tmp_path, make())) == weights(make().learn(WHOLE))
+    assert weights(go_on(tmp_path, make())) == undisturbed()
 
 
 def test_what_is_normalised_goes_on(tmp_path: Path) -> None:
@@ -218,20 +226,20 @@ def test_what_is_normalised_goes_on(tmp_path: Path) -> None:
         native = sb3_saf.make_team_env("TeamTogether", N_GAMES, **TASK).venv
         return make(env=sb3_saf.CentralizedValueWrapper(VecNormalize(native, norm_obs=False), n_agents=N_AGENTS))
 
-    undisturbed = go_on(tmp_path / "undisturbed", normalised())
+    whole = go_on(tmp_path / "whole", normalised())
     struck(tmp_path / "run", normalised, after_calls=30)
-    assert weights(go_on(tmp_path / "run", normalised())) == weights(undisturbed)
+    assert weights(go_on(tmp_path / "run", normalised())) == weights(whole)
 
 
 def test_evaluations_monitor_and_tensorboard_go_on_without_gap_or_repetition(tmp_path: Path) -> None:
-    for folder, strikes in ((tmp_path / "undisturbed", ()), (tmp_path / "run", (28, 21))):
+    for folder, strikes in ((tmp_path / "undisturbed", ()), (tmp_path / "run", (12, 13))):
         for calls in strikes:
             struck(folder / "checkpoints", lambda: make(folder), calls, [evaluation(folder)])  # noqa: B023
         others = [evaluation(folder)]
         go_on(folder / "checkpoints", make(folder), others)
     one, other = tmp_path / "undisturbed", tmp_path / "run"
     with np.load(one / "evaluations.npz") as a, np.load(other / "evaluations.npz") as b:
-        assert len(a["results"]) == 6 and all(np.array_equal(a[name], b[name]) for name in a.files)
+        assert len(a["results"]) == ROLLOUTS and all(np.array_equal(a[name], b[name]) for name in a.files)
     lines = [
         [line.rsplit(",", 1)[0] for line in (f / "monitor.csv").read_text().splitlines()[1:]] for f in (one, other)
     ]
@@ -247,7 +255,6 @@ def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
 
 
 def test_resume_alone(tmp_path: Path) -> None:
-    undisturbed = make().learn(WHOLE)
     checkpoints = TeamCheckpointCallback(tmp_path, every_game_steps=1)
     with pytest.raises(RuntimeError):
         make().learn(WHOLE, [checkpoints, Lightning(20)])
@@ -256,7 +263,7 @@ def test_resume_alone(tmp_path: Path) -> None:
     path = resume(tmp_path, model)
     assert path.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"
     model.learn(WHOLE - model.num_timesteps, TeamCheckpointCallback(tmp_path), reset_num_timesteps=False)
-    assert weights(model) == weights(undisturbed)
+    assert weights(model) == undisturbed()
 
 
 def fingerprint(folder: Path) -> dict[str, bytes]:
@@ -322,13 +329,12 @@ def test_another_run_does_not_go_into_the_folder(tmp_path: Path) -> None:
 
 
 def test_a_damaged_checkpoint_costs_a_rollout_and_no_bit(tmp_path: Path) -> None:
-    undisturbed = go_on(tmp_path / "undisturbed", make())
     struck(tmp_path / "run", make, after_calls=30)
     newest = max((tmp_path / "run").glob("*.ckpt"))
     newest.write_bytes(newest.read_bytes()[:1000])
     with pytest.warns(UserWarning, match="Going back to"):
         model = go_on(tmp_path / "run", make())
-    assert weights(model) == weights(undisturbed)
+    assert weights(model) == undisturbed()
 
 
 def test_replay_of_another_size_and_algorithms_without_teams_are_refused(tmp_path: Path) -> None:
@@ -362,9 +368,14 @@ def foreign(game: type[CounterEnv], n_cpus: int = 1, seed: int | None = 3) -> An
     return make(env=env, seed=seed, policy_kwargs={"net_arch": [8]})
 
 
+@functools.cache
+def undisturbed_foreign(game: Any) -> dict[str, bytes]:
+    return weights(foreign(game).learn(WHOLE))
+
+
 @pytest.mark.parametrize("n_cpus", [1, 2])
 @pytest.mark.parametrize("game", [LazyEnv, StateEnv])
-def test_games_of_others_go_on_bit_for_bit(game: type[CounterEnv], n_cpus: int, tmp_path: Path) -> None:
+def test_games_of_others_go_on_bit_for_bit(game: Any, n_cpus: int, tmp_path: Path) -> None:
     struck(tmp_path / "ck", lambda: foreign(game, n_cpus), 20)
     going_on = foreign(game, n_cpus)
     going_on.set_logger(configure(str(tmp_path / "log"), ["log"]))
@@ -372,7 +383,7 @@ def test_games_of_others_go_on_bit_for_bit(game: type[CounterEnv], n_cpus: int, 
     going_on.logger.close()
     is_pickled = "they were unpickled from it" in (tmp_path / "log" / "log.txt").read_text()
     assert is_pickled == (game is LazyEnv)
-    assert weights(model) == weights(foreign(game).learn(WHOLE))
+    assert weights(model) == undisturbed_foreign(game)
     assert model.num_timesteps == WHOLE
 
 
@@ -397,7 +408,6 @@ def test_games_that_cannot_be_copied_begin_new_episodes_and_say_so_at_the_start(
 
 def test_pickled_games_of_strangers_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     struck(tmp_path / "ck", lambda: foreign(LazyEnv), 20)
-    undisturbed = weights(foreign(LazyEnv).learn(WHOLE))
     shutil.copytree(tmp_path / "ck", tmp_path / "trusted")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
     opened: list[object] = []
@@ -410,18 +420,18 @@ def test_pickled_games_of_strangers_are_not_read(tmp_path: Path, monkeypatch: py
     monkeypatch.undo()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
     model = resumable_learn(foreign(LazyEnv), WHOLE, tmp_path / "trusted", [Lightning(-1)], trust_games=True)
-    assert weights(model) == undisturbed
+    assert weights(model) == undisturbed_foreign(LazyEnv)
 
 
 def test_a_clock_that_is_set_back_all_the_time_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    undisturbed = weights(go_on(tmp_path / "undisturbed", make()))
+    expected = undisturbed()
     seconds = itertools.count(2_000_000_000, -60)
     monkeypatch.setattr("time.time", lambda: float(next(seconds)))
     monkeypatch.setattr("time.time_ns", lambda: next(seconds) * 10**9)
     struck(tmp_path / "run", make, after_calls=20)
     newest = max((tmp_path / "run").glob("*.ckpt"))
     assert newest.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"  # not by time
-    assert weights(go_on(tmp_path / "run", make())) == undisturbed
+    assert weights(go_on(tmp_path / "run", make())) == expected
 
 
 def test_lines_of_a_monitor_file_are_kept(tmp_path: Path) -> None:
@@ -441,34 +451,38 @@ def test_lines_of_a_monitor_file_are_kept(tmp_path: Path) -> None:
     assert (tmp_path / "monitor.csv").read_bytes() not in (b"", longer)
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        resumable_learn(make(), WHOLE, tmp_path, Lightning(20, KeyboardInterrupt), every_game_steps=10**9)
+@pytest.mark.parametrize(
+    ("error", "ending"),
+    [(KeyboardInterrupt, KeyboardInterrupt()), (signal.SIGTERM, SystemExit(128 + signal.SIGTERM))],
+    ids=["Ctrl-C", "SIGTERM"],
+)
+def test_what_ends_it_saves_and_says_how_to_go_on(
+    error: Any, ending: BaseException, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(type(ending)) as ended:
+        resumable_learn(make(), WHOLE, tmp_path, Lightning(20, error), every_game_steps=10**9)
+    assert ended.value.args == ending.args
     assert (
         f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt is saved; start the same command again"
         in capsys.readouterr().out
     )
-    assert weights(go_on(tmp_path, make())) == weights(make().learn(WHOLE))
+    assert weights(go_on(tmp_path, make())) == undisturbed()
 
 
-def test_sigterm_saves_and_ends_with_its_status(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.kill_harness", "--algo", "saf", "--rollouts", "100000"]
-    with subprocess.Popen([*command, "--train", str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
-        while not list(tmp_path.glob("checkpoints/*.ckpt")):
-            assert process.poll() is None
-            time.sleep(0.05)
-        process.send_signal(signal.SIGTERM)
-        out, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + signal.SIGTERM
-    newest = max((tmp_path / "checkpoints").glob("*.ckpt"))
-    assert f"{newest} is saved; start the same command again" in out
+#: All algorithms in one process, whose children have its imports and compiled code.
+KILLS = """
+import json
+import torch.utils.tensorboard
+from tests.kill_harness import ALGOS, Games, Moment, kill_in_a_row, make_run
+
+moments = [Moment("rollout", 40), Moment("update", 6), Moment("writing", 5)]
+for algo in ALGOS:
+    make_run(algo, None).warm_up()
+    print(json.dumps(kill_in_a_row(algo, Games(), 6, moments)))
+"""
 
 
-@pytest.mark.parametrize("algo", ALGOS)
-def test_killed_runs_end_bit_equal(algo: str) -> None:
-    command = [sys.executable, "-m", "tests.kill_harness", "--algo", algo, "--rollouts", "8"]
-    moments = ["rollout:40", "update:6", "writing:5"]
-    out = subprocess.run(
-        [*command, "--at", *moments], stdout=subprocess.PIPE, text=True, check=True, timeout=240
-    ).stdout
-    assert json.loads(out) == {"killed": ["rollout", "update", "writing"], "equal": True}
+def test_killed_runs_end_bit_equal() -> None:
+    command = [sys.executable, "-c", KILLS]
+    out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=240).stdout
+    assert [json.loads(line) for line in out.splitlines()] == [[["rollout", "update", "writing"], True]] * len(ALGOS)

@@ -808,7 +808,6 @@ def test_more_cpus_than_games(bridge: Bridge) -> None:
 box = spaces.Box(-1.0, np.array([1.0, 0.7], np.float32), (2,), np.float32)
 
 
-@one_and_two_cpus
 @pytest.mark.parametrize(
     ("space", "actions", "message"),
     [
@@ -831,8 +830,8 @@ box = spaces.Box(-1.0, np.array([1.0, 0.7], np.float32), (2,), np.float32)
         (spaces.Box(0, 9, (1,), np.uint8), [[0], [256], [0], [0]], "got [256] in row 1"),
     ],
 )  # fmt: skip
-def test_wrong_actions(bridge: Bridge, n_cpus: int, space: spaces.Space[Any], actions: Any, message: str) -> None:
-    venv = bridge(lambda: OddSpacesEnv(action_space=space), n_games=2, n_cpus=n_cpus)
+def test_wrong_actions(bridge: Bridge, space: spaces.Space[Any], actions: Any, message: str) -> None:
+    venv = bridge(lambda: OddSpacesEnv(action_space=space), n_games=2)
     venv.reset()
     with pytest.raises(ValueError, match=re.escape(message)):
         venv.step(actions)

@@ -9,12 +9,15 @@ import pandas as pd
 import pytest
 
 from benchmarks import team_size
+from sb3_saf.experiments import cli
+from tests.experiments_jobs import InlineEngine
 
 
 def test_it_trains_what_is_missing_then_draws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["-f", str(tmp_path), "--agents", "2", "--methods", "ippo", "--seeds", "0", "-n", "800", "--episodes", "2"]
+    monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
     monkeypatch.setattr(sys, "argv", ["team_size", *words, "--figure", str(tmp_path / "size.png")])
     team_size.main()
     header, _, ippo, random, _, script = capsys.readouterr().out.partition("| agents")[2].strip().splitlines()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -93,7 +92,12 @@ def test_options_do_not_change_what_is_learned(
 ) -> None:
     assert equal(by_hand, weights(train_settings(settings, 3)))
     options = RunOptions(
-        eval_freq=60, eval_episodes=4, save_freq=100, inspect_freq=200, checkpoint_freq=None, tensorboard_log=tmp_path
+        eval_freq=60,
+        eval_episodes=4,
+        save_freq=100,
+        inspect_freq=10_000,
+        checkpoint_freq=None,
+        tensorboard_log=tmp_path,
     )
     folder = tmp_path / "run"
     assert equal(by_hand, weights(train_settings(settings, 3, folder, options)))
@@ -116,14 +120,14 @@ def test_an_interrupted_run_goes_on(
 
 @pytest.mark.parametrize("algo", ["saf", "qplex"])
 def test_tensorboard_has_the_inside_of_the_policy_and_training_does_not_notice(algo: str, tmp_path: Path) -> None:
-    quick = ("--eval-freq", "-1", "-n", "80")
+    quick = ("--eval-freq", "-1", "-n", "40")
     plain = train(tmp_path, *quick, algo=algo)
-    watched = train(tmp_path, *quick, "-tb", str(tmp_path / "tb"), "--inspect-freq", "40", algo=algo)
+    watched = train(tmp_path, *quick, "-tb", str(tmp_path / "tb"), "--inspect-freq", "100", algo=algo)
     load = ALGOS[algo].algorithm.load
     assert equal(weights(load(plain / f"{ENV}.zip")), weights(load(watched / f"{ENV}.zip")))
     (file,) = (tmp_path / "tb").glob("*/*/events.*")
     found = EventAccumulator(str(file)).Reload()
-    assert [event.step for event in found.Scalars("team/return")] == [0, 40, 80]
+    assert [event.step for event in found.Scalars("team/return")] == [0, 40]
     assert {"episode/strip", "critic/calibration"} <= set(found.Tags()["images"])
     assert b"TeamTogether" in found.PluginTagToContent("hparams")["_hparams_/session_start_info"]
 
@@ -260,23 +264,19 @@ def test_the_remaining_time_is_told_once(capsys: pytest.CaptureFixture[str], mon
 COUNTER = "tests.toy_envs:CounterEnv"
 
 
-@pytest.mark.parametrize("env_id", [COUNTER, "mpe2.simple_spread_v3"])
-def test_any_environment_is_trained_watched_drawn_and_tuned(
-    env_id: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_any_environment_is_trained_watched_drawn_and_tuned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In a folder whose name is a glob pattern, twice, because the second run must find the first."""
-    pytest.importorskip(env_id.partition(":")[0].partition(".")[0])
     logs = str(tmp_path / "runs [a]")
-    short = ("--env", env_id, "--size", "smoke", "-n", "80", "-f", logs, "--eval-episodes", "2")
+    short = ("--env", COUNTER, "--size", "smoke", "-n", "80", "-f", logs, "--eval-episodes", "2")
     for _ in range(2):
         zoo_train.main(["--seed", "0", "--env-kwargs", "max_cycles:5", "--eval-freq", "40", *short])
-    name = env_id.replace(":", "-")
+    name = COUNTER.replace(":", "-")
     run = Path(logs) / "saf" / f"{name}_2"
     assert {f"{name}.zip", "best_model.zip", "evaluations.npz", "monitor.csv"} <= {path.name for path in run.iterdir()}
     gif = tmp_path / "game.gif"
-    result = zoo_enjoy.enjoy(["--env", env_id, "-f", logs, "--episodes", "2", "--gif", str(gif)])
+    result = zoo_enjoy.enjoy(["--env", COUNTER, "-f", logs, "--episodes", "2", "--gif", str(gif)])
     assert set(result.lengths) == {5} and gif.is_file()
-    zoo_plot.main(["curves", "-f", logs, "-o", str(tmp_path / "curves.png"), "--env", env_id])
+    zoo_plot.main(["curves", "-f", logs, "-o", str(tmp_path / "curves.png"), "--env", COUNTER])
     assert (tmp_path / "curves.png").is_file()
     zoo_train.main(["-optimize", "--n-trials", "1", *short])
     assert "Best: trial 0" in capsys.readouterr().out
@@ -471,13 +471,3 @@ def test_strings_are_not_evaluated(
         for key in ("policy_kwargs", "n_agents", "learning_rate"):
             failed(["--size", "smoke", option, f"{key}:{code}"], capsys)
     assert not (tmp_path / "evaluated").exists()
-
-
-def test_from_a_shell(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sb3_saf.train", "--algo", "saf", "--env-kwargs", "coordination:99"]
-    result = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
-    assert result.returncode == 2
-    assert result.stderr.splitlines() == [
-        "python -m sb3_saf.train: error: coordination must be an integer from 1 to 5 (1 <= coordination <= n_agents), "
-        "got 99"
-    ]

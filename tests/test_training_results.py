@@ -152,13 +152,15 @@ def test_mistakes_in_enjoy_are_one_line(
     assert words in failed(["-f", str(logs), *quiet, *options], capsys, zoo_enjoy.main)
 
 
-def test_a_reader_may_leave(logs: Path) -> None:
-    """Like ``| head -1``."""
-    words = ["-m", "sb3_saf.enjoy", "-f", str(logs), "--env", ENV, "--episodes", "2", "--text"]
-    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
-        assert command.stdout is not None and command.stderr is not None
-        command.stdout.close()
-        assert command.stderr.read() == b""
+def test_a_reader_may_leave(logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Like ``| head -1``: neither the command nor closing its output complains."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as output, monkeypatch.context() as context:
+        context.setattr(sys, "stdout", output)
+        with pytest.raises(SystemExit, match="1"):
+            zoo_enjoy.main(["-f", str(logs), "--env", ENV, "--episodes", "2", "--text"])
+    assert capsys.readouterr().err == ""
 
 
 def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -240,8 +242,9 @@ def test_what_all_runs_share_is_not_named(tmp_path: Path) -> None:
     assert list(describe(find_runs(tmp_path))["method"]) == ["saf", "saf"]
 
 
-@pytest.mark.parametrize("kind", ["curves", "levels", "aggregate"])
-@pytest.mark.parametrize("source", ["evaluation", "training"])
+@pytest.mark.parametrize(
+    ("kind", "source"), [("curves", "training"), ("levels", "evaluation"), ("aggregate", "evaluation")]
+)
 def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Path) -> None:
     output = tmp_path / "new" / "figure.png"
     algos = ["saf", "mappo"]
@@ -263,24 +266,25 @@ def test_damaged_results_are_one_line(
     assert f"{name} is not what sb3_saf.train writes" in failed(options, capsys, zoo_plot.main)
 
 
-@pytest.mark.parametrize("module", ["plot_train", "all_plots"])
-def test_plots_of_rl_zoo3_read_the_folders(module: str, logs: Path, tmp_path: Path) -> None:
+#: Runs two modules, with their words.
+PLOTS = """
+import runpy, sys
+for words in sys.argv[1].split("; "):
+    sys.argv = words.split()
+    runpy.run_module(f"rl_zoo3.plots.{sys.argv[0]}", run_name="__main__")
+"""
+
+
+def test_plots_of_rl_zoo3_read_the_folders(logs: Path, tmp_path: Path) -> None:
     pytest.importorskip("seaborn")
     pytest.importorskip("rl_zoo3.plots")
-    options = {
-        "plot_train": ["-a", "saf", "-e", ENV, "-f", str(logs), "-w", "1"],
-        "all_plots": ["-a", "saf", "mappo", "-e", ENV, "-f", str(logs), "--no-display", "-o", str(tmp_path / "all")],
-    }
-    result = subprocess.run(
-        [sys.executable, "-m", f"rl_zoo3.plots.{module}", *options[module]],
-        env={**os.environ, "MPLBACKEND": "agg"},
-        capture_output=True,
-        text=True,
-    )
+    words = f"plot_train -a saf -e {ENV} -f {logs} -w 1; "
+    words += f"all_plots -a saf mappo -e {ENV} -f {logs} --no-display -o {tmp_path / 'all'}"
+    environment = {**os.environ, "MPLBACKEND": "agg"}
+    result = subprocess.run([sys.executable, "-c", PLOTS, words], env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "No data" not in result.stdout and "not found" not in result.stdout
-    if module == "all_plots":
-        assert "SAF" in result.stdout and ENV in result.stdout
+    assert "SAF" in result.stdout and ENV in result.stdout
 
 
 @pytest.mark.parametrize(

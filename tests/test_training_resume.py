@@ -20,7 +20,7 @@ from tests.test_training_commands import failed
 ENV = "TeamTogether-v0"
 OPTIONS = (
     *("--env", ENV, "--size", "smoke", "-n", "200"),
-    *("--eval-episodes", "2", "--checkpoint-freq", "1", "--inspect-freq", "100000"),
+    *("--eval-episodes", "2", "--checkpoint-freq", "1", "--inspect-freq", "-1"),
 )
 
 
@@ -54,18 +54,19 @@ def left(run: Path) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("algo", ["saf", "qplex"])
+@pytest.mark.parametrize(("algo", "inspect_freq"), [("saf", "-1"), ("qplex", "100000")])
 def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
-    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    algo: str, inspect_freq: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train(tmp_path / "undisturbed", algo, "--seed", "3", "--resume")
+    options = ("--resume", "--inspect-freq", inspect_freq)
+    train(tmp_path / "undisturbed", algo, "--seed", "3", *options)
     assert "unfinished: a new one begins" in capsys.readouterr().out
     for evaluation in (8, 14):
         struck(monkeypatch, RuntimeError, evaluation)
         with pytest.raises(RuntimeError):
-            train(tmp_path / "run", algo, "--seed", "3", "--resume")
+            train(tmp_path / "run", algo, "--seed", "3", *options)
         monkeypatch.undo()
-    train(tmp_path / "run", algo, "--resume")  # the seed is the run's
+    train(tmp_path / "run", algo, *options)  # the seed is the run's
     assert f"Going on with {tmp_path}" in capsys.readouterr().out
     one, other = (tmp_path / name / algo / f"{ENV}_1" for name in ("undisturbed", "run"))
     assert left(one) == left(other) and not (other / "checkpoints").exists()

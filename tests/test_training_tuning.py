@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,11 @@ def config_of(run: Path) -> dict[str, Any]:
 
 def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
-    command = [sys.executable, "-m", "sb3_saf.train", *given(tmp_path, "--storage", storage, "--n-trials", "2")]
-    root = Path(__file__).parents[1]
-    workers = [subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for _ in range(2)]
-    outputs = [worker.communicate()[0].decode() for worker in workers]
-    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    words = given(tmp_path, "--storage", storage, "--n-trials", "2", "--n-evaluations", "1", "-params", "n_epochs:1")
+    optuna.storages.RDBStorage(f"sqlite:///{tmp_path}/other.db")  # whose modules the processes inherit
+    with ProcessPoolExecutor(2, multiprocessing.get_context("fork")) as pool:
+        for worker in [pool.submit(zoo_train.main, words) for _ in range(2)]:
+            worker.result()
     study = load_study(storage)
     complete = study.get_trials(states=[TrialState.COMPLETE])
     assert len(study.trials) == 4
@@ -107,7 +107,8 @@ def test_a_failed_trial_is_never_complete(
 
 def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Path) -> None:
     sampled = to_overrides(tune(tmp_path).trials[0].params)
-    options = ("--storage", str(tmp_path / "study.log"), "--study-name", "s", "-n", "80", "-f", str(tmp_path / "logs"))
+    study = ("--storage", str(tmp_path / "study.log"), "--study-name", "s")
+    options = (*study, "-n", "40", "--eval-freq", "-1", "-f", str(tmp_path / "logs"))
     for number, trial in enumerate(("0", "best"), start=1):
         zoo_train.main([*SMOKE, *options, "--trial-id", trial])
         saved = config_of(tmp_path / "logs" / "saf" / f"{ENV}_{number}")["hyperparams"]

@@ -103,8 +103,6 @@ def test_its_commands_run_outside_the_checkout(installed: Path, tmp_path: Path) 
     code = "import zoo_configs, hecogrid_envs; print(zoo_configs.__file__, hecogrid_envs.__file__)"
     files = call(["-c", code], tmp_path, PYTHONPATH=str(installed)).split()
     assert [Path(file).parents[1] for file in files] == [installed] * 2
-    table = call(["-m", "sb3_saf.parameters"], tmp_path, PYTHONPATH=str(installed))
-    assert "1,740,016" in table
     options = ["--algo", "saf", "--env", "TeamSupport-v0", "--size", "smoke", "-f", "logs", "--eval-freq", "-1"]
     call(["-m", "sb3_saf.train", *options], tmp_path, PYTHONPATH=str(installed))
     assert (tmp_path / "logs" / "saf" / "TeamSupport-v0_1" / "TeamSupport-v0.zip").is_file()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
+from copy import deepcopy
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -112,9 +114,14 @@ def read_config(name: str, refined_by: Sequence[str] = ()) -> dict[str, Any]:
     :param name: file name without ``.yml``
     :param refined_by: files that refine this one
     """
-    source = f"zoo_configs/{name}.yml"
+    return _with_base(deepcopy(_content_of(name)), f"zoo_configs/{name}.yml", (*refined_by, name))
+
+
+@cache
+def _content_of(name: str) -> Any:
+    """Read a file of ``zoo_configs`` once in a process: an experiment asks for the settings of every cell."""
     text = files("zoo_configs").joinpath(f"{name}.yml").read_text(encoding="utf-8")
-    return _with_base(load_yaml(text, source), source, (*refined_by, name))
+    return load_yaml(text, f"zoo_configs/{name}.yml")
 
 
 def config_names() -> list[str]:
