@@ -181,7 +181,7 @@ def small_model(algo: str, n_agents: int | None = None) -> PPO:
         algo,
         "TeamSupport-v0",
         "small",
-        overrides={"n_envs": n_games, "n_minibatches": 2},
+        overrides={"n_envs": n_games, "n_steps": 50, "n_minibatches": 2},
         env_kwargs={"n_agents": n_agents, "grid_size": side, "n_treasures": side * side // 9},
     )
     model = settings.make_model(settings.make_env(0), 0, device="cpu")

@@ -1,10 +1,10 @@
 """
 Measure training time by stage: ``python -m benchmarks.stages``.
 
-One table per setting: SAF, MAPPO and IPPO in the size ``small`` of the zoo with 16 and 128 games, and SAF with the
-paper's network. A stage excludes the stages inside it: for example, the rollout does not include the games that it
-steps. Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are of the real program and sum to the
-total.
+One table per setting: SAF, MAPPO and IPPO in the size ``small`` of the zoo, with its 80 games and with 16 and 128, and
+SAF with the paper's network. A stage excludes the stages inside it: for example, the rollout does not include the games
+that it steps. Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are of the real program and
+sum to the total.
 
 On a GPU, ``--device cuda --only "SAF, paper size"`` waits for the device between stages, so that each includes its own
 kernels, and prints the time of 10 million game steps; ``--no-wait`` lets stages overlap as in training.
@@ -99,15 +99,18 @@ class Stopwatch:
         setattr(owner, method, timed)
 
 
-#: Minibatches by number of games: equal rows in each as in the zoo.
-SMALL_GAMES: Final = {16: 2, 128: 16}
+#: Settings by number of games, with minibatches of 2,000 rows: the zoo's own, and rollouts of whole episodes.
+SMALL_GAMES: Final[Mapping[int, dict[str, int]]] = {
+    80: {},
+    16: {"n_envs": 16, "n_steps": 50, "n_minibatches": 2},
+    128: {"n_envs": 128, "n_steps": 50, "n_minibatches": 16},
+}
 PAPER_GAME_STEPS: Final = 10_000_000
 
 
 def small_model(algo: str, n_games: int, device: str) -> PPO:
     """Create PPO with the zoo's settings of the size ``small``."""
-    sizes = {"n_envs": n_games, "n_minibatches": SMALL_GAMES[n_games]}
-    settings = load_settings(algo, "TeamSupport-v0", "small", overrides=sizes)
+    settings = load_settings(algo, "TeamSupport-v0", "small", overrides=SMALL_GAMES[n_games])
     model = settings.make_model(settings.make_env(0), 0, device=device)
     assert isinstance(model, PPO)
     return model
