@@ -53,7 +53,8 @@ def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
         raise ValueError(f"{results.folder} does not say how its cells were trained: settings.json is missing")
     settings = config.settings(cell)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=16)
-    model = settings.make_model(env, cell.seed, device="cpu")
+    # Made on the games of training, whose rollouts its minibatches fit.
+    model = settings.make_model(settings.make_env(cell.seed), cell.seed, device="cpu")
     sb3_saf.load_weights(model, results.cell_folder(cell) / "model.zip")
     scalars: dict[str, Any] = dict(sb3_saf.inspect_team(model, env, n_episodes).scalars)
     scalars |= useless_commands(check_task(cell.task), *commands_and_zones(model, env))
