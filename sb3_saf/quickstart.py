@@ -98,7 +98,7 @@ def draw_curve(options: Options, random: EvaluationResult) -> Path:
     figure = Figure(figsize=(7, 4), dpi=120, layout="constrained")
     axes = figure.subplots()
     axes.plot(game_steps, returns, color="tab:blue", alpha=0.12, linewidth=0.5)
-    window = max(1, min(options.settings.n_envs * 5, len(returns) // 10))
+    window = max(1, min(options.settings.n_envs, len(returns) // 10))
     smooth = np.convolve(returns, np.ones(window) / window, mode="valid")
     axes.plot(game_steps[window - 1 :], smooth, color="tab:blue", label=f"SAF (mean of {window} episodes)")
     axes.axhline(random.mean, color="tab:grey", linestyle="--", label="random team")
