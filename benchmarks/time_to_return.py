@@ -17,7 +17,7 @@ import pandas as pd
 
 from sb3_saf.experiments.tables import read_results
 
-#: Points of a curve that are averaged; a single rollout of 16 games is noisy.
+#: Points of a curve that are averaged; a single one is noisy.
 _WINDOW = 5
 
 
