@@ -137,10 +137,8 @@ def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path
     words += ["-f", str(tmp_path)]
     process = subprocess.Popen([sys.executable, "-m", "sb3_saf.experiments", "run", *words], stdout=subprocess.DEVNULL)
     wait_until(lambda: list(tmp_path.glob("unfinished/*/*/*/job.json")))
-    wait_until(lambda: worker_of(process.pid))
     subprocess.run(["kill", "-9", str(worker_of(process.pid))], check=True)
     wait_until(lambda: len(list(tmp_path.glob("cells/*/*/*"))) >= 1)
-    wait_until(lambda: worker_of(process.pid))
     worker = worker_of(process.pid)
     process.kill()
     process.wait()
@@ -155,10 +153,17 @@ def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path
 
 
 def worker_of(driver: int) -> int:
-    """Return the process of a driver's worker; 0 if there is none."""
+    """Wait for the process of a driver's worker. Never 0, which kill takes for the whole group of the tests."""
     children = Path(f"/proc/{driver}/task/{driver}/children")
-    found = children.read_text().split() if children.exists() else []
-    return next((int(pid) for pid in found if b"cell" in Path(f"/proc/{pid}/cmdline").read_bytes()), 0)
+    workers: list[int] = []
+
+    def has_worker() -> bool:
+        found = children.read_text().split() if children.exists() else []
+        workers[:] = [int(pid) for pid in found if b"cell" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        return bool(workers)
+
+    wait_until(has_worker)
+    return workers[0]
 
 
 def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> None:
