@@ -28,7 +28,7 @@ def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
     They are those of ``sb3_saf.train --algo mappo --size small``: ``TeamRolloutBuffer``, and a few minibatches per
     rollout with the same number of game steps for any number of games. HECOGrid with tile codes has its own settings:
     the light encoder, narrow heads, normalised values, its discount, and a learning rate that decreases to 0. SAF
-    trains a third faster with ``policy_kwargs={"projection_arch": [], "latent_dim": 32}``, as in ``--algo saf``.
+    takes less time with ``policy_kwargs={"projection_arch": [], "latent_dim": 32}``, as in ``--algo saf``.
 
     :param env: from ``make_team_env``, with any number of games
     :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
