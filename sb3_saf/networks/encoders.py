@@ -216,7 +216,7 @@ class LightEncoder(Encoder):
     Tile codes are embedded once per code and looked up. Pictures are cut into tiles first.
 
     Tiles with similar pixels have similar embeddings. With zones that is a disadvantage: an orange agent's actions
-    differ from a red one's. ``one_hot_codes`` separates them (measured: ``results/README.md``).
+    differ from a red one's. ``one_hot_codes`` separates them.
 
     :param observation: pictures (either layout) or tile codes
     :param features_dim: size of the features
