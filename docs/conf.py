@@ -78,7 +78,8 @@ def _copy_pages() -> None:
     """Copy the pages that live outside this folder into it: Sphinx reads no others."""
     docs = ROOT / "docs"
     for folder, pages in (("notebooks", "tutorials"), ("results", "results")):
-        shutil.copytree(ROOT / folder, docs / pages, ignore=shutil.ignore_patterns("*.py*", "__*"), dirs_exist_ok=True)
+        shutil.rmtree(docs / pages, ignore_errors=True)  # pages that are gone
+        shutil.copytree(ROOT / folder, docs / pages, ignore=shutil.ignore_patterns("*.py*", "__*"))
         for copied in [*(docs / pages).rglob("*.md"), *(docs / pages).rglob("*.ipynb")]:
             text = copied.read_text(encoding="utf-8").replace("../docs/", "../")
             # A report is reached from the page that it belongs to, not from the sidebar.
