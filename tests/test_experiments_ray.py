@@ -88,8 +88,26 @@ class NodeKiller(RayEngine):
     def _kill(self) -> None:
         node = self.cluster.list_all_nodes()[-1]
         (raylet,) = (psutil.Process(info.process.pid) for info in node.all_processes["raylet"])
-        wait_until(lambda: any(is_cell(process) for process in raylet.children(recursive=True)))
+        workers: list[psutil.Process] = []
+        wait_until(lambda: workers.extend(filter(is_caught, raylet.children(recursive=True))) or workers)
         self.cluster.remove_node(node, allow_graceful=False)
+        for worker in workers:
+            worker.kill()
+
+
+def is_caught(worker: psutil.Process) -> bool:
+    """
+    Suspend a worker that runs a cell; return whether it does.
+
+    A worker outlives its node for a moment, in which it may finish the cell and send the result.
+    """
+    if not is_cell(worker):
+        return False
+    worker.suspend()
+    if is_cell(worker):
+        return True
+    worker.resume()
+    return False
 
 
 def is_cell(process: psutil.Process) -> bool:
