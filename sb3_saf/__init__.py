@@ -24,6 +24,7 @@ def _is_installed(name: str) -> bool:
 if _is_installed("stable_baselines3"):
     from sb3_saf.buffers.replay import TeamReplayBuffer
     from sb3_saf.buffers.rollout import TeamRolloutBuffer
+    from sb3_saf.callbacks.entropy import EntropySchedule
     from sb3_saf.callbacks.evaluation import TeamEvalCallback
     from sb3_saf.callbacks.finite import FiniteCallback
     from sb3_saf.callbacks.game_steps import GameStepsCallback
@@ -85,6 +86,7 @@ __all__ = [
     "CentralizedValueWrapper",
     "CheckpointError",
     "Curriculum",
+    "EntropySchedule",
     "EqualSpaces",
     "EvaluationResult",
     "ExportError",

@@ -89,7 +89,12 @@ class NodeKiller(RayEngine):
         node = self.cluster.list_all_nodes()[-1]
         (raylet,) = (psutil.Process(info.process.pid) for info in node.all_processes["raylet"])
         workers: list[psutil.Process] = []
-        wait_until(lambda: workers.extend(filter(is_caught, raylet.children(recursive=True))) or workers)
+
+        def is_any_caught() -> bool:
+            workers.extend(filter(is_caught, raylet.children(recursive=True)))
+            return bool(workers)
+
+        wait_until(is_any_caught)
         self.cluster.remove_node(node, allow_graceful=False)
         for worker in workers:
             worker.kill()

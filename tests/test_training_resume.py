@@ -54,11 +54,18 @@ def left(run: Path) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(("algo", "inspect_freq"), [("saf", "-1"), ("qplex", "100000")])
+@pytest.mark.parametrize(
+    ("algo", "more"),
+    [("saf", ("-params", "callback:sb3_saf.EntropySchedule")), ("qplex", ("--inspect-freq", "100000"))],
+)
 def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
-    algo: str, inspect_freq: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    algo: str,
+    more: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    options = ("--resume", "--inspect-freq", inspect_freq)
+    options = ("--resume", *more)
     train(tmp_path / "undisturbed", algo, "--seed", "3", *options)
     assert "unfinished: a new one begins" in capsys.readouterr().out
     for evaluation in (8, 14):

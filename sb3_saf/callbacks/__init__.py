@@ -1,1 +1,1 @@
-"""Callbacks: evaluation by team episodes, checks for NaN and infinity, game steps in the logs."""
+"""Callbacks: evaluation by team episodes, entropy schedule, checks for NaN and infinity, game steps in the logs."""

@@ -25,6 +25,7 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_saf.callbacks.entropy import EntropySchedule
 from sb3_saf.checkpoints.checks import check_keys, check_list, check_text, refused
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.envs.teams import game_seeds_of
@@ -45,6 +46,7 @@ _SCHEDULES: Final = ("lr_schedule", "clip_range", "clip_range_vf")
 #: Arguments of callbacks.
 _OF_CALLBACKS: Final[dict[type[BaseCallback], tuple[str, ...]]] = {
     EvalCallback: ("n_eval_episodes", "eval_freq", "deterministic"),
+    EntropySchedule: ("end",),
     EveryNTimesteps: ("n_steps",),
     StopTrainingOnMaxEpisodes: ("max_episodes",),
     StopTrainingOnNoModelImprovement: ("max_no_improvement_evals", "min_evals"),

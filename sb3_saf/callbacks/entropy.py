@@ -1,0 +1,56 @@
+"""Entropy bonus that changes during training, which SB3 has for the learning rate only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+
+class EntropySchedule(BaseCallback):
+    """
+    Change the entropy coefficient linearly from the model's ``ent_coef`` to ``end`` over the training.
+
+    An entropy bonus keeps agents exploring, but what it adds to their actions remains in the trained team, whose most
+    likely actions may then be worse than drawn ones. With a bonus that decreases to 0 they hardly differ.
+
+    Each update uses the value at the end of its rollout, as SB3 does for learning rates, and logs it as
+    ``train/ent_coef``. After training the model has its own value again.
+
+    In settings: ``callback: sb3_saf.EntropySchedule``.
+
+    :param end: value at the end of training, at least 0
+    :raises ValueError: if ``end`` is negative, or the algorithm has no fixed ``ent_coef``
+    """
+
+    def __init__(self, end: float = 0.0) -> None:
+        super().__init__()
+        if not end >= 0:
+            raise ValueError(f"end must be at least 0, got {end!r}")
+        self.end = end
+        self._start = 0.0
+
+    def _init_callback(self) -> None:
+        found = getattr(self.model, "ent_coef", None)
+        if not isinstance(found, (int, float)):
+            raise ValueError(
+                f"EntropySchedule changes the entropy coefficient of PPO and A2C; {type(self.model).__name__} has "
+                f"{'none' if found is None else f'ent_coef={found!r}'}; leave the callback out"
+            )
+        self._start = float(found)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        model: Any = self.model
+        self.logger.record("train/ent_coef", model.ent_coef)  # SB3 writes it beside the losses of the last update
+
+    def _on_rollout_end(self) -> None:
+        model: Any = self.model
+        done = self.num_timesteps / self.locals["total_timesteps"]
+        model.ent_coef = self._start + min(done, 1.0) * (self.end - self._start)
+
+    def _on_training_end(self) -> None:
+        model: Any = self.model
+        model.ent_coef = self._start
