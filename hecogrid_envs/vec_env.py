@@ -157,6 +157,8 @@ class NativeVecEnv(TeamVecEnv):
         self.params = batch.params
         env_class = TASKS[batch.task]
         self.games: list[HECOGridEnv] = [env_class.of_batch(batch, e, render_mode) for e in range(batch.n_games)]
+        #: Names of the agents of every game, in index order.
+        self.possible_agents = list(self.games[0].possible_agents)
         self._stagger = stagger
         #: Games in an episode that is shorter than others, (E,).
         self._is_short = np.zeros(batch.n_games, dtype=bool)

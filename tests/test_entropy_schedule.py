@@ -21,8 +21,11 @@ class Seen(BaseCallback):
     def __init__(self) -> None:
         super().__init__()
         self.coefficients: list[float] = []
+        self.saved: set[float] = set()
 
     def _on_step(self) -> bool:
+        model: Any = self.model
+        self.saved.add(model.ent_coef)
         return True
 
     def _on_rollout_end(self) -> None:
@@ -44,6 +47,7 @@ def test_updates_use_a_coefficient_that_changes_linearly(
     model.learn(4 * ROLLOUT, [EntropySchedule(end=0.04), seen], log_interval=1)
     assert seen.coefficients == pytest.approx([0.07, 0.06, 0.05, 0.04])
     assert model.ent_coef == 0.08
+    assert seen.saved == {0.08}  # a model that is saved during a rollout has its own value
     model.logger.close()
     with (tmp_path / "progress.csv").open() as file:
         logged = [float(row["train/ent_coef"]) for row in csv.DictReader(file)]
@@ -64,5 +68,11 @@ def test_what_has_no_entropy_coefficient_is_refused() -> None:
     model = QPLEX("QPLEXPolicy", env, replay_buffer_class=TeamReplayBuffer, buffer_size=100, device="cpu")
     with pytest.raises(ValueError, match="of PPO and A2C; QPLEX has none; leave the callback out"):
         model.learn(ROLLOUT, EntropySchedule())
-    with pytest.raises(ValueError, match="end must be at least 0, got -1"):
-        EntropySchedule(end=-1)
+    with pytest.raises(ValueError, match=r"ent_coef is 0\.0 from the start, as end; give the algorithm another"):
+        learner(PPO, ent_coef=0.0, batch_size=ROLLOUT).learn(ROLLOUT, EntropySchedule())
+
+
+@pytest.mark.parametrize("end", [-1, float("nan"), float("inf"), "x", None, True])
+def test_the_end_is_a_number(end: Any) -> None:
+    with pytest.raises(ValueError, match=f"end must be a number of at least 0, got {end!r}"):
+        EntropySchedule(end=end)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import warnings
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_saf import GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
+from sb3_saf import QPLEX, GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
 from tests.toy_envs import CounterEnv, TellingEnv
 
 
@@ -153,15 +154,59 @@ def test_observations_by_agent_give_actions_by_agent(policy: str) -> None:
         model.predict({**observations, "agent_2": observations["agent_1"]})
 
 
-def test_actors_that_read_who_acts_need_all_agents_or_their_index() -> None:
+def test_actors_that_read_who_acts_are_told_by_name_or_index() -> None:
     env = make_team_env(CounterEnv, n_envs=2, seed=0)
     model = PPO("IPPOPolicy", env, policy_kwargs={"actor_identity": True}, device="cpu")
     observations, _ = CounterEnv().reset(seed=0)
     actions, _ = model.predict(observations, deterministic=True)
     alone = {"obs": observations["agent_1"], "agent": 1}
     assert model.predict(alone, deterministic=True)[0] == actions["agent_1"]
+    alone = {"agent_1": observations["agent_1"]}
+    assert model.predict(alone, deterministic=True)[0] == {"agent_1": actions["agent_1"]}
+    with pytest.raises(ValueError, match=r"expected observations of 'agent_0', 'agent_1', the agents .* got 'agent_9'"):
+        model.predict({"agent_9": observations["agent_1"]})
     with pytest.raises(ValueError, match=r"expected the observation to have 'agent'"):
-        model.predict({"agent_1": observations["agent_1"]})
+        model.predict(observations["agent_1"])
+
+
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_agents_are_found_by_their_names(is_saved: bool, tmp_path: Path) -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    model: Any = PPO("MAPPOPolicy", env, policy_kwargs={"heads": "per_agent"}, device="cpu", seed=0)
+    for index, head in enumerate(model.policy.actor.head.heads):  # each agent prefers an action of its own
+        head.net[-1].bias.data[index] = 5
+    if is_saved:
+        model.save(tmp_path / "model")
+        model = PPO.load(tmp_path / "model", device="cpu")
+    seen = next(iter(CounterEnv().reset(seed=0)[0].values()))
+    by_index = [int(model.predict({"obs": seen, "agent": i}, deterministic=True)[0]) for i in range(2)]
+    assert by_index == [0, 1]
+    actions, _ = model.predict({"agent_1": seen, "agent_0": seen}, deterministic=True)
+    assert actions == {"agent_1": by_index[1], "agent_0": by_index[0]}
+
+
+@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXLstmPolicy"])
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_qplex_acts_by_agent(policy: str, deterministic: bool) -> None:
+    model: Any = QPLEX(policy, make_team_env(CounterEnv, n_envs=2, seed=0), buffer_size=100, device="cpu", seed=0)
+    observations, _ = CounterEnv().reset(seed=0)
+    model.set_random_seed(1)
+    actions, _ = model.predict(observations, deterministic=deterministic)
+    model.set_random_seed(1)
+    rows = {"obs": np.stack(list(observations.values())), "agent": np.arange(2)}
+    assert list(actions.values()) == model.predict(rows, deterministic=deterministic)[0].tolist()
+    assert list(actions) == list(observations)
+
+
+def test_observations_that_rows_convert_are_refused_with_the_way_to_act() -> None:
+    model: Any = PPO("IPPOPolicy", make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
+    seen = CounterEnv().reset(seed=0)[0]["agent_0"]
+    for observations, message in (
+        ({"agent_0": {"pos": seen}, "agent_1": {"pos": seen}}, r"with the keys 'obs', .* got 'pos'; where make_team"),
+        ({"agent_0": seen, "agent_1": seen[:-1]}, r"with one shape, that of rows, .* act on its rows"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.predict(observations)
 
 
 def test_masks_in_pettingzoos_form_are_understood() -> None:

@@ -276,10 +276,15 @@ def test_any_environment_is_trained_watched_drawn_and_tuned(tmp_path: Path, caps
     gif = tmp_path / "game.gif"
     result = zoo_enjoy.enjoy(["--env", COUNTER, "-f", logs, "--episodes", "2", "--gif", str(gif)])
     assert set(result.lengths) == {5} and gif.is_file()
-    zoo_plot.main(["curves", "-f", logs, "-o", str(tmp_path / "curves.png"), "--env", COUNTER])
-    assert (tmp_path / "curves.png").is_file()
+    zoo_plot.main(["curves", "-f", logs, "-o", str(tmp_path / "curves.svg"), "--env", COUNTER])
+    assert "<!-- team return -->" in (tmp_path / "curves.svg").read_text()  # not treasures
     zoo_train.main(["-optimize", "--n-trials", "1", *short])
     assert "Best: trial 0" in capsys.readouterr().out
+
+
+def test_games_that_cannot_be_shown_say_what_they_lack() -> None:
+    with pytest.raises(ValueError, match=r"unexpected keyword argument 'render_mode'; to show its games, give it"):
+        find_environment("tests.toy_envs:BareEnv").make_game({}, "human")
 
 
 def test_environments_by_other_names(tmp_path: Path) -> None:

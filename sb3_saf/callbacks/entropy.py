@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
@@ -15,18 +16,18 @@ class EntropySchedule(BaseCallback):
     likely actions may then be worse than drawn ones. With a bonus that decreases to 0 they hardly differ.
 
     Each update uses the value at the end of its rollout, as SB3 does for learning rates, and logs it as
-    ``train/ent_coef``. After training the model has its own value again.
+    ``train/ent_coef``. Outside updates the model has its own value, so that saved models and longer runs keep it.
 
     In settings: ``callback: sb3_saf.EntropySchedule``.
 
     :param end: value at the end of training, at least 0
-    :raises ValueError: if ``end`` is negative, or the algorithm has no fixed ``ent_coef``
+    :raises ValueError: if ``end`` is no such number, or the algorithm has no ``ent_coef`` that differs from it
     """
 
     def __init__(self, end: float = 0.0) -> None:
         super().__init__()
-        if not end >= 0:
-            raise ValueError(f"end must be at least 0, got {end!r}")
+        if isinstance(end, bool) or not isinstance(end, (int, float)) or not 0 <= end < math.inf:
+            raise ValueError(f"end must be a number of at least 0, got {end!r}")
         self.end = end
         self._start = 0.0
 
@@ -37,6 +38,11 @@ class EntropySchedule(BaseCallback):
                 f"EntropySchedule changes the entropy coefficient of PPO and A2C; {type(self.model).__name__} has "
                 f"{'none' if found is None else f'ent_coef={found!r}'}; leave the callback out"
             )
+        if found == self.end:
+            raise ValueError(
+                f"EntropySchedule has nothing to change: ent_coef is {found} from the start, as end; give the "
+                "algorithm another, such as ent_coef=0.01"
+            )
         self._start = float(found)
 
     def _on_step(self) -> bool:
@@ -45,6 +51,7 @@ class EntropySchedule(BaseCallback):
     def _on_rollout_start(self) -> None:
         model: Any = self.model
         self.logger.record("train/ent_coef", model.ent_coef)  # SB3 writes it beside the losses of the last update
+        model.ent_coef = self._start
 
     def _on_rollout_end(self) -> None:
         model: Any = self.model

@@ -83,12 +83,15 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     def __init__(self, venv: VecEnv, n_agents: int | None = None, time_limit: TimeLimit = "terminal") -> None:
         check_choice("time_limit", time_limit, TIME_LIMITS)
         raw = RowSpaces.of(venv.observation_space, venv.action_space)
+        n_agents = require_n_agents(venv, n_agents)
+        names = getattr(venv, "possible_agents", None)
         team = TeamSpaces.of(
             channels_first(raw.own),
-            require_n_agents(venv, n_agents),
+            n_agents,
             raw.active,
             raw.n_masked_actions,
             None if raw.state is None else channels_first(raw.state),
+            names if names is not None and len(names) == n_agents else None,
         )
         if _sb3_would_transpose(team):
             venv = _protected_from_transposition(venv, n_agents)

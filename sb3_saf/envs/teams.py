@@ -58,6 +58,19 @@ FIXED_SHAPE: Final = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary,
 _TEAM_ATTRIBUTES: Final = ("n_agents", "n_games")
 
 
+class AgentSpace(spaces.Discrete):
+    """
+    Discrete(N), the index of an agent in its team, with the agents' names.
+
+    :param n_agents: N
+    :param names: PettingZoo's names of the agents in index order; None if they are unknown
+    """
+
+    def __init__(self, n_agents: int, names: Sequence[Any] | None = None) -> None:
+        super().__init__(n_agents)
+        self.names = None if names is None else tuple(names)
+
+
 class TeamSpaces(NamedTuple):
     """
     Parts of the Dict observation of ``CentralizedValueWrapper``.
@@ -87,6 +100,7 @@ class TeamSpaces(NamedTuple):
         active: bool = False,
         n_masked_actions: int | None = None,
         state: spaces.Space[Any] | None = None,
+        names: Sequence[Any] | None = None,
     ) -> TeamSpaces:
         """
         Return the spaces of a team whose agents share one observation space.
@@ -96,6 +110,7 @@ class TeamSpaces(NamedTuple):
         :param active: whether rows have ``"active"``
         :param n_masked_actions: A if rows have action masks
         :param state: space of the game's state if rows have it
+        :param names: the agents' names in index order, if they are known
         :raises ValueError: if ``own`` is another kind of space
         """
         low, high = bounds_of(own)
@@ -107,7 +122,7 @@ class TeamSpaces(NamedTuple):
         return cls(
             own,
             team,
-            spaces.Discrete(n_agents),
+            AgentSpace(n_agents, names),
             n_agents,
             spaces.MultiBinary(n_agents) if active else None,
             None if n_masked_actions is None else spaces.MultiBinary(n_masked_actions),
@@ -151,6 +166,12 @@ class TeamSpaces(NamedTuple):
         """Keys of a row's observation."""
         optional = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
         return (*TEAM_KEYS, *(key for key, space in optional.items() if space is not None))
+
+    @property
+    def names(self) -> tuple[Any, ...] | None:
+        """The agents' names in index order; None if they are unknown."""
+        names: tuple[Any, ...] | None = getattr(self.agent, "names", None)
+        return names
 
     @property
     def own_shape(self) -> tuple[int, ...]:

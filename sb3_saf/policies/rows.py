@@ -112,34 +112,60 @@ class TeamRowsPolicy(BasePolicy):
         Act as SB3's ``predict``; also on the observations of a PettingZoo environment.
 
         :param observation: rows, some of their entries, only own observations, or ``{agent: observation}`` of a
-            ParallelEnv. If the actor reads the agent's index, the latter must have all agents in index order. A model
+            ParallelEnv, of some or all of its agents in any order. Agents are found by their names; if the training
+            environment had no names, an actor that reads the index needs all agents in index order. Observations have
+            the space of the rows' own (``make_team_env`` flattens Dicts and pads agents with other spaces). A model
             trained on tile codes also takes the pixels of the same game
         :param args: state, episode_start, deterministic as in SB3
         :param kwargs: the same, and ``action_masks`` of MaskablePPO
         :return: actions and the next state; ``{agent: action}`` for ``{agent: observation}``
         """
-        if not self._is_by_agent(observation):
+        if not self.is_by_agent(observation):
             return super().predict(observation, *args, **kwargs)
-        rows = self._stacked(observation)
-        actions, state = super().predict(rows, *args, **kwargs)
+        actions, state = self.predict(self.rows_of(observation), *args, **kwargs)
         return dict(zip(observation, actions, strict=True)), state
 
-    def _is_by_agent(self, observation: object) -> bool:
+    def is_by_agent(self, observation: object) -> bool:
+        """Return whether an observation is ``{agent: observation}`` of a ParallelEnv."""
         return isinstance(observation, Mapping) and bool(observation) and not (set(observation) & (ALL_KEYS | _CLASSIC))
 
-    def _stacked(self, observations: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Stack observations by agent to rows."""
-        n_agents, first = self.team_spaces.n_agents, next(iter(observations.values()))
-        if len(observations) > n_agents:
-            raise ValueError(f"expected observations of at most {n_agents} agents, got {len(observations)}")
+    def rows_of(self, observations: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """
+        Stack observations by agent to rows.
+
+        :param observations: ``{agent: observation}``
+        :raises ValueError: for unknown agents, and observations in another form than the rows' own
+        """
+        first = next(iter(observations.values()))
         if isinstance(first, Mapping):
             entries = [self._renamed(one) for one in observations.values()]
-            rows = {key: np.stack([np.asarray(entry[key]) for entry in entries]) for key in entries[0]}
+            if unknown := [key for key in entries[0] if key not in self.team_spaces.keys]:
+                raise _not_as_rows(f"the keys {', '.join(map(repr, self.team_spaces.keys))}", repr(unknown[0]))
+            rows = {key: self._stacked([entry[key] for entry in entries]) for key in entries[0]}
         else:
-            rows = {OBS_KEY: np.stack([np.asarray(one) for one in observations.values()])}
-        if len(observations) == n_agents:
-            rows.setdefault(AGENT_KEY, np.arange(n_agents))
-        return rows
+            rows = {OBS_KEY: self._stacked(list(observations.values()))}
+        indices = self._indices_of(list(observations))
+        return rows if indices is None else {AGENT_KEY: indices, **rows}
+
+    def _stacked(self, values: list[Any]) -> np.ndarray:
+        arrays = [np.asarray(value) for value in values]
+        if len(shapes := {array.shape for array in arrays}) > 1:
+            raise _not_as_rows(f"one shape, that of rows, {self.team_spaces.own_shape}", str(sorted(shapes)))
+        return np.stack(arrays)
+
+    def _indices_of(self, agents: list[Any]) -> np.ndarray | None:
+        """Return the indices of agents by their names; without names, those of a whole team are in order."""
+        n_agents, names = self.team_spaces.n_agents, self.team_spaces.names
+        if len(agents) > n_agents:
+            raise ValueError(f"expected observations of at most {n_agents} agents, got {len(agents)}")
+        if names is None:
+            return np.arange(n_agents) if len(agents) == n_agents else None
+        if unknown := [agent for agent in agents if agent not in names]:
+            raise ValueError(
+                f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, got "
+                f"{unknown[0]!r}"
+            )
+        return np.array([names.index(agent) for agent in agents])
 
     def _renamed(self, entries: Mapping[str, Any]) -> Mapping[str, Any]:
         """Rename PettingZoo's keys to those of rows."""
@@ -290,6 +316,13 @@ class TeamRowsPolicy(BasePolicy):
             return None
         has_convolutions = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
         return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
+
+
+def _not_as_rows(expected: str, got: str) -> ValueError:
+    return ValueError(
+        f"expected observations by agent with {expected}, got {got}; where make_team_env converts observations (Dicts, "
+        "agents with other spaces), act on its rows: env = make_team_env(...), model.predict(env.reset())"
+    )
 
 
 def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:

@@ -223,14 +223,14 @@ class QPLEXPolicy(TeamRowsPolicy):
         """
         Act greedily, as SB3's ``predict``.
 
-        :param observation: rows, or only own observations (and ``"agent"`` for memory or one head per agent); one or a
-            batch
+        :param observation: rows, only own observations (and ``"agent"`` for memory or one head per agent), one or a
+            batch; or ``{agent: observation}``
         :param state: recurrent state after the last step: hidden state, cell state, last action. None at the start
         :param episode_start: (B,) where an episode starts, which resets the state
         :param deterministic: unused
         :return: actions (B,) and the next state
         """
-        if self.memory is None:
+        if self.memory is None or self.is_by_agent(observation):
             return super().predict(observation, state, episode_start, deterministic)
         self.set_training_mode(False)
         obs, is_batch = self.obs_to_tensor(observation)

@@ -256,20 +256,24 @@ class QPLEX(OffPolicyAlgorithm):
 
     def predict(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
+        observation: Any,
         state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, State | None]:
+    ) -> tuple[Any, State | None]:
         """
         Act from own observations.
 
-        :param observation: rows, or only own observations; see :meth:`QPLEXPolicy.predict`
+        :param observation: rows, only own observations, or ``{agent: observation}``; see :meth:`QPLEXPolicy.predict`
         :param state: state of policies with memory
         :param episode_start: (B,) where an episode starts
         :param deterministic: False explores with the current exploration rate, each agent independently
         :return: actions and the next state
         """
+        if self.policy.is_by_agent(observation):
+            rows = self.policy.rows_of(observation)
+            actions, state = self.predict(rows, state, episode_start, deterministic)
+            return dict(zip(observation, actions, strict=True)), state
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
         if deterministic or not self.exploration_rate:
             return actions, state

@@ -102,7 +102,8 @@ class TeamEnvironment:
         try:
             game = team_game(self.make(**kwargs))
         except TypeError as error:  # most often an argument that it does not have
-            raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}") from error
+            hint = "" if render_mode is None else "; to show its games, give it the argument render_mode (PettingZoo's)"
+            raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}{hint}") from error
         if not isinstance(game, pettingzoo.ParallelEnv):
             raise ValueError(f"expected {self.id} to make a PettingZoo ParallelEnv, got a {type(game).__name__}")
         return game

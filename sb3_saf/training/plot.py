@@ -62,7 +62,7 @@ def plot(arguments: Sequence[str] | None = None) -> None:
 def _draw(options: argparse.Namespace) -> Figure:
     import pandas as pd
 
-    from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_levels
+    from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_levels
     from sb3_saf.training.runs import describe, find_runs, setting_names
     from sb3_saf.training.statistics import score_matrices
 
@@ -74,19 +74,20 @@ def _draw(options: argparse.Namespace) -> Figure:
     for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
         if changes not in method:
             print(f"{method}: {changes}")
+    are_treasures = "n_treasures" in table and table["n_treasures"].notna().all()
+    y_label = TEAM_RETURN if are_treasures else "team return"
     if options.kind == "curves":
         names = ("method", "seed", "setting")
         curves = [
             row.run.curve(options.source).assign(**{k: getattr(row, k) for k in names}) for row in table.itertuples()
         ]
-        return draw_curves(pd.concat(curves), options.title, panel="setting")
+        return draw_curves(pd.concat(curves), options.title, panel="setting", y_label=y_label)
     table["score"] = [run.final_score(options.source) for run in table["run"]]
     if options.kind == "levels":
-        return draw_levels(table, options.level, options.title, panel="setting")
-    label = "team return"
-    if "n_treasures" in table and table["n_treasures"].notna().all():
-        table["score"], label = table["score"] / table["n_treasures"], "treasures collected / on the map"
-    return draw_aggregates(score_matrices(table, "setting"), options.title, label)
+        return draw_levels(table, options.level, options.title, panel="setting", y_label=y_label)
+    if are_treasures:
+        table["score"], y_label = table["score"] / table["n_treasures"], "treasures collected / on the map"
+    return draw_aggregates(score_matrices(table, "setting"), options.title, y_label)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
