@@ -45,11 +45,13 @@ def test_closing_ends_the_workers_with_a_last_checkpoint(tmp_path: Path) -> None
 
 
 DRIVER = """
-    import sys
+    import signal
     from pathlib import Path
     from sb3_saf.experiments.engines import LocalEngine
     from tests.experiments_jobs import WORKER, order
 
+    # A shell lets what it runs in the background ignore the signal.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with LocalEngine(1, command=WORKER) as engine:
             future = engine.submit(order(Path({folder!r}), "a", "sleep"))
