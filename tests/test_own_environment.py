@@ -198,6 +198,17 @@ def test_qplex_acts_by_agent(policy: str, deterministic: bool) -> None:
     assert list(actions) == list(observations)
 
 
+def test_qplex_explores_legal_actions_by_agent() -> None:
+    model: Any = QPLEX(
+        "QPLEXPolicy", make_team_env(lambda: TellingEnv(n_agents=2), seed=0), buffer_size=100, device="cpu"
+    )
+    observations, _ = TellingEnv(n_agents=2).reset(seed=0)
+    assert model.exploration_rate == 1.0
+    for _ in range(20):
+        actions, _ = model.predict(observations)
+        assert all(observations[agent]["action_mask"][action] == 1 for agent, action in actions.items())
+
+
 def test_observations_that_rows_convert_are_refused_with_the_way_to_act() -> None:
     model: Any = PPO("IPPOPolicy", make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
     seen = CounterEnv().reset(seed=0)[0]["agent_0"]

@@ -1,4 +1,4 @@
-"""Entropy bonus that changes during training, which SB3 has for the learning rate only."""
+"""Linear schedule of the entropy coefficient; SB3 has schedules of the learning rate and the clip range only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class EntropySchedule(BaseCallback):
     Change the entropy coefficient linearly from the model's ``ent_coef`` to ``end`` over the training.
 
     An entropy bonus keeps agents exploring, but what it adds to their actions remains in the trained team, whose most
-    likely actions may then be worse than drawn ones. With a bonus that decreases to 0 they hardly differ.
+    likely actions may then be worse than drawn ones. With a bonus that decreases to 0 they lose less (results page).
 
     Each update uses the value at the end of its rollout, as SB3 does for learning rates, and logs it as
     ``train/ent_coef``. Outside updates the model has its own value, so that saved models and longer runs keep it.
