@@ -119,6 +119,7 @@ BAD = {
     ("report", "joint", "-f", "nowhere"): "there is no folder nowhere; name another with -f, or run it first: python",
     ("report", "joint", "-f", "empty"): "empty has no results of 'joint'; run it first: python -m",
     ("run", "joint", "--size", "huge"): "argument --size: invalid choice",
+    ("run", "joint", "-params", "policy_kwargs:{n_slots: 4}"): "unknown argument of MAPPOPolicy 'n_slots'",
     ("fly",): "argument COMMAND: invalid choice",
     ("check",): "the following arguments are required: FOLDER/CELL",
     ("check", "empty"): "empty is no finished cell; expected RESULTS/cells/TASK-LEVEL/METHOD/seed-N",
@@ -136,3 +137,4 @@ def test_one_line_errors(
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
     assert message in failed(words, capsys, cli.main)
+    assert [*Path().iterdir()] == [Path("empty")]  # nothing that would refuse the corrected command

@@ -12,6 +12,7 @@ from torch import nn
 from sb3_saf.networks import attention
 from sb3_saf.networks.layers import mlp, side_by_side
 from sb3_saf.networks.tanh import Tanh
+from sb3_saf.policies.distributions import LeanCategorical
 
 
 def gradients(function: Callable[..., th.Tensor], *inputs: th.Tensor) -> list[th.Tensor]:
@@ -85,3 +86,20 @@ def test_compiled_attention_is_attention(queries: th.Tensor, masked: bool, of_we
         th.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
     if active is not None:
         assert not found[0][2].any()
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (400, 2), (48, 33)])
+def test_actions_are_those_of_multinomial(shape: tuple[int, int]) -> None:
+    distribution = LeanCategorical(shape[1]).proba_distribution(3 * th.randn(shape))
+    th.manual_seed(1)
+    found = distribution.sample(), th.rand(1)
+    th.manual_seed(1)
+    expected = th.multinomial(distribution.log_probs.exp(), 1, True).squeeze(1), th.rand(1)
+    assert th.equal(found[0], expected[0]) and th.equal(found[1], expected[1])
+
+
+def test_nan_probabilities_are_refused() -> None:
+    logits = th.zeros(7, 5)
+    logits[3, 2] = th.nan
+    with pytest.raises(ValueError, match=r"probabilities of actions are NaN.*lower the learning rate"):
+        LeanCategorical(5).proba_distribution(logits).sample()

@@ -98,11 +98,12 @@ def test_sizes_are_those_of_the_experiments() -> None:
     assert smoke.game_steps <= 1000
 
 
-def test_ablations_are_arguments_of_saf() -> None:
-    saf, no_pool, no_ks = (load_settings(algo, ENV, "smoke") for algo in ("saf", "saf-no-pool", "saf-no-ks"))
+@pytest.mark.parametrize("size", ["smoke", "small"])
+def test_ablations_are_arguments_of_saf(size: str) -> None:
+    saf, no_pool, no_ks = (load_settings(algo, ENV, size) for algo in ("saf", "saf-no-pool", "saf-no-ks"))
     assert no_pool.hyperparams["policy_kwargs"] == {**saf.hyperparams["policy_kwargs"], "n_policies": 1}
     assert no_ks.hyperparams["policy_kwargs"] == {**saf.hyperparams["policy_kwargs"], "knowledge_source": False}
-    without = [{**s.hyperparams, "policy_kwargs": None} for s in (saf, no_pool, no_ks)]
+    without = [{**s.as_dict()["hyperparams"], "policy_kwargs": None} for s in (saf, no_pool, no_ks)]
     assert without[0] == without[1] == without[2]
 
 

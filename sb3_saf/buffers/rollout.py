@@ -195,6 +195,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     def _allocate_by_game(self) -> None:
         """Allocate the arrays with one entry per step and game, (T, E, ...)."""
+        self._agents_of_steps = th.arange(self.n_agents, device=self.device).repeat(self.buffer_size * self.n_games, 1)
         self.active: Array | None = None
         self.states: Array | None = None
         shape = (self.buffer_size, self.n_games)
@@ -408,16 +409,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     def _of_team_steps(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
         """Select team steps: (T, E, ...) -> (K, ...)."""
-        return array.reshape(self.buffer_size * self.n_games, *array.shape[2:])[team_steps]
+        return array.reshape(self.buffer_size * self.n_games, *array.shape[2:]).take(team_steps, axis=0)
 
     def _gather(self, array: Array, team_steps: npt.NDArray[np.int64]) -> th.Tensor:
         """Gather team steps: (T, B, ...) -> (K, N, ...); with game-major rows, each team step is contiguous."""
         by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
-        return self.to_torch(by_team[team_steps], copy=False)
+        return self.to_torch(by_team.take(team_steps, axis=0), copy=False)
 
     def _entries(self, team_steps: npt.NDArray[np.int64]) -> dict[str, th.Tensor]:
         """Return the rows' entries other than own observations, in the shapes of SB3's buffer."""
-        entries = {AGENT_KEY: th.arange(self.n_agents, device=self.device).repeat(len(team_steps)).unsqueeze(1)}
+        entries = {AGENT_KEY: self._agents_of_steps[: len(team_steps)].reshape(-1, 1)}
         if ACTION_MASK_KEY in self.observations:
             entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):

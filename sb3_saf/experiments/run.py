@@ -79,10 +79,11 @@ def run(
     grid = expand(experiment, selection, config)
     results.check_experiment(experiment)
     results.agree(config, grid.cells)
-    results.save_config(config)
-    results.add_selection(experiment, selection)
     cells = shard.of(grid.cells)
     todo = [cell for cell in cells if results.missing_tests(cell)]
+    progress = _Progress(todo, config, results, engine, options or CellOptions())
+    results.save_config(config)  # of settings with which all cells can be made
+    results.add_selection(experiment, selection)
     for left_out in grid.left_out:
         print(left_out)
     for error in results.damaged.values():
@@ -92,7 +93,6 @@ def run(
         f"{experiment.name}: {len(grid.cells)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
         f"{results.folder}"
     )
-    progress = _Progress(todo, config, results, engine, options or CellOptions())
     # On a terminal a bar with the remaining time; in a log file a line per cell.
     with tqdm(total=len(todo), unit="cell", disable=None, dynamic_ncols=True) as bar, progress, engine:
         for line in progress.lines():

@@ -6,6 +6,7 @@ Letters: B rows, U policies, P parameters, D action dimensions.
 
 from __future__ import annotations
 
+from math import isnan
 from typing import Any, ClassVar, cast
 
 import torch as th
@@ -123,8 +124,19 @@ class LeanCategorical(CategoricalDistribution):
         return -(self.log_probs.exp() * self.log_probs).sum(dim=1)
 
     def sample(self) -> th.Tensor:
-        """Sample actions (B,)."""
-        return th.multinomial(self.log_probs.exp(), 1, True).squeeze(1)
+        """
+        Sample actions (B,), those of ``torch.multinomial`` from the same random numbers.
+
+        :raises ValueError: for NaN
+        """
+        probabilities = self.log_probs.exp()
+        if isnan(probabilities.sum().item()):
+            raise ValueError(
+                "the probabilities of actions are NaN: the policy's parameters, or its observations, are; check the "
+                "observations' range, lower the learning rate, or set max_grad_norm"
+            )
+        # The first of A exponential clocks with rates p: action a with probability p_a.
+        return (probabilities / th.empty_like(probabilities).exponential_()).argmax(dim=1)
 
     def mode(self) -> th.Tensor:
         """Return the most likely actions (B,)."""

@@ -224,7 +224,7 @@ def load_settings(
     content = read_config(spec.config) if config is None else read_file(config)
     _check_environments(content, environment, source)
     own = _checked_keys(entry_of(content, environment.yaml_keys, size), spec, source)
-    given = _exclusive(_checked_keys(overrides or {}, spec, "the given settings"))
+    given = _exclusive(_checked(overrides or {}, spec, "the given settings"))
     level = entry_of(read_config("levels"), environment.yaml_keys, size)
     layers = (level, own, given, {"env_kwargs": env_kwargs or {}}, {"policy_kwargs": dict(spec.policy_kwargs)})
     return _build(algo, environment, size, _for_algorithm(algo, merge(*layers)))
@@ -245,7 +245,7 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
         raise ValueError(f"expected saved hyperparams to map names to values, got {saved['hyperparams']!r}")
     spec = find_algorithm(saved["algo"])
     own = {key: saved[key] for key in _OWN_KEYS if key in saved and saved[key] != spec.algorithm.__name__}
-    entry = merge(_checked_keys({**own, **saved["hyperparams"]}, spec, "the saved settings"))
+    entry = merge(_checked({**own, **saved["hyperparams"]}, spec, "the saved settings"))
     # Reading N from the file avoids importing the games' package for plots.
     n_agents = None if env_kwargs else saved.get("n_agents")
     return _build(
@@ -276,7 +276,7 @@ def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment
 
 
 def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> dict[str, Any]:
-    """Rename RL-Zoo3's keys; raise ValueError for unknown keys, and for values that contradict the algorithm."""
+    """Rename RL-Zoo3's keys; raise ValueError for unknown keys."""
     entry = dict(entry)
     known = [*_OWN_KEYS, *algorithm_arguments(spec.algorithm)]
     if _N_TIMESTEPS in entry:
@@ -296,6 +296,12 @@ def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) ->
             raise ValueError(f"{source}: {unknown_name('setting', key, known)}")
     for key in MERGED:
         resolve(key, entry.get(key, {}), _OWN_KEYS[key])
+    return entry
+
+
+def _checked(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> dict[str, Any]:
+    """Check the keys, and raise ValueError for values that contradict the algorithm; a file is for all its names."""
+    entry = _checked_keys(entry, spec, source)
     for key, value in entry.get("policy_kwargs", {}).items():
         if spec.policy_kwargs.get(key, value) != value:
             raise ValueError(
