@@ -511,6 +511,8 @@ BAD_ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"n_policies": 0}, r"n_policies must be an integer of at least 1, got 0"),
     ({"n_slots": 2.5}, r"n_slots must be an integer of at least 1, got 2.5"),
     ({"latent_dim": True}, r"latent_dim must be an integer of at least 1, got True"),
+    ({"knowledge_source": "no"}, r"knowledge_source must be True or False, got 'no'"),
+    ({"actor_identity": 1}, r"actor_identity must be True or False, got 1"),
     ({"chunk_size": -1}, r"chunk_size must be an integer of at least 1, got -1"),
     ({"use_sde": True}, r"team policies have no state-dependent exploration \(gSDE\): leave use_sde=False"),
     ({"share_features_extractor": False}, r"share the features extractor .*: leave share_features_extractor=True"),

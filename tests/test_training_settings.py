@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import inspect
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def test_sizes_are_those_of_the_experiments() -> None:
 
 
 @pytest.mark.parametrize("size", ["smoke", "small"])
-def test_ablations_are_arguments_of_saf(size: str) -> None:
+def test_ablations_are_arguments_of_saf(size: Size) -> None:
     saf, no_pool, no_ks = (load_settings(algo, ENV, size) for algo in ("saf", "saf-no-pool", "saf-no-ks"))
     assert no_pool.hyperparams["policy_kwargs"] == {**saf.hyperparams["policy_kwargs"], "n_policies": 1}
     assert no_ks.hyperparams["policy_kwargs"] == {**saf.hyperparams["policy_kwargs"], "knowledge_source": False}
@@ -120,6 +121,18 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
     assert of_the_size["features_extractor_class"] is LightEncoder
     assert settings.hyperparams["policy_kwargs"] == {**of_the_size, "n_slots": 8}
     assert (settings.env_kwargs["coordination"], settings.env_kwargs["grid_size"]) == (2, 15)
+
+
+@pytest.mark.parametrize("algorithm", ["A2C", "TRPO"])
+def test_another_algorithm_takes_the_settings_that_it_has(algorithm: str) -> None:
+    settings = load_settings("saf", ENV, "small", overrides={"algo": algorithm, "n_envs": 2})
+    with closing(settings.make_env(0)) as env:
+        model = settings.make_model(env, 0, device="cpu")
+        model.learn(model.n_envs)
+    assert type(model).__name__ == algorithm
+    assert (model.gamma, model.gae_lambda, model.n_steps) == (0.9, 0.9, 10)  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="unknown setting 'clip_range'"):
+        load_settings("saf", ENV, "small", overrides={"algo": algorithm, "clip_range": 0.1})
 
 
 def test_a_batch_size_replaces_the_number_of_minibatches() -> None:

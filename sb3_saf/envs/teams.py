@@ -305,6 +305,12 @@ def check_count(name: str, value: object) -> int:
     return int(value)
 
 
+def check_flag(name: str, value: object) -> None:
+    """Check that an argument is True or False; the ValueError contains ``name``."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
     """Check that an argument is one of ``choices``; the ValueError lists them."""
     if value not in choices:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, NamedTuple, get_args
 
 from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.envs.teams import check_choice
+from sb3_saf.envs.teams import check_choice, check_flag
 from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.layers import NetworkSpec
@@ -49,6 +49,8 @@ class TeamParts(ABC):
 
     def __post_init__(self) -> None:
         check_choice("heads", self.heads, get_args(Heads))
+        for flag in [one.name for one in fields(self) if isinstance(one.default, bool)]:
+            check_flag(flag, getattr(self, flag))
 
     def n_identities(self, spec: NetworkSpec) -> int:
         """Return N if a shared actor reads the agent's index, else 0."""

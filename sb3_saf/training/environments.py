@@ -26,11 +26,12 @@ ENV_IDS: Final = tuple(TASK_OF_ENV)
 HECOGRID: Final = "hecogrid"
 #: Tile codes are the default: the same views as the paper's pictures in 49 bytes.
 _HECOGRID_DEFAULTS: Final = {"observation": "tiles"}
-HOW_TO_NAME: Final = (
-    f"{', '.join(ENV_IDS)}, a task of a suite (lbf/Foraging-8x8-2p-3f-v3; python -m sb3_saf.suites lists them), a "
+_OTHERS: Final = (
+    "a task of a suite (lbf/Foraging-8x8-2p-3f-v3; python -m sb3_saf.suites lists them), a "
     "module with parallel_env (mpe2.simple_spread_v3), a function that makes a ParallelEnv "
     "(my_package.my_module:make_env), or an id registered with PettingZoo"
 )
+HOW_TO_NAME: Final = f"{', '.join(ENV_IDS)}, {_OTHERS}"
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def find_environment(env_id: str) -> TeamEnvironment:
     if ":" in name or "." in name or _is_module(name):
         module, _, function = name.partition(":")
         return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"--env {name}"))
-    raise ValueError(f"{unknown_name('environment', env_id, ENV_IDS)}; others are named {HOW_TO_NAME}")
+    raise ValueError(f"{unknown_name('environment', env_id, ENV_IDS)}; others are named by {_OTHERS}")
 
 
 def _maker(one: SuiteTask) -> Callable[..., Any]:

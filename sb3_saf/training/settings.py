@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -166,6 +167,7 @@ class Settings:
         :param seed: the run's seed
         :raises ValueError: if the algorithm rejects its arguments
         """
+        self._check_masks(env)
         try:
             return self.spec.algorithm(
                 self.spec.policy,
@@ -178,6 +180,13 @@ class Settings:
             )
         except (AssertionError, TypeError) as error:  # SB3's checks of its arguments
             raise ValueError(str(error)) from error
+
+    def _check_masks(self, env: CentralizedValueWrapper) -> None:
+        if issubclass(self.spec.algorithm, MaskablePPO) and not is_masking_supported(env):
+            raise ValueError(
+                f"MaskablePPO is for games that tell which actions are legal; {self.env_id} has no action masks: leave "
+                "algo:MaskablePPO out"
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """Return all settings as plain data, for a file with the results."""
@@ -226,6 +235,7 @@ def load_settings(
     own = _checked_keys(entry_of(content, environment.yaml_keys, size), spec, source)
     given = _exclusive(_checked(overrides or {}, spec, "the given settings"))
     level = entry_of(read_config("levels"), environment.yaml_keys, size)
+    own = _known_to(given.get("algorithm"), algo, own)
     layers = (level, own, given, {"env_kwargs": env_kwargs or {}}, {"policy_kwargs": dict(spec.policy_kwargs)})
     return _build(algo, environment, size, _for_algorithm(algo, merge(*layers)))
 
@@ -255,6 +265,15 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
         merge(entry, {"env_kwargs": env_kwargs or {}}),
         None if n_agents is None else resolve("n_agents", n_agents, int),
     )
+
+
+def _known_to(algorithm: str | None, algo: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """Leave out settings of the method's file that an algorithm given in place of its own does not have."""
+    if algorithm is None:
+        return entry
+    known = algorithm_arguments(find_algorithm(algo, algorithm).algorithm)
+    left_out = {"n_minibatches"} if "batch_size" not in known else set()
+    return {key: value for key, value in entry.items() if key in {*known, *_OWN_KEYS} - left_out}
 
 
 def _for_algorithm(algo: str, entry: dict[str, Any]) -> dict[str, Any]:

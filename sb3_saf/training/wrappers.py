@@ -99,7 +99,10 @@ def wrap_rows(
     for wrapper, arguments in named(wrapping.get("vec_env_wrapper"), "vec_env_wrapper"):
         if not isinstance(wrapper, type) or not issubclass(wrapper, VecEnvWrapper):
             raise ValueError(f"vec_env_wrapper must be a class of SB3's VecEnvWrapper, got {wrapper}")
-        rows = wrapper(rows, **arguments)
+        try:
+            rows = wrapper(rows, **arguments)
+        except (TypeError, AssertionError) as error:
+            raise ValueError(f"vec_env_wrapper: {error}") from error
     if normalize is not None:
         rows = _normalized(rows, {} if normalize is True else dict(normalize), gamma, is_training)
     return CentralizedValueWrapper(rows, time_limit=env.time_limit)
