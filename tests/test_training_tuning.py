@@ -132,6 +132,12 @@ def test_unknown_studies_and_trials_are_one_line(
     assert words in failed([*SMOKE, "--storage", storage, "-f", str(tmp_path), *options], capsys)
 
 
+def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tune(tmp_path)
+    line = failed(given(tmp_path, "--algo", "mappo"), capsys)
+    assert f"the trials of the study 's' are of saf on {ENV}, not of mappo on {ENV}" in line
+
+
 def _sampled(algo: str, fixed: dict[str, Any] | None = None) -> dict[str, Any]:
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     return sample_overrides(study.ask(), ALGOS[algo], fixed or {})

@@ -351,12 +351,14 @@ def _tune(options: argparse.Namespace, command: str) -> None:
         n_evaluations=options.n_evaluations,
         **{key: getattr(options, key) for key in keys},
     )
-    print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
+    goal = f"{settings.algo} on {settings.env_id}"
+    print(f"Tuning {goal}: {settings.game_steps:,} game steps a trial")
     with user_errors():
         study = optimize(
             lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options)))[0],
             tuning,
             command,
+            goal,
         )
         folder = options.log_folder / settings.algo
         folder.mkdir(parents=True, exist_ok=True)

@@ -150,8 +150,16 @@ class Tuning:
     log_path: Path | None = None
 
 
-def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str) -> optuna.Study:
-    """Run trials with settings from ``settings_of``, and return the study, in which ``command`` is stored."""
+def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str, goal: str) -> optuna.Study:
+    """
+    Run trials and return the study.
+
+    :param settings_of: makes the settings of a trial
+    :param tuning: options
+    :param command: stored in the study
+    :param goal: what is tuned on what; the trials of one study are of one goal
+    :raises ValueError: if the study's trials are of another goal
+    """
     study = optuna.create_study(
         sampler=_make_sampler(tuning),
         pruner=_make_pruner(tuning),
@@ -160,8 +168,13 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
         load_if_exists=True,
         direction="maximize",
     )
+    if (stored := study.user_attrs.get("goal", goal)) != goal:
+        raise ValueError(
+            f"the trials of the study {tuning.study_name!r} are of {stored}, not of {goal}; choose another --study-name"
+        )
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
+        study.set_user_attr("goal", goal)
     callbacks: list[MaxTrialsCallback] = []
     n_trials: int | None = tuning.n_trials
     if tuning.max_total_trials is not None:
