@@ -22,11 +22,13 @@ from gymnasium import spaces
 from safetensors.torch import load, save
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 import hecogrid_envs
 from sb3_saf import (
     Actor,
+    CentralizedValueWrapper,
     ExportError,
     IPPOPolicy,
     LightEncoder,
@@ -43,6 +45,7 @@ from sb3_saf.export.manifest import MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, Data
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.lone_agent import TRAINING, Absent
 from tests.test_policies import ACTIONS, equal_weights, make_model, make_policy
+from tests.toy_envs import CounterEnv
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, samples
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -186,6 +189,15 @@ def test_a_saved_loaded_and_exported_model_predicts_the_same(tmp_path: Path) -> 
     actor = Actor.load(exported(loaded, tmp_path / "actor"))
     obs = samples(VECTOR, 50)
     np.testing.assert_array_equal(actor.act(obs), model.predict(obs, deterministic=True)[0])
+
+
+def test_an_export_without_its_normalisation_warns(tmp_path: Path) -> None:
+    rows = VecNormalize(make_team_env(CounterEnv, n_envs=2, seed=0).venv, norm_obs_keys=["obs"])
+    model = PPO("MAPPOPolicy", CentralizedValueWrapper(rows), device="cpu")
+    with pytest.warns(UserWarning, match="normalise what the actors observe"):
+        exported(model, tmp_path / "actor")
+    rows.norm_obs = False
+    exported(model, tmp_path / "actor")  # warnings are errors
 
 
 # --- ONNX -------------------------------------------------------------------------------------------------------------

@@ -56,6 +56,7 @@ def test_with_masks_of_the_environment_it_acts_as_the_model(
     rows = {"obs": obs, "agent": np.ones(40, int), "action_mask": masks.astype(np.int8)}
     expected = policy.predict(rows, deterministic=True)[0]
     np.testing.assert_array_equal(actor.act(obs, action_mask=masks), expected)
+    np.testing.assert_array_equal(actor.act({"observation": obs, "action_mask": masks}), expected)  # PettingZoo's form
     unmasked = Actor.load(exported(make_policy(policy_class, noise=0.6, **kwargs), tmp_path / "actor"), agent=1)
     assert not np.array_equal(unmasked.act(obs), expected), "masks make a difference"
     for row in range(10):

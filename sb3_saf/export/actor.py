@@ -6,9 +6,10 @@ This module and its imports use neither Stable-Baselines3 nor Gymnasium: ``sb3_s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 import msgspec
 import numpy as np
@@ -20,6 +21,8 @@ from sb3_saf.export.runtime import Array, Inputs, Rng, Runtime, States
 from sb3_saf.networks.spaces import SpaceSpec, pixels_to_codes
 
 RuntimeName: TypeAlias = Literal["torch", "onnx"]
+#: Keys of PettingZoo's observations with masks.
+_WITH_MASK: Final = ("observation", "action_mask")
 
 
 class Actor:
@@ -94,7 +97,8 @@ class Actor:
         ``predict`` itself is to sample.
 
         :param observation: one own observation of the environment (pictures with channels first or last), or a batch of
-            them with one more axis. An actor of tile codes also takes the game's pixels
+            them with one more axis. An actor of tile codes also takes the game's pixels. A dict in PettingZoo's form,
+            ``{"observation": ..., "action_mask": ...}``, gives both
         :param deterministic: whether to take the most likely action instead of sampling
         :param rng: seed or NumPy generator for sampling. None continues from the last call; with torch that is torch's
             global generator, and samples equal those of the trained model's ``predict`` (for a seed, those of
@@ -149,6 +153,8 @@ class Actor:
 
     def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[Inputs, bool]:
         """Return the checked inputs of the runtime, and whether they are a batch."""
+        if isinstance(observation, Mapping) and set(observation) == set(_WITH_MASK) and action_mask is None:
+            observation, action_mask = (observation[key] for key in _WITH_MASK)
         batch, is_batch = self._batch(observation)
         mask = as_masks(action_mask, self._masks, len(batch))
         return Inputs(batch, mask, self._states(memory, len(batch))), is_batch

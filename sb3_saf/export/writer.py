@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -61,10 +62,10 @@ def export_actors(
     ``act.py``            an example that needs only NumPy and onnxruntime
     ===================== ============================================================================
 
-    The critic is not exported. ``sb3_saf.Actor.load`` reads the folder. Actors of models with action masks need a mask
-    with each observation, those of models with memory a memory (see :class:`~sb3_saf.Actor`). With a custom encoder or
-    activation only the ONNX graph is written, without ``actor.safetensors``. The folder is written atomically; an
-    earlier export is replaced.
+    The critic is not exported, nor are VecNormalize's statistics, of which a warning tells. ``sb3_saf.Actor.load``
+    reads the folder. Actors of models with action masks need a mask with each observation, those of models with memory
+    a memory (see :class:`~sb3_saf.Actor`). With a custom encoder or activation only the ONNX graph is written, without
+    ``actor.safetensors``. The folder is written atomically; an earlier export is replaced.
 
     :param model: an algorithm with a SAF, MAPPO or IPPO policy, also recurrent or maskable; QPLEX without memory; or
         the policy itself
@@ -76,6 +77,14 @@ def export_actors(
         outputs differ from the model's
     """
     policy = _checked_policy(model)
+    layer = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
+    if layer is not None and layer.norm_obs:
+        warnings.warn(
+            "the model was trained on observations normalised by VecNormalize, whose statistics are not exported; "
+            "normalise what the actors observe, as env.normalize_obs does",
+            UserWarning,
+            stacklevel=2,
+        )
     described = _Described.of(policy)
     network = described.network(policy)
     inputs = some_inputs(policy, described.memory)
