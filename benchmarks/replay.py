@@ -20,7 +20,7 @@ def measure(n_agents: int, folder: Path) -> tuple[float, int]:
             "TeamSupport", n_envs=1, seed=0, n_agents=n_agents, grid_size=size, n_treasures=10 * n_agents
         )
     ) as env:
-        model = PPO("SAFPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
+        model = PPO("SAFPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env, "saf"))
         start = time.process_time()
         page = sb3_saf.replay(model, env, folder / f"{n_agents}.html")
         return time.process_time() - start, page.stat().st_size

@@ -12,6 +12,7 @@ import pytest
 from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
+from sb3_saf.training.settings import load_settings
 from tests.toy_envs import CounterEnv, TellingEnv
 
 
@@ -128,7 +129,7 @@ def test_sb3s_own_buffer_warns_once_and_names_the_remedy() -> None:
 @pytest.mark.parametrize("overrides", [{}, {"n_steps": 7, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}])
 def test_good_settings_train_any_team(policy: str, overrides: dict[str, Any]) -> None:
     env = make_team_env(CounterEnv, n_envs=3, seed=0)
-    settings = ppo_settings(env, device="cpu", **overrides)
+    settings = ppo_settings(env, policy.lower(), device="cpu", **overrides)
     assert settings["batch_size"] % 2 == 0 and settings["rollout_buffer_class"] is TeamRolloutBuffer
     assert all(settings[key] == value for key, value in overrides.items())
     model = PPO(policy, env, **settings)
@@ -137,6 +138,16 @@ def test_good_settings_train_any_team(policy: str, overrides: dict[str, Any]) ->
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "the games have action_masks")
         model.learn(1 if overrides else 0, GameStepsCallback())
+
+
+def test_settings_are_those_of_the_method() -> None:
+    env = make_team_env("TeamSupport", n_envs=2, seed=0, observation="tiles")
+    saf, no_pool = (ppo_settings(env, algo)["policy_kwargs"] for algo in ("saf", "saf-no-pool"))
+    of_commands = load_settings("saf", "TeamSupport-v0", "small").hyperparams["policy_kwargs"]
+    assert {**saf, "projection_arch": tuple(saf["projection_arch"])} == of_commands
+    assert no_pool == {**saf, "n_policies": 1}
+    with pytest.raises(ValueError, match=r"unknown method of PPO 'qplex'; there is saf, "):
+        ppo_settings(env, "qplex")
 
 
 @pytest.mark.parametrize("policy", ["SAFPolicy", "MAPPOPolicy"])

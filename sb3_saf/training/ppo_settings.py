@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.teams import TeamSpaces, require_n_agents
 
-#: Settings of ``sb3_saf.train --algo mappo --size small`` that also apply to scripts.
+#: Settings of ``sb3_saf.train --size small`` that also apply to scripts.
 _TAKEN: Final = (
     *("learning_rate", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
     "rollout_buffer_class",
@@ -19,36 +19,45 @@ _TAKEN: Final = (
 _TAKEN_OF_HECOGRID: Final = (*_TAKEN, "gamma")
 
 
-def ppo_settings(env: VecEnv, **overrides: Any) -> dict[str, Any]:
+def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str, Any]:
     """
     Return PPO hyperparameters for an environment of teams::
 
-        model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env))
+        model = PPO("MAPPOPolicy", env, **sb3_saf.ppo_settings(env))
+        model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf"))
 
-    They are those of ``sb3_saf.train --algo mappo --size small``: ``TeamRolloutBuffer``, and a few minibatches per
-    rollout with the same number of game steps for any number of games. HECOGrid with tile codes has its own settings:
-    the light encoder, narrow heads, normalised values, its discount, and a learning rate that decreases to 0. SAF
-    takes less time with ``policy_kwargs={"projection_arch": [], "latent_dim": 32}``, as in ``--algo saf``.
+    They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
+    same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
+    narrow heads, normalised values, its discount, and a learning rate that decreases to 0.
 
     :param env: from ``make_team_env``, with any number of games
+    :param algo: the method, a name of ``sb3_saf.train --algo`` that PPO trains. The settings of ``"saf"`` include its
+        widths, which other policies do not take
     :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
-    :raises ValueError: if ``env`` has no teams
+    :raises ValueError: if ``env`` has no teams, or PPO does not train ``algo``
     """
+    from sb3_saf.training.algorithms import ALGOS, find_algorithm
     from sb3_saf.training.environments import HECOGRID
+    from sb3_saf.training.names import unknown_name
     from sb3_saf.training.values import algorithm_arguments, resolve
     from sb3_saf.training.yaml_files import entry_of, read_config
 
-    n_agents = require_n_agents(env)
+    trained = [name for name, spec in ALGOS.items() if spec.algorithm is PPO]
+    if algo not in trained:
+        raise unknown_name("method of PPO", algo, trained)
+    n_agents, spec = require_n_agents(env), find_algorithm(algo)
     n_games, encoder = env.num_envs // n_agents, _encoder_of(env)
-    source = entry_of(read_config("mappo"), ("default",) if encoder is None else ("default", HECOGRID), "small")
+    source = entry_of(read_config(spec.config), ("default",) if encoder is None else ("default", HECOGRID), "small")
     hints, taken = algorithm_arguments(PPO), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
-    found = {key: resolve(key, source[key], hints[key]) for key in taken}
+    found = {key: resolve(key, source[key], hints[key]) for key in taken if key in source}
     rollout = source["n_steps"] * source["n_envs"]  # game steps, in all games
     n_minibatches = source["n_minibatches"]
     n_steps = max(source["n_steps"], -(-rollout // (n_games * n_minibatches)) * n_minibatches)
     teams = int(overrides.get("n_steps", n_steps)) * n_games
     found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
-    policy_kwargs = {} if encoder is None else {**source["policy_kwargs"], "features_extractor_class": encoder}
+    policy_kwargs = source.get("policy_kwargs", {}) | spec.policy_kwargs
+    if encoder is not None:
+        policy_kwargs["features_extractor_class"] = encoder
     policy_kwargs |= overrides.get("policy_kwargs") or {}
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
 
