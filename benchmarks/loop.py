@@ -3,9 +3,10 @@ Measure the training loop with few games and small networks: SB3's own PPO compa
 ``python -m benchmarks.loop``
 
 ``free``: games that take no time (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of 2 x
-64 without an encoder, for all; 4 epochs, 4 minibatches. SB3 plays the same rows with its ``MlpPolicy``. ``small``:
-HECOGrid in the zoo's size ``small``, with the zoo's settings. ``growth``: cost by the number of agents, ``small`` with
-N agents and the same number of rows. ``import``: seconds of ``import sb3_saf``, compared with torch and SB3.
+64 without an encoder, for all, and SAF's pool, slots and widths of the zoo's size ``small``; 4 epochs, 4 minibatches.
+SB3 plays the same rows with its ``MlpPolicy``. ``small``: HECOGrid in the zoo's size ``small``, with the zoo's
+settings. ``growth``: cost by the number of agents, ``small`` with N agents and the same number of rows. ``import``:
+seconds of ``import sb3_saf``, compared with torch and SB3.
 
 Processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of the rollout in
 milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole loop, and the
@@ -30,7 +31,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_saf import CentralizedValueWrapper, TeamMonitor, TeamRolloutBuffer
+from sb3_saf import CentralizedValueWrapper, TeamMonitor, TeamRolloutBuffer, ppo_settings
 from sb3_saf.suites.registry import find_task
 from sb3_saf.training.settings import load_settings
 
@@ -46,11 +47,7 @@ N_STEPS: Final = {4: 128, 16: 128, 128: 25}
 #: The same in games of a suite, as in JaxMARL's settings.
 SUITE_STEPS: Final = 128
 NARROW: Final[dict[str, Any]] = {"net_arch": [64, 64], "features_extractor_class": FlattenExtractor}
-POLICIES: Final[Mapping[str, dict[str, Any]]] = {
-    "IPPO": NARROW,
-    "MAPPO": NARROW,
-    "SAF": {**NARROW, "projection_arch": [64], "latent_dim": 32},
-}
+POLICIES: Final = ("IPPO", "MAPPO", "SAF")
 GROWTH: Final = (2, 5, 10, 20, 50, 100)
 GROWTH_ROWS: Final = 100
 _SET_UP = "import time; start = time.perf_counter(); import {}; print(time.perf_counter() - start)"
@@ -161,9 +158,10 @@ def _models(make_games: Callable[[], VecEnv], n_steps: int) -> dict[str, PPO]:
     }
     rows = VecExtractDictObs(games, "obs") if isinstance(games.observation_space, spaces.Dict) else games
     models = {SB3: PPO("MlpPolicy", rows, policy_kwargs=NARROW, **settings)}
-    for name, policy_kwargs in POLICIES.items():
+    for name in POLICIES:
         env = CentralizedValueWrapper(TeamMonitor(make_games()))
-        buffer: dict[str, Any] = {"rollout_buffer_class": TeamRolloutBuffer, "policy_kwargs": dict(policy_kwargs)}
+        policy_kwargs = {**ppo_settings(env, name.lower())["policy_kwargs"], **NARROW}  # SAF's pool, slots and widths
+        buffer: dict[str, Any] = {"rollout_buffer_class": TeamRolloutBuffer, "policy_kwargs": policy_kwargs}
         models[name] = PPO(f"{name}Policy", env, **buffer, **settings)
     return models
 

@@ -131,7 +131,8 @@ def test_good_settings_train_any_team(policy: str, overrides: dict[str, Any]) ->
     env = make_team_env(CounterEnv, n_envs=3, seed=0)
     settings = ppo_settings(env, policy.lower(), device="cpu", **overrides)
     assert settings["batch_size"] % 2 == 0 and settings["rollout_buffer_class"] is TeamRolloutBuffer
-    assert all(settings[key] == value for key, value in overrides.items())
+    assert settings["policy_kwargs"].items() >= overrides.get("policy_kwargs", {}).items()
+    assert all(settings[key] == value for key, value in overrides.items() if key != "policy_kwargs")
     model = PPO(policy, env, **settings)
     assert model.n_steps * model.n_envs == (42 if overrides else 2 * 3 * 268)
     with warnings.catch_warnings():
