@@ -35,8 +35,7 @@ class AllToAll(nn.Module):
 
     def forward(self, messages: th.Tensor, states: th.Tensor) -> th.Tensor:
         """Map (G, N, d) and (G, N, d) to (G, N, d)."""
-        values: th.Tensor = self.attention(states, messages).values
-        return values
+        return self.attention(states, messages).values
 
 
 def one_pass(module: nn.Module, n_teams: int, n_agents: int) -> Callable[[], None]:

@@ -110,8 +110,7 @@ class Worker:
             self._process.wait()
             written = self._messages.read_text().strip().splitlines() or ["no message"]
             raise RuntimeError(f"its process ended with {self._process.returncode}: {written[-1]}")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
+        return json.loads(line)
 
     def close(self) -> None:
         """End the process."""

@@ -56,8 +56,7 @@ def paper_policy(declaration: Declaration) -> TeamPolicy:
     rows = TeamSpaces.of(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
     policy_class: Any = declaration.policies[PPO][0]
     kwargs = declaration.paper_table.policy_kwargs
-    policy: TeamPolicy = policy_class(rows, spaces.Discrete(7), lambda _: 0.0, ortho_init=False, **kwargs)
-    return policy
+    return policy_class(rows, spaces.Discrete(7), lambda _: 0.0, ortho_init=False, **kwargs)
 
 
 def parameter_table() -> list[TableRow]:

@@ -421,8 +421,7 @@ def _blend(treasure: Image, agent: Image) -> Image:
     below, above = treasure.astype(int), agent.astype(int)
     a = above.sum(axis=2, keepdims=True)
     most = a.max()
-    blended: Image = ((below * (most - a) + above * a) // most).astype(np.uint8)
-    return blended
+    return ((below * (most - a) + above * a) // most).astype(np.uint8)
 
 
 @cache

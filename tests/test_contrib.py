@@ -458,8 +458,7 @@ def test_time_limits_are_bootstrapped_from_single_rows() -> None:
 
     def noting(obs: Any, *args: Any) -> th.Tensor:
         asked.append(len(obs["obs"]))
-        values: th.Tensor = predict_values(obs, *args)
-        return values
+        return predict_values(obs, *args)
 
     model.policy.predict_values = noting
     model.learn(96)

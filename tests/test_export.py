@@ -378,8 +378,7 @@ class LoneAgent:
 
     def answer(self) -> dict[str, Any]:
         assert self.process.stdout
-        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
-        return answer
+        return json.loads(self.process.stdout.readline())
 
 
 def test_agents_in_processes_of_their_own_play_an_episode_as_the_model_would(tmp_path: Path) -> None:

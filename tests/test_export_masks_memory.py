@@ -221,8 +221,7 @@ def run_script(folder: Path, observations: np.ndarray, *options: str) -> list[An
     np.save(folder.parent / "obs.npy", observations)
     command = [sys.executable, str(folder / "act.py"), str(folder.parent / "obs.npy"), *options]
     answer = subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder.parent)
-    actions: list[Any] = json.loads(answer.stdout)
-    return actions
+    return json.loads(answer.stdout)
 
 
 def test_onnx_with_a_memory(tmp_path: Path) -> None:

@@ -44,8 +44,7 @@ def load_study(storage: str) -> optuna.Study:
 
 
 def config_of(run: Path) -> dict[str, Any]:
-    config: dict[str, Any] = yaml.safe_load((run / ENV / "config.yml").read_text())
-    return config
+    return yaml.safe_load((run / ENV / "config.yml").read_text())
 
 
 def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path: Path) -> None:

@@ -465,8 +465,7 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def _slots(self, steps: Indices) -> Indices:
         """Return the slots of steps that are counted from the oldest."""
-        slots: Indices = (self.pos - self.size() + steps) % self.n_slots
-        return slots
+        return (self.pos - self.size() + steps) % self.n_slots
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: Indices, env: VecNormalize | None = None

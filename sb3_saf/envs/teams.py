@@ -170,8 +170,7 @@ class TeamSpaces(NamedTuple):
     @property
     def names(self) -> tuple[Any, ...] | None:
         """The agents' names in index order; None if they are unknown."""
-        names: tuple[Any, ...] | None = getattr(self.agent, "names", None)
-        return names
+        return getattr(self.agent, "names", None)
 
     @property
     def own_shape(self) -> tuple[int, ...]:

@@ -179,8 +179,7 @@ class _Asked(NamedTuple):
 def _size(options: argparse.Namespace) -> Size:
     """Return the given size, that of the folder, or the default."""
     stored = None if options.folder is None else Results(options.folder).config()
-    size: Size = options.size or (DEFAULT_SIZE if stored is None else stored.size)
-    return size
+    return options.size or (DEFAULT_SIZE if stored is None else stored.size)
 
 
 def _name(options: argparse.Namespace) -> str:

@@ -121,8 +121,7 @@ class RunConfig:
         if not cell.is_trained:
             settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
         test = {"episodes": self.episodes, "deterministic": self.deterministic}
-        result: dict[str, Any] = plain({**settings, "seed": cell.seed, "test": test})
-        return result
+        return plain({**settings, "seed": cell.seed, "test": test})
 
 
 class LeftOut(NamedTuple):

@@ -219,5 +219,4 @@ def _own(experiment: Experiment) -> dict[str, Any]:
     """Return a user's experiment as plain data."""
     vary = {view.parameter: [view.position(level) for level in view.levels] for view in experiment.views}
     vary.pop("", None)
-    content: dict[str, Any] = plain({"envs": experiment.envs, "vary": vary})
-    return content
+    return plain({"envs": experiment.envs, "vary": vary})

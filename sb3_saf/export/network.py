@@ -57,8 +57,7 @@ class RawEncoder(nn.Module):
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
         """Encode (K, *shape) as (K, d)."""
-        features: th.Tensor = self.encoder(preprocess(observation, self.space, self.divide_by_255))
-        return features
+        return self.encoder(preprocess(observation, self.space, self.divide_by_255))
 
 
 def make_encoder(net: EncoderNet, observation: ObservationSpec) -> nn.Module:
@@ -213,8 +212,7 @@ def _taken_atlas(manifest: Manifest, tensors: dict[str, th.Tensor]) -> Array | N
     if shape is None or (ATLAS not in tensors and not reads_pixels):
         return None
     check_tensors({ATLAS: th.empty(shape, dtype=th.uint8, device="meta")}, tensors, WEIGHTS_FILE, subset=True)
-    atlas: Array = np.array(tensors.pop(ATLAS).numpy())
-    return atlas
+    return np.array(tensors.pop(ATLAS).numpy())
 
 
 def _check_layers(manifest: Manifest, n_tensors: int) -> None:

@@ -177,8 +177,7 @@ def _written(
     proto = program.model_proto
     for key, value in metadata.items():
         proto.metadata_props.add(key=key, value=value)
-    data: bytes = proto.SerializeToString(deterministic=True)
-    return data
+    return proto.SerializeToString(deterministic=True)
 
 
 @contextmanager

@@ -216,8 +216,7 @@ class _OwnExtractor(nn.Module):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode (K, *shape) raw own observations as (K, d)."""
-        features: th.Tensor = self.extractor(preprocess_obs(observations, self.space, self.normalize_images))
-        return features
+        return self.extractor(preprocess_obs(observations, self.space, self.normalize_images))
 
 
 # --- describing -------------------------------------------------------------------------------------------------------

@@ -124,8 +124,7 @@ def _overlap_of_gaussians(p: Floats, q: Floats) -> npt.NDArray[np.float64]:
     var_p, var_q = np.exp(2 * log_p), np.exp(2 * log_q)
     total = var_p + var_q
     scale = np.sqrt(2 * np.exp(log_p + log_q) / total)
-    overlap: npt.NDArray[np.float64] = (scale * np.exp(-((mean_p - mean_q) ** 2) / (4 * total))).prod(axis=1)
-    return overlap
+    return (scale * np.exp(-((mean_p - mean_q) ** 2) / (4 * total))).prod(axis=1)
 
 
 def _softmax(logits: Floats) -> npt.NDArray[np.float64]:

@@ -252,8 +252,7 @@ class _Recorder:
 
 
 def _stack(tensors: list[th.Tensor]) -> Floats:
-    stacked: Floats = th.stack(tensors).cpu().numpy()
-    return stacked
+    return th.stack(tensors).cpu().numpy()
 
 
 def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:

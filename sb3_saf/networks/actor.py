@@ -139,8 +139,7 @@ class ActorNetwork(nn.Module, ABC):
         :param agent: (K,) int64 index of the agent, where ``reads_agent``
         :return: (K, P'')
         """
-        result: th.Tensor = self(features, agent)
-        return result
+        return self(features, agent)
 
 
 class SinglePolicy(ActorNetwork):
@@ -181,10 +180,8 @@ class SinglePolicy(ActorNetwork):
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """See :class:`ActorNetwork`; (K, d) to (K, P)."""
         if isinstance(self.head, AgentHeads):
-            of_agents: th.Tensor = self.head(features, agent)
-            return of_agents
-        result: th.Tensor = self.head(self.with_identity(features, agent))
-        return result
+            return self.head(features, agent)
+        return self.head(self.with_identity(features, agent))
 
     def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """See :class:`ActorNetwork`; (K, 1) log weights of zero and (K, 1, P) parameters."""

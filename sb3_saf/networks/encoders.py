@@ -148,8 +148,7 @@ class PaperCNN(Encoder):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape) as (K, features_dim)."""
-        features: th.Tensor = self.net(self.pixels(observations))
-        return features
+        return self.net(self.pixels(observations))
 
 
 def _after_convolutions(size: int) -> int:
@@ -181,8 +180,7 @@ class NatureEncoder(Encoder):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape) as (K, features_dim)."""
-        features: th.Tensor = self.nature(self.pixels(observations))
-        return features
+        return self.nature(self.pixels(observations))
 
 
 class _NatureCNN(nn.Module):
@@ -205,8 +203,7 @@ class _NatureCNN(nn.Module):
 
     def forward(self, pictures: th.Tensor) -> th.Tensor:
         """Encode pictures (K, C, H, W) as (K, d)."""
-        features: th.Tensor = self.linear(self.cnn(pictures))
-        return features
+        return self.linear(self.cnn(pictures))
 
 
 class LightEncoder(Encoder):
@@ -270,8 +267,7 @@ class LightEncoder(Encoder):
             tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
         else:
             tiles = self.embed(self._cut(self.pixels(observations)))
-        features: th.Tensor = self.net(tiles.flatten(1))
-        return features
+        return self.net(tiles.flatten(1))
 
     def _inputs_of_codes(self, one_hot: bool) -> th.Tensor:
         """Return the embedding's inputs of every tile, (n_codes, inputs)."""
@@ -308,5 +304,4 @@ class MLPEncoder(Encoder):
         """Encode observations (K, *shape), raw or preprocessed, as (K, features_dim)."""
         if not observations.is_floating_point():
             observations = preprocess(observations, self.space, normalize_images=False)
-        features: th.Tensor = self.net(observations.flatten(1))
-        return features
+        return self.net(observations.flatten(1))

@@ -93,8 +93,7 @@ class SelfAttentionBlock(nn.Module):
         """
         normed = self.norm(slots)
         slots = slots + self.attention(normed, normed).values
-        updated: th.Tensor = slots + self.mlp(self.mlp_norm(slots))
-        return updated
+        return slots + self.mlp(self.mlp_norm(slots))
 
 
 class KnowledgeSource(nn.Module):
@@ -143,8 +142,7 @@ class KnowledgeSource(nn.Module):
         :param slots: (G, L, d)
         :return: m (G, N, d) and read attention (G, N, L)
         """
-        attended: Attended = self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
-        return attended
+        return self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
 
     def exchange(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
         """

@@ -264,5 +264,4 @@ def _bound(values: Array) -> Bound:
 def _merged(number: Any, word: Any) -> Bound:
     if isinstance(number, list):
         return [_merged(*pair) for pair in zip(number, word, strict=True)]
-    result: Bound = word or number
-    return result
+    return word or number

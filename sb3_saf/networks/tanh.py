@@ -32,8 +32,7 @@ class Tanh(th.nn.Tanh):
             return super().forward(x)
         if not (x.requires_grad and th.is_grad_enabled()):
             return _tanh(x)
-        result: th.Tensor = _Tanh.apply(x)
-        return result
+        return _Tanh.apply(x)
 
 
 class _Tanh(th.autograd.Function):
@@ -46,8 +45,7 @@ class _Tanh(th.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: th.Tensor) -> th.Tensor:
         # Autograd's formula, which is differentiable again, as TRPO needs.
-        gradient: th.Tensor = th.ops.aten.tanh_backward(gradients[0], *ctx.saved_tensors)
-        return gradient
+        return th.ops.aten.tanh_backward(gradients[0], *ctx.saved_tensors)
 
 
 def _tanh(x: th.Tensor) -> th.Tensor:

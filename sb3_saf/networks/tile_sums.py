@@ -131,8 +131,7 @@ def rectified_sums(views: th.Tensor, table: th.Tensor, bias: th.Tensor, places: 
     :param places: places of the layer
     :return: (K, W) or (K, W, height, width), channels last in memory; twice differentiable in table and bias
     """
-    summed: th.Tensor = _Rectified.apply(table, bias, views, places)
-    return summed
+    return _Rectified.apply(table, bias, views, places)
 
 
 class _Rectified(th.autograd.Function):

@@ -58,8 +58,7 @@ class PaperCNN(encoders.PaperCNN, BaseFeaturesExtractor):
         """Encode observations (K, *shape) as (K, features_dim)."""
         if self._places is None or not looks_up(self.pixels, observations):
             return super().forward(observations)
-        features: th.Tensor = self.net[2:](self._first_layer(observations, self._places))
-        return features
+        return self.net[2:](self._first_layer(observations, self._places))
 
     def _first_layer(self, codes: th.Tensor, places: Places) -> th.Tensor:
         """Apply the first convolution and its ReLU: codes (K, rows, columns) to (K, 32, h, w)."""
@@ -100,8 +99,7 @@ class LightEncoder(encoders.LightEncoder, BaseFeaturesExtractor):
         """Encode observations (K, *shape) as (K, features_dim)."""
         if not looks_up(self.pixels, observations):
             return super().forward(observations)
-        features: th.Tensor = self.net[2:](self._first_layer(observations))
-        return features
+        return self.net[2:](self._first_layer(observations))
 
     def _first_layer(self, codes: th.Tensor) -> th.Tensor:
         """Apply the first linear layer and its ReLU: codes (K, rows, columns) to (K, hidden)."""
@@ -158,8 +156,7 @@ class PartsEncoder(BaseFeaturesExtractor):
         if self.rest is not None:
             vectors = [slice_ for slice_, part in zip(slices, self.parts, strict=True) if part.picture is None]
             found.append(self.rest(th.cat(vectors, dim=1)))
-        features: th.Tensor = self.join(th.cat(found, dim=1))
-        return features
+        return self.join(th.cat(found, dim=1))
 
 
 class ObservationEncoder(BaseFeaturesExtractor):
@@ -182,8 +179,7 @@ class ObservationEncoder(BaseFeaturesExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape) as (K, features_dim)."""
-        features: th.Tensor = self.encoder(observations)
-        return features
+        return self.encoder(observations)
 
 
 def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:

@@ -50,8 +50,7 @@ class JointCritic(TeamCritic):
         members = gather(features, teams)
         if active is not None:
             members = members * active.unsqueeze(2)
-        values: th.Tensor = self.value_head(members)
-        return values
+        return self.value_head(members)
 
 
 class JointStateCritic(StateCritic):
@@ -75,8 +74,7 @@ class JointStateCritic(StateCritic):
 
     def forward(self, states: th.Tensor) -> th.Tensor:
         """See :class:`StateCritic`."""
-        values: th.Tensor = self.value_head(self.encoder(states))
-        return values
+        return self.value_head(self.encoder(states))
 
 
 @dataclass(frozen=True)

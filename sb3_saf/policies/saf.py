@@ -87,8 +87,7 @@ class SAFStates(TeamStates):
         :param read: (G, N, d), m of every agent: the message read, or a substitute
         :return: (G, N, d)
         """
-        combined: th.Tensor = self.combine_net(th.cat([states, read], dim=2))
-        return combined
+        return self.combine_net(th.cat([states, read], dim=2))
 
 
 class SAFCritic(SAFStates, TeamCritic):
@@ -124,8 +123,7 @@ class SAFCritic(SAFStates, TeamCritic):
             return self.value_head.of_teams(states)
         if active is not None:
             states = states * active.unsqueeze(2)
-        values: th.Tensor = self.value_head(states)
-        return values
+        return self.value_head(states)
 
 
 @dataclass(frozen=True)

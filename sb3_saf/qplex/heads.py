@@ -72,8 +72,7 @@ class AgentMemory(nn.Module):
 
     def forward(self, inputs: th.Tensor, memory: Memory) -> Memory:
         """Run one step on inputs (K, d + A + N)."""
-        result: Memory = self.cell(inputs, memory)
-        return result
+        return self.cell(inputs, memory)
 
     def empty(self, n_rows: int, like: th.Tensor) -> Memory:
         """Return the memory of K agents at the start of an episode."""

@@ -168,8 +168,7 @@ def _mix(
     """Compute Q_tot of joint actions (G, N) from (G, N, A) values and (G, N, d) features."""
     chosen = values.gather(2, actions.unsqueeze(2)).squeeze(2)
     choice = JointChoice(chosen, values.max(dim=2).values, actions, steps.active)
-    mixed: Mixed = networks.mixer(_state(policy, networks.state_encoder, steps, features), choice)
-    return mixed
+    return networks.mixer(_state(policy, networks.state_encoder, steps, features), choice)
 
 
 def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tensor) -> th.Tensor:

@@ -225,5 +225,4 @@ class QPLEXMixer(Mixer):
         actions = nn.functional.one_hot(choice.actions, self.n_actions).to(state.dtype)
         if choice.active is not None:
             actions = actions * choice.active.unsqueeze(2)
-        weights: th.Tensor = self.kernels(state, th.cat([state, actions.flatten(1)], dim=1))
-        return weights
+        return self.kernels(state, th.cat([state, actions.flatten(1)], dim=1))

@@ -292,8 +292,7 @@ class QPLEX(OffPolicyAlgorithm):
         else:
             legal = np.asarray(masks).reshape(len(actions), -1) != 0
             others = np.where(legal, np.random.random(legal.shape), -1.0).argmax(axis=1)  # noqa: NPY002
-        result: Array = np.where(explores, others, actions)
-        return result
+        return np.where(explores, others, actions)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

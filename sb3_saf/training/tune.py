@@ -237,8 +237,7 @@ def _make_sampler(tuning: Tuning) -> optuna.samplers.BaseSampler:
         optunahub = importlib.import_module("optunahub")
     except ImportError:
         raise ValueError("--sampler auto needs optunahub: pip install optunahub") from None
-    sampler: optuna.samplers.BaseSampler = optunahub.load_module("samplers/auto_sampler").AutoSampler(seed=seed)
-    return sampler
+    return optunahub.load_module("samplers/auto_sampler").AutoSampler(seed=seed)
 
 
 def _make_pruner(tuning: Tuning) -> optuna.pruners.BasePruner:

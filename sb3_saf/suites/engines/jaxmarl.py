@@ -85,8 +85,7 @@ class Packing:
             size, buffer = form.size, left[form.dtype.itemsize]
             leaves.append(buffer[..., :size].view(form.dtype).reshape(*buffer.shape[:-1], *form.shape))
             left[form.dtype.itemsize] = buffer[..., size:]
-        game: Game = jax.tree.unflatten(self._tree, leaves)
-        return game
+        return jax.tree.unflatten(self._tree, leaves)
 
 
 class JaxPrograms:
