@@ -203,7 +203,7 @@ def test_states_of_games_are_plain_data_and_checked() -> None:
         for ours, theirs in zip(env.step(actions)[:3], other.step(actions)[:3], strict=True):
             np.testing.assert_equal(ours, theirs)
     states[-1]["state"]["games"]["n_steps"] = np.zeros(2)
-    with pytest.raises(CheckpointError, match="expected 'n_steps' of shape"):
+    with pytest.raises(CheckpointError, match=r"\['n_steps'\] to be an array of shape"):
         check_environment_state(other, states)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -219,6 +220,6 @@ def test_a_checkpoint_is_written_without_a_second_buffer_in_memory(tmp_path: Pat
 
 
 def test_memory_that_does_not_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_saf.buffers.replay.free_memory", lambda: 100)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=100))
     with pytest.warns(UserWarning, match="replay buffer of 30 game steps takes"):
         make_buffer()

@@ -6,18 +6,19 @@ Letters: S slots, E games, N agents, A actions, G sampled team steps. A *team st
 
 from __future__ import annotations
 
-import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_saf.checkpoints.checks import check_array, check_keys, check_list, check_whole
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -30,27 +31,12 @@ from sb3_saf.envs.teams import (
     check_whole_teams,
 )
 
-try:
-    import psutil
-except ImportError:  # optional, as in SB3
-    psutil = None
-
 Indices = npt.NDArray[np.int64]
 
 _TRUNCATED: Final = "TimeLimit.truncated"
 _NO_ACTION: Final = -1
 #: The observation after a step is that of the next slot.
 _IN_NEXT_SLOT: Final = -1
-
-
-def free_memory() -> int | None:
-    """Return the free memory in bytes, or None if unknown."""
-    if psutil is not None:
-        return int(psutil.virtual_memory().available)
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not Linux
-        return None
 
 
 class TeamSteps(NamedTuple):
@@ -197,8 +183,8 @@ class TeamReplayBuffer(ReplayBuffer):
         return self.size() * self.n_games
 
     def _check_memory(self) -> None:
-        available = free_memory()
-        if available is not None and self.nbytes > available:
+        available = psutil.virtual_memory().available
+        if self.nbytes > available:
             warnings.warn(
                 f"The replay buffer of {self.buffer_size * self.n_games} game steps takes {self.nbytes / 1e9:.2f} GB, "
                 f"but {available / 1e9:.2f} GB are free; lower buffer_size, or take observations of fewer bytes "
@@ -338,16 +324,21 @@ class TeamReplayBuffer(ReplayBuffer):
         """
         if state.get("n_slots") != self.n_slots:
             raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state.get('n_slots')}")
-        _check_names(state, ("n_slots", "slots", "aside", "free", "pos", "n_steps"), "the replay buffer")
-        pos, n_steps = (_checked_whole(name, state[name], self.n_slots - 1) for name in ("pos", "n_steps"))
+        check_keys(dict(state), ("n_slots", "slots", "aside", "free", "pos", "n_steps"), "the replay buffer")
+        for name in ("pos", "n_steps"):
+            check_whole(state[name], f"{name!r} of the replay buffer", high=self.n_slots - 1)
+        pos, n_steps, free = state["pos"], state["n_steps"], state["free"]
         if n_steps < self.buffer_size and pos != n_steps:
             raise ValueError(f"expected a replay buffer of {n_steps} steps that goes on at {n_steps}, got {pos}")
         n_filled = self.n_slots if n_steps == self.buffer_size else pos + 1
         self._check_arrays(state["slots"], {name: part[:n_filled] for name, part in self._by_slot().items()})
-        self._check_arrays(state["aside"], {f"{key}": part for key, part in self.aside.items()}, any_length=True)
+        self._check_arrays(state["aside"], self.aside, any_length=True)
         n_places = len(state["aside"][OBS_KEY])
         used = state["slots"]["aside_index"]
-        places = sorted([*used[used != _IN_NEXT_SLOT].tolist(), *_checked_list("free", state["free"])])
+        check_list(free, "'free' of the replay buffer")
+        for place in free:
+            check_whole(place, "a place in 'free' of the replay buffer")
+        places = sorted([*used[used != _IN_NEXT_SLOT].tolist(), *free])
         if places != list(range(n_places)):
             raise ValueError(f"expected each of the {n_places} observations put aside to belong to one step or to none")
         if len({len(part) for part in state["aside"].values()}) > 1:
@@ -356,16 +347,10 @@ class TeamReplayBuffer(ReplayBuffer):
         self._check_values(state["aside"], "")
 
     def _check_arrays(self, found: Any, like: Mapping[str, Array], any_length: bool = False) -> None:
-        _check_names(found, like, "the arrays of the replay buffer")
+        check_keys(found, like, "the arrays of the replay buffer")
         for name, own in like.items():
-            shape = own.shape
-            if any_length and isinstance(found[name], np.ndarray) and found[name].ndim:
-                shape = (len(found[name]), *own.shape[1:])
-            if not isinstance(found[name], np.ndarray) or found[name].shape != shape or found[name].dtype != own.dtype:
-                raise ValueError(
-                    f"expected {name!r} of the replay buffer of shape {shape} and {own.dtype}, got "
-                    f"{np.shape(found[name])} and {getattr(found[name], 'dtype', type(found[name]).__name__)}"
-                )
+            length = np.shape(found[name])[:1] if any_length else own.shape[:1]
+            check_array(found[name], (*length, *own.shape[1:]), own.dtype, f"{name!r} of the replay buffer")
 
     def _check_values(self, arrays: Mapping[str, Array], prefix: str) -> None:
         """Check values that networks use as table indices."""
@@ -507,21 +492,3 @@ class TeamReplayBuffer(ReplayBuffer):
             None if active is None else active != 0,
             tensors.get(STATE_KEY),
         )
-
-
-def _check_names(value: Any, names: Iterable[str], where: str) -> None:
-    if not isinstance(value, Mapping) or set(value) != set(names):
-        got = sorted(map(str, value)) if isinstance(value, Mapping) else type(value).__name__
-        raise ValueError(f"expected {where} to have {', '.join(names)}, got {got}")
-
-
-def _checked_whole(name: str, value: Any, high: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= high:
-        raise ValueError(f"expected {name!r} of the replay buffer from 0 to {high}, got {value!r}")
-    return int(value)
-
-
-def _checked_list(name: str, value: Any) -> list[int]:
-    if not isinstance(value, list) or not all(isinstance(entry, int) for entry in value):
-        raise ValueError(f"expected {name!r} of the replay buffer to be a list of whole numbers, got {value!r:.80}")
-    return value

@@ -183,7 +183,7 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
     :param again: advice on how to continue
     """
     signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
-    with _handled(signals, _stopper(checkpoints, at_rollout)):
+    with handled(signals, _stopper(checkpoints, at_rollout)):
         try:
             yield
         except (KeyboardInterrupt, SystemExit):
@@ -223,7 +223,8 @@ def _stop(number: int) -> NoReturn:
 
 
 @contextmanager
-def _handled(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+def handled(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Set a handler of signals; none outside of the main thread."""
     if threading.current_thread() is not threading.main_thread():  # only it may set handlers
         yield
         return

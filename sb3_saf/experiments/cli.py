@@ -7,12 +7,12 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from hecogrid_envs.task import check_task
+from sb3_saf.checkpoints.learning import handled
 from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, PROGRAM, Experiment, own_experiment
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
 from sb3_saf.experiments.grid import RunConfig, Selection, Shard
@@ -262,7 +262,7 @@ def _run(options: argparse.Namespace) -> int:
         check_device(options.device), options.threads, options.retries, options.tensorboard, options.resume
     )
     try:
-        with _sigterm_like_control_c():
+        with handled({signal.SIGTERM}, signal.default_int_handler):  # batch systems send it before they kill
             summary = run(experiment, selection, config, results, _engine(options), how, shard)
     except KeyboardInterrupt:
         print(
@@ -276,16 +276,6 @@ def _run(options: argparse.Namespace) -> int:
         return 1
     print(f"next: {PROGRAM} report {experiment.name} -f {results.folder}")
     return 0
-
-
-@contextmanager
-def _sigterm_like_control_c() -> Iterator[None]:
-    """Treat SIGTERM, which batch systems send before they kill, like Ctrl-C."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _report(options: argparse.Namespace) -> int:

@@ -75,16 +75,6 @@ class JointStates(TeamStates):
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`; inactive agents are read as zeros."""
         members = gather(features, teams) if self.members is None else self.members.states(features, teams, active)
-        return self.join(members, active)
-
-    def join(self, members: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
-        """
-        Concatenate the states of a team's members.
-
-        :param members: (G, N, d)
-        :param active: (G, N) bool, agents that take part; all if None
-        :return: (G, N, S)
-        """
         if active is not None:
             members = members * active.unsqueeze(2)
         n_teams, n_agents, _ = members.shape

@@ -107,13 +107,9 @@ class LeanCategorical(CategoricalDistribution):
         return self
 
     @property
-    def distribution(self) -> Categorical:
+    def distribution(self) -> Categorical:  # type: ignore[override]  # SB3's attribute
         """PyTorch's distribution, for TRPO's KL divergence."""
         return Categorical(logits=self.log_probs, validate_args=False)
-
-    @distribution.setter
-    def distribution(self, value: object) -> None:
-        """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """Return log-likelihoods (B,) of actions (B,)."""
@@ -199,13 +195,9 @@ class PoolDistribution(_FromPool):
         return self
 
     @property
-    def distribution(self) -> PolicyAndAction:
+    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # SB3's attribute
         """Joint distribution of policy and action, for TRPO's KL divergence."""
         return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
-
-    @distribution.setter
-    def distribution(self, value: object) -> None:
-        """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """Return log-likelihoods (B,) of actions (B, D)."""
@@ -266,16 +258,12 @@ class SelectedDistribution(_FromPool):
         self.favourite = favourite
 
     @property
-    def distribution(self) -> TorchDistribution:
+    def distribution(self) -> TorchDistribution:  # type: ignore[override]  # SB3's attribute
         """Raise an error: TRPO would compare policies drawn at different times."""
         raise ValueError(
             "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
             "(TRPO's KL divergence) says nothing; use selection='mixture'"
         )
-
-    @distribution.setter
-    def distribution(self, value: object) -> None:
-        """Ignore the None that the constructor of Stable-Baselines3 2.7 sets."""
 
     def proba_distribution(self, *args: Any, **kwargs: Any) -> SelectedDistribution:
         """Set the parameters of the drawn policy."""

@@ -64,7 +64,7 @@ class SAFStates(TeamStates):
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamStates`."""
         communicated = self.communicate(features, teams, active)
-        return self.combine(communicated.states, communicated.exchanged.read)
+        return self.combine_net(th.cat([communicated.states, communicated.exchanged.read], dim=2))
 
     def communicate(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> Communicated:
         """
@@ -78,16 +78,6 @@ class SAFStates(TeamStates):
         ((own_messages, own_states),) = side_by_side([[self.message_net, self.state_net]], features)
         messages, states = gather(own_messages, teams), gather(own_states, teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
-
-    def combine(self, states: th.Tensor, read: th.Tensor) -> th.Tensor:
-        """
-        Return s^SAF = g_phi([s, m]).
-
-        :param states: (G, N, d), s of every agent
-        :param read: (G, N, d), m of every agent: the message read, or a substitute
-        :return: (G, N, d)
-        """
-        return self.combine_net(th.cat([states, read], dim=2))
 
 
 class SAFCritic(SAFStates, TeamCritic):
@@ -109,16 +99,7 @@ class SAFCritic(SAFStates, TeamCritic):
 
     def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`."""
-        return self.judge(self.states(features, teams, active), active)
-
-    def judge(self, states: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
-        """
-        Return V_i of every agent.
-
-        :param states: (G, N, d), s^SAF of every agent
-        :param active: (G, N) bool, agents that take part; all if None
-        :return: (G, N)
-        """
+        states = self.states(features, teams, active)
         if isinstance(self.value_head, OwnValueHead):
             return self.value_head.of_teams(states)
         if active is not None:

@@ -37,5 +37,4 @@ SUITE: Final = Suite(
         "SMAX", "MPE_simple_adversary_*", "MPE_simple_crypto_*", "MPE_simple_push_*", "MPE_simple_tag_*",
         "MPE_simple_world_comm_*", "coin_game",
     ),
-    has_state=True,
 )  # fmt: skip

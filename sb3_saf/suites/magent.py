@@ -23,5 +23,4 @@ SUITE: Final = Suite(
     examples=("gather_v5", "adversarial_pursuit_v4", "tiger_deer_v4"),
     game=partial(parallel_env, "magent2.environments"),
     competitive=("adversarial_*", "battle*", "combined_*", "tiger_*"),
-    has_state=True,
 )

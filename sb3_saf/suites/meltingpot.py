@@ -120,7 +120,6 @@ SUITE: Final = Suite(
     list_tasks=_tasks,
     examples=("collaborative_cooking__cramped", "clean_up"),
     game=_game,
-    has_state=True,
     is_seeded=False,
     module="meltingpot",
 )

@@ -23,5 +23,4 @@ SUITE: Final = Suite(
     examples=("simple_spread_v3", "simple_reference_v3", "simple_speaker_listener_v4"),
     game=partial(parallel_env, "mpe2"),
     competitive=("simple_adversary_*", "simple_crypto_*", "simple_push_*", "simple_tag_*", "simple_world_comm_*"),
-    has_state=True,
 )

@@ -37,5 +37,4 @@ SUITE: Final = Suite(
     examples=("3m",),
     vec_env=_games,
     team_return="mean",
-    has_state=True,
 )

@@ -41,7 +41,6 @@ class Suite:
         receives the team's whole reward)
     :param team_reward: default reward for learning, see ``make_team_env``
     :param training_params: parameters of the games for training only, such as shaped rewards
-    :param has_state: whether ``state=True`` is supported
     :param is_seeded: whether seeds determine its games
     :param module: module of the package, if it may be a source folder on ``PYTHONPATH`` instead of an installed package
     :param unavailable: why no version of the package works; such a suite has no games, only this message
@@ -60,7 +59,6 @@ class Suite:
     team_return: Reduction = "sum"
     team_reward: Literal["given"] | Reduction = "given"
     training_params: tuple[str, ...] = ()
-    has_state: bool = False
     is_seeded: bool = True
     module: str | None = None
     unavailable: str | None = None

@@ -70,11 +70,6 @@ class TeamEnvironment:
         """Name of the environment in file names."""
         return folder_name(self.id)
 
-    @property
-    def picture_mode(self) -> str | None:
-        """Render mode of pictures; None if the game may not support it."""
-        return "rgb_array" if self.task else None
-
     def complete(self, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """Check parameters of the game and add the defaults, if known."""
         if self.task is None:

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 import torch as th
@@ -108,16 +107,12 @@ def train(
     :raises CheckpointError: if a checkpoint cannot be written or read
     :raises NonFiniteError: at NaN or infinity
     """
-    with Training(settings, seed, folder, options, callbacks) as training:
+    with closing(Training(settings, seed, folder, options, callbacks)) as training:
         return training.learn()
 
 
 class Training:
-    """
-    Games, model and callbacks of one run, ready to learn; arguments as in :func:`train`.
-
-    A context manager that closes the games.
-    """
+    """Games, model and callbacks of one run, to be closed at the end; arguments as in :func:`train`."""
 
     def __init__(
         self,
@@ -138,14 +133,6 @@ class Training:
             self.model = self._make_model()
             self.callbacks = [*callbacks, *self._make_callbacks()]
             self._open = self._open.pop_all()
-
-    def __enter__(self) -> Training:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close all games."""
@@ -246,9 +233,9 @@ class Training:
     def _inspection(self, every_game_steps: int) -> InspectionCallback:
         """Make the callback that inspects the policy for TensorBoard, on games not used in training."""
         settings = self.settings
-        games = self._games(
-            settings, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode=settings.environment.picture_mode
-        )
+        # Other games may not support pictures.
+        render_mode = "rgb_array" if settings.environment.task else None
+        games = self._games(settings, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode=render_mode)
         return InspectionCallback(
             games,
             every_game_steps,

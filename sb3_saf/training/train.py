@@ -11,7 +11,7 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -269,7 +269,7 @@ def _train(options: argparse.Namespace, command: str) -> None:
                 options, settings, eval_settings=eval_settings, resume_hint=f"go on from there with: {again}"
             )
             remaining = RemainingTime(verbose=int(not options.progress))
-            training = stack.enter_context(Training(settings, seed, folder, run_options, [remaining]))
+            training = stack.enter_context(closing(Training(settings, seed, folder, run_options, [remaining])))
         _announce(training, folder)
         with user_errors(CheckpointError, NonFiniteError):
             training.learn()

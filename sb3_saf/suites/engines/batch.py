@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
+from sb3_saf.checkpoints.checks import check_keys, check_like, check_list, check_whole
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.space_reader import checked_actions
@@ -234,14 +235,14 @@ class ResumableBatchVecEnv(BatchVecEnv):
         :param state: result of :meth:`checkpoint_state`
         :raises ValueError: naming the first difference
         """
-        seeds, games = state["next_seeds"], state["games"]
-        if not isinstance(state["running"], bool) or not isinstance(games, Mapping):
-            raise ValueError("expected the state of games with 'running' true or false and arrays in 'games'")
-        if seeds is not None and not (len(seeds) == self.n_games and all(_is_seed(seed) for seed in seeds)):
-            raise ValueError(f"expected {self.n_games} seeds of games or None, got {seeds!r:.80}")
+        check_keys(dict(state), ("running", "next_seeds", "games"), "the games")
+        check_like(state["running"], False, "'running' of the games")
+        if (seeds := state["next_seeds"]) is not None:
+            check_list(seeds, "the seeds of the games", self.n_games)
+            for seed in seeds:
+                check_whole(seed, "a seed of the games", high=2**63 - 1)
         if state["running"]:
-            for difference in _differences(self._example(), games):
-                raise ValueError(difference)
+            check_like(state["games"], self._example(), "the games")
 
     def _example(self) -> dict[str, Array]:
         """Return a state of these games, which are reset first if they have not begun."""
@@ -261,17 +262,3 @@ class ResumableBatchVecEnv(BatchVecEnv):
             self.batch.restore(state["games"])
         self._running = state["running"]
         self._next_seeds = None if state["next_seeds"] is None else list(state["next_seeds"])
-
-
-def _is_seed(seed: object) -> bool:
-    return isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**63
-
-
-def _differences(own: Mapping[str, Array], found: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the differences in form between a state and one of these games."""
-    for name in sorted(own.keys() ^ found.keys()):
-        yield f"expected the state of games with {', '.join(own)}, they differ in {name!r}"
-    for name, array in own.items():
-        other = found[name]
-        if getattr(other, "shape", None) != array.shape or other.dtype != array.dtype:
-            yield f"expected {name!r} of shape {array.shape} and dtype {array.dtype}, got {other!r:.80}"
