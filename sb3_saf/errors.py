@@ -7,6 +7,10 @@ class ExportError(ValueError):
     """Raised for an invalid or untrusted file, or a model that cannot be exported."""
 
 
+class SettingsError(ValueError):
+    """Raised for settings that do not fit the model."""
+
+
 class NonFiniteError(ValueError):
     """Raised for NaN or infinity in training data, losses or gradients."""
 

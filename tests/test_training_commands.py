@@ -345,10 +345,11 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
         ("vec_env_wrapper:stable_baselines3.common.vec_env.VecFrameStack", "vec_env_wrapper: .*'n_stack'"),
         ("env_wrapper:nowhere.Wrapper", "cannot import Wrapper from 'nowhere'"),
         ("frame_stack:0", "frame_stack must be from 1"),
+        ("ent_coef:0.0 callback:sb3_saf.EntropySchedule", "EntropySchedule has nothing to change"),
     ],
 )
 def test_wrappers_that_are_none(settings: str, words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    line = failed(["--env", COUNTER, "--size", "smoke", "-f", str(tmp_path), "-params", settings], capsys)
+    line = failed(["--env", COUNTER, "--size", "smoke", "-f", str(tmp_path), "-params", *settings.split()], capsys)
     assert re.search(words, line), line
 
 

@@ -199,7 +199,9 @@ def test_results_of_a_run(logs: Path) -> None:
     assert run.final_score("training") == returns[-2:].mean()  # of 16 episodes, those that ended after 144 steps
 
 
-def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_once(logs: Path, tmp_path: Path) -> None:
+def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_once(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     given = ["--size", "smoke", "-n", "40", "--eval-freq", "-1", "--seed", "0", "--verbose", "0", "-f", str(tmp_path)]
     zoo_train.main(["--algo", "saf", *given])
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
@@ -209,6 +211,11 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     assert [run.number for run in table["run"]] == [1, 3]
     with pytest.raises(ValueError, match="has no evaluations"):
         table["run"][0].curve("evaluation")
+    fake_run(tmp_path, 4, seed=1)
+    figure = str(tmp_path / "curves.png")
+    zoo_plot.main(["curves", "-f", str(tmp_path), "--source", "training", "-o", figure])
+    assert capsys.readouterr().err.count("left out: ") == 1  # the run without episodes
+    assert "has no evaluations" in failed(["curves", "-f", str(tmp_path), "-o", figure], capsys, zoo_plot.main)
 
 
 def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None:

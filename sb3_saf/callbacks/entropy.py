@@ -7,6 +7,8 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_saf.errors import SettingsError
+
 
 class EntropySchedule(BaseCallback):
     """
@@ -34,12 +36,12 @@ class EntropySchedule(BaseCallback):
     def _init_callback(self) -> None:
         found = getattr(self.model, "ent_coef", None)
         if not isinstance(found, (int, float)):
-            raise ValueError(
+            raise SettingsError(
                 f"EntropySchedule changes the entropy coefficient of PPO and A2C; {type(self.model).__name__} has "
                 f"{'none' if found is None else f'ent_coef={found!r}'}; leave the callback out"
             )
         if found == self.end:
-            raise ValueError(
+            raise SettingsError(
                 f"EntropySchedule has nothing to change: ent_coef is {found} from the start, as end; give the "
                 "algorithm another, such as ent_coef=0.01"
             )

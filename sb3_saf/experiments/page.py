@@ -189,7 +189,11 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
     if common.empty:
         return "## Aggregates\n\nNone yet: the methods have no seed in common on the same settings."
     of_treasures = common["max_return"].notna().all()
-    what = "the share of treasures collected" if of_treasures else "the place in the range of all returns on a setting"
+    what = (
+        "the share of treasures collected"
+        if of_treasures
+        else "the return, scaled to 0 to 1 by the range of all returns on a setting"
+    )
     text = (
         f"Interquartile mean of {what}, over tasks and the seeds {_numbers(common['seed'])}, which all methods have; "
         "95 % stratified bootstrap intervals (rliable)."

@@ -36,7 +36,7 @@ def load_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -
     own: dict[str, th.Tensor] = policy.state_dict()
     limit = 2 * sum(tensor.numel() * tensor.element_size() for tensor in own.values()) + _OVERHEAD
     path = Path(path)
-    path = path if path.is_file() else path.with_name(f"{path.name}.zip")
+    path = path if path.is_file() or path.suffix == ".zip" else path.with_name(f"{path.name}.zip")
     tensors = read_weights(path, limit)
     remedy = "; make the model with the policy and policy_kwargs it was trained with"
     check_tensors(own, tensors, str(path), remedy)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from textwrap import fill
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ from sb3_saf.training.statistics import (
     require_columns,
 )
 
+#: Letters in a line of a panel's title.
+_TITLE_WIDTH: Final = 48
 #: Colours distinguishable by colour-blind readers (Okabe and Ito, and three darker ones).
 _COLOURS: Final = {
     "saf": "#0072B2",
@@ -106,6 +109,11 @@ def _figure(n_panels: int, height: float = 3.6) -> tuple[Figure, list[Axes]]:
     return figure, list(axes[:n_panels])
 
 
+def _wrapped(title: str) -> str:
+    """Return the title of a panel in lines that fit its width."""
+    return fill(title, _TITLE_WIDTH)
+
+
 def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
     """Add the title on top, and one legend for all panels below them."""
     entries: dict[str, Artist] = {}
@@ -159,7 +167,7 @@ def draw_curves(
             ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
         for (label, score), line in zip((references or {}).items(), cycle(_REFERENCE_LINES), strict=False):
             ax.axhline(score, color=_REFERENCE, linestyle=line, label=label)
-        ax.set(xlabel="game steps", ylabel=y_label, title=name)
+        ax.set(xlabel="game steps", ylabel=y_label, title=_wrapped(name))
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
@@ -191,7 +199,7 @@ def draw_levels(
         _draw_bars(ax, rows, level, styles)
         if references is not None:
             _draw_lines(ax, references if panel is None else references[references[panel] == name], level, rows)
-        ax.set(xlabel=level, ylabel=y_label, title=name)
+        ax.set(xlabel=level, ylabel=y_label, title=_wrapped(name))
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
 
@@ -250,7 +258,7 @@ def draw_differences(
         ax.set_yticks(middles.to_numpy(), middles.index)
         ax.axvline(0, color="black", linewidth=1)
         ax.invert_yaxis()
-        ax.set(xlabel=x_label, title=name)
+        ax.set(xlabel=x_label, title=_wrapped(name))
     return _finish(figure, all_axes, title)
 
 

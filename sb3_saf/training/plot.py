@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -12,6 +13,8 @@ from sb3_saf.training.names import unknown_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from sb3_saf.training.runs import Run, Source
 
 PROGRAM: Final = "python -m sb3_saf.plot"
 #: Columns of :func:`describe` that are not parameters of the game.
@@ -66,7 +69,7 @@ def _draw(options: argparse.Namespace) -> Figure:
     from sb3_saf.training.runs import describe, find_runs, setting_names
     from sb3_saf.training.statistics import score_matrices
 
-    table = describe(find_runs(options.log_folder, options.algos, options.env))
+    table = describe(_with_scores(find_runs(options.log_folder, options.algos, options.env), options.source))
     if options.kind == "levels" and options.level not in table:
         raise unknown_name("parameter", options.level, (column for column in table if column not in _NO_LEVELS))
     without = [options.level] if options.kind == "levels" else []
@@ -88,6 +91,22 @@ def _draw(options: argparse.Namespace) -> Figure:
     if are_treasures:
         table["score"], y_label = table["score"] / table["n_treasures"], "treasures collected / on the map"
     return draw_aggregates(score_matrices(table, "setting"), options.title, y_label)
+
+
+def _with_scores(runs: Sequence[Run], source: Source) -> list[Run]:
+    """Leave out runs without scores, and say why; ValueError if none has any."""
+    found, reasons = [], []
+    for run in runs:
+        try:
+            run.curve(source)
+            found.append(run)
+        except ValueError as error:
+            reasons.append(str(error))
+    if not found:
+        raise ValueError(reasons[0])
+    for reason in reasons:
+        print(f"left out: {reason}", file=sys.stderr)
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import yaml
 
-from sb3_saf.errors import CheckpointError, NonFiniteError
+from sb3_saf.errors import CheckpointError, NonFiniteError, SettingsError
 from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.callbacks import RemainingTime
 from sb3_saf.training.commands import (
@@ -271,7 +271,7 @@ def _train(options: argparse.Namespace, command: str) -> None:
             remaining = RemainingTime(verbose=int(not options.progress))
             training = stack.enter_context(closing(Training(settings, seed, folder, run_options, [remaining])))
         _announce(training, folder)
-        with user_errors(CheckpointError, NonFiniteError):
+        with user_errors(CheckpointError, NonFiniteError, SettingsError):
             training.learn()
     print(f"Saved to {folder}")
 
