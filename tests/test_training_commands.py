@@ -227,6 +227,7 @@ def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert f"the weights and the optimiser of {first}; no code is loaded" in capsys.readouterr().out
     other = ["--algo", "mappo", "--size", "smoke", "--env", ENV, "-f", str(tmp_path), "-i", str(first)]
     assert "do not fit MAPPOPolicy" in failed(other, capsys)
+    assert "another algorithm's" in failed([*other, "--algo", "saf", "-params", "algo:A2C"], capsys)
     pairs = zip(*(weights(PPO.load(path)).values() for path in (first, second)), strict=True)
     assert all(th.allclose(a.float(), b.float(), atol=1e-5) for a, b in pairs)
 

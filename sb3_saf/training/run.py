@@ -275,8 +275,12 @@ def load_parameters(model: BaseAlgorithm, path: Path) -> None:
     :param model: model with the policy and the ``policy_kwargs`` of the saved one
     :raises ValueError: if the file does not fit
     """
+    optimizer = model.policy.optimizer
+    settings = set(optimizer.param_groups[0])
     try:
         model.set_parameters(str(path), device=model.device)
+        if missing := settings - set(optimizer.param_groups[0]):
+            raise ValueError(f"its optimizer has no {', '.join(sorted(missing))}: another algorithm's")
     except Exception as error:  # errors of zipfile, the unpickler and torch have no common class
         reason = " ".join(str(error).split())[:300]
         raise ValueError(
