@@ -144,6 +144,8 @@ def test_bad_input(model: PPO, tmp_path: Path) -> None:
         replay(model, make_env(), tmp_path / "page.html", episodes=3)
     with pytest.raises(ValueError, match=r"team to be trained on observations of shape \(5, 5\).*got shape \(7, 7\)"):
         replay(model, make_env(view_size=5), tmp_path / "page.html")
+    with pytest.raises(ValueError, match=r"with 2 agents, got .* with 3"):
+        replay(model, make_env(n_agents=2), tmp_path / "page.html")
     env = sb3_saf.make_team_env(CounterEnv, n_envs=1)
     other = PPO("MAPPOPolicy", env, **sb3_saf.ppo_settings(env))
     with pytest.raises(ValueError, match="neither a grid nor render_mode='rgb_array'"):

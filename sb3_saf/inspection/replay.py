@@ -112,15 +112,16 @@ def replay(
 
 
 def _check_spaces(name: str, player: Player, env: VecEnv) -> None:
-    own = TeamSpaces.from_observation_space(env.observation_space).own
-    expected = own.shape
     if isinstance(player, Actor):
         return  # it checks every observation
-    found = TeamSpaces.from_observation_space(player.observation_space).own.shape
-    if found != expected or player.action_space != env.action_space:
+    expected, found = (TeamSpaces.from_observation_space(one.observation_space) for one in (env, player))
+    if (found.own.shape, found.n_agents) != (expected.own.shape, expected.n_agents) or (
+        player.action_space != env.action_space
+    ):
         raise ValueError(
-            f"expected {name} to be trained on observations of shape {expected} and {env.action_space}, got shape "
-            f"{found} and {player.action_space}; replay it on the environment that it was trained on"
+            f"expected {name} to be trained on observations of shape {expected.own.shape} and {env.action_space} with "
+            f"{expected.n_agents} agents, got shape {found.own.shape} and {player.action_space} with {found.n_agents}; "
+            "replay it on the environment that it was trained on"
         )
 
 
