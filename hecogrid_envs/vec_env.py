@@ -236,7 +236,7 @@ class NativeVecEnv(TeamVecEnv):
         """Return the complete state as plain data."""
         return {
             "task": self.batch.task,
-            "params": {name: _plain(value) for name, value in asdict(self.params).items()},
+            "params": asdict(self.params),
             "n_games": self.n_games,
             "running": self._running,
             "seeds": self.per_row(self._next_seeds or [None] * self.n_games),
@@ -314,11 +314,6 @@ def _check_seeds(seeds: Any, n_games: int, n_agents: int) -> None:
         raise ValueError(
             f"expected {n_games * n_agents} seeds of at least 0 or None, one for each row, got {seeds!r:.80}"
         )
-
-
-def _plain(value: object) -> object:
-    """Convert a parameter to what JSON gives back."""
-    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def make_vec_env(

@@ -33,7 +33,6 @@ from sb3_saf.envs.teams import (
 )
 
 TimeLimit = Literal["terminal", "bootstrap"]
-TIME_LIMITS: Final[tuple[TimeLimit, ...]] = get_args(TimeLimit)
 
 TERMINAL_OBSERVATION: Final = "terminal_observation"
 TRUNCATED: Final = "TimeLimit.truncated"
@@ -81,7 +80,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, n_agents: int | None = None, time_limit: TimeLimit = "terminal") -> None:
-        check_choice("time_limit", time_limit, TIME_LIMITS)
+        check_choice("time_limit", time_limit, get_args(TimeLimit))
         raw = RowSpaces.of(venv.observation_space, venv.action_space)
         n_agents = require_n_agents(venv, n_agents)
         names = getattr(venv, "possible_agents", None)

@@ -17,12 +17,11 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.team_game import make_team_game, team_game
-from sb3_saf.envs.team_reward import TEAM_REWARDS, SharedReward, TeamReward
+from sb3_saf.envs.team_reward import SharedReward, TeamReward
 from sb3_saf.envs.teams import check_choice, check_count
 from sb3_saf.suites.registry import SuiteTask, find_task
 
 Backend = Literal["native", "supersuit"]
-BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 #: Characters that occur in names of modules and functions, but not of tasks.
 _NAMES_OF_CODE: Final = frozenset(".:")
 
@@ -109,9 +108,9 @@ def make_team_env(
     check_count("n_envs", n_envs)
     check_count("n_cpus", n_cpus)
     if backend is not None:
-        check_choice("backend", backend, BACKENDS)
+        check_choice("backend", backend, get_args(Backend))
     if team_reward is not None:
-        check_choice("team_reward", team_reward, TEAM_REWARDS)
+        check_choice("team_reward", team_reward, get_args(TeamReward))
     request = Request(n_envs, backend, n_cpus, Signals(active is not False, action_masks, state))
     task = find_task(env) if isinstance(env, str) and "/" in env else None
     if isinstance(env, str) and _NAMES_OF_CODE.intersection(env):

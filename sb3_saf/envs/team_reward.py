@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -13,7 +13,6 @@ from sb3_saf.envs.teams import TeamVecEnvWrapper
 
 #: Each agent its own reward; each the sum, or the mean, over the agents of its team.
 TeamReward = Literal["given", "sum", "mean"]
-TEAM_REWARDS: Final[tuple[TeamReward, ...]] = get_args(TeamReward)
 
 
 class SharedReward(TeamVecEnvWrapper):
@@ -23,11 +22,10 @@ class SharedReward(TeamVecEnvWrapper):
 
     :param venv: rows of flattened teams
     :param team_reward: ``"sum"`` or ``"mean"`` over the agents of a team
-    :param n_agents: N; None uses the attribute ``n_agents`` of ``venv``
     """
 
-    def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"], n_agents: int | None = None) -> None:
-        super().__init__(venv, n_agents)
+    def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"]) -> None:
+        super().__init__(venv)
         self.team_reward = team_reward
 
     def step_wait(self) -> VecEnvStepReturn:

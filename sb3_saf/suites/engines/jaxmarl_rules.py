@@ -91,7 +91,6 @@ _SMAX: Final = Rules(is_undecided=_both_alive, is_won=_enemies_dead, pays_the_de
 _RULES: Final[dict[str, Rules]] = {
     "SMAX": _SMAX._replace(is_won=None),  # both sides are trained, one wins
     "HeuristicEnemySMAX": _SMAX,
-    "LearnedPolicyEnemySMAX": _SMAX,
     "overcooked": Rules(extra_reward=_shaped, draw=_draw_overcooked),
     "overcooked_v2": Rules(extra_reward=_shaped, draw=_draw_overcooked_v2),
 }
