@@ -1,7 +1,7 @@
 """
 Measure the cost of ``InspectionCallback`` at its default frequency: ``python -m benchmarks.inspection``.
 
-Trains SAF as ``make train`` does (TeamSupport, 5 agents, 16 games, light encoder) with an inspection at the start and
+Trains SAF as ``make train`` does (TeamSupport, 5 agents, 80 games, light encoder) with an inspection at the start and
 one at the end, and relates the seconds of one inspection to those of training during the default interval. Seconds are
 processor time of one core, which excludes other programs.
 """
