@@ -18,7 +18,6 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from hecogrid_envs.vec_env import chosen_indices
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.teams import (
     ACTION_MASK_KEY,
@@ -27,6 +26,7 @@ from sb3_saf.envs.teams import (
     STAGGERED,
     Array,
     check_count,
+    chosen_rows,
     find_n_agents,
     team_dones,
 )
@@ -220,7 +220,7 @@ class _GameRows(VecEnvWrapper):
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Return True for SB3's Monitor if there is a TeamMonitor, so that SB3 uses its unmodified episodes."""
-        return [self._monitored and wrapper_class is Monitor for _ in chosen_indices(indices, self.num_envs)]
+        return [self._monitored and wrapper_class is Monitor for _ in chosen_rows(indices, self.num_envs)]
 
 
 def _whole(info: dict[str, Any]) -> dict[str, Any]:

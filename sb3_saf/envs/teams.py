@@ -20,7 +20,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs
 
-from hecogrid_envs.vec_env import chosen_indices
 from sb3_saf.errors import NonFiniteError
 
 TeamKey = Literal["obs", "team", "agent"]
@@ -291,6 +290,13 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     return size
 
 
+def chosen_rows(indices: VecEnvIndices, n_rows: int) -> list[int]:
+    """Return the rows selected by ``indices`` as in SB3's methods, None for all."""
+    rows = np.arange(n_rows)
+    chosen = rows if indices is None else np.atleast_1d(rows[np.asarray(indices, dtype=np.int64)])
+    return [*map(int, chosen)]
+
+
 def check_count(name: str, value: object) -> int:
     """Check that a value is an integer of at least 1; the ValueError contains ``name``."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
@@ -448,7 +454,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """See the base class; the team's shape is answered here, even if the environments lack it."""
         if attr_name in _TEAM_ATTRIBUTES and attr_name in vars(self):
-            return [vars(self)[attr_name] for _ in chosen_indices(indices, self.num_envs)]
+            return [vars(self)[attr_name] for _ in chosen_rows(indices, self.num_envs)]
         return super().get_attr(attr_name, indices)
 
     def env_is_wrapped(
@@ -461,7 +467,7 @@ class TeamVecEnvWrapper(VecEnvWrapper):
         if wrapper_class is not Monitor:
             return super().env_is_wrapped(wrapper_class, indices)
         self._warn_of_rows()
-        return [False for _ in chosen_indices(indices, self.num_envs)]
+        return [False for _ in chosen_rows(indices, self.num_envs)]
 
     def _warn_of_rows(self) -> None:
         if self._warned_of_rows or self.n_agents == 1:
