@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_saf.errors import NonFiniteError
 from sb3_saf.networks import attention
 from sb3_saf.networks.layers import mlp, side_by_side
 from sb3_saf.networks.tanh import Tanh
@@ -101,5 +102,5 @@ def test_actions_are_those_of_multinomial(shape: tuple[int, int]) -> None:
 def test_nan_probabilities_are_refused() -> None:
     logits = th.zeros(7, 5)
     logits[3, 2] = th.nan
-    with pytest.raises(ValueError, match=r"probabilities of actions are NaN.*lower the learning rate"):
+    with pytest.raises(NonFiniteError, match=r"probabilities of actions are NaN.*lower the learning rate"):
         LeanCategorical(5).proba_distribution(logits).sample()

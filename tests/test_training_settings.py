@@ -131,6 +131,9 @@ def test_another_algorithm_takes_the_settings_that_it_has(algorithm: str) -> Non
         model.learn(model.n_envs)
     assert type(model).__name__ == algorithm
     assert (model.gamma, model.gae_lambda, model.n_steps) == (0.9, 0.9, 10)  # type: ignore[attr-defined]
+    if algorithm == "A2C":  # its own settings, also when they are read again
+        own = load_settings("saf", ENV, "small", overrides={"algo": algorithm, "use_rms_prop": False})
+        assert saved_settings(own.as_dict()).hyperparams["use_rms_prop"] is False
     with pytest.raises(ValueError, match="unknown setting 'clip_range'"):
         load_settings("saf", ENV, "small", overrides={"algo": algorithm, "clip_range": 0.1})
 

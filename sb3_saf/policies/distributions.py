@@ -22,6 +22,7 @@ from torch import nn
 from torch.distributions import Categorical, register_kl
 from torch.distributions import Distribution as TorchDistribution
 
+from sb3_saf.errors import NonFiniteError
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, PoolOutput, draw_policy
 from sb3_saf.networks.distributions import (
     masked_parameters,
@@ -123,11 +124,11 @@ class LeanCategorical(CategoricalDistribution):
         """
         Sample actions (B,), those of ``torch.multinomial`` from the same random numbers.
 
-        :raises ValueError: for NaN
+        :raises NonFiniteError: for NaN
         """
         probabilities = self.log_probs.exp()
         if isnan(probabilities.sum().item()):
-            raise ValueError(
+            raise NonFiniteError(
                 "the probabilities of actions are NaN: the policy's parameters, or its observations, are; check the "
                 "observations' range, lower the learning rate, or set max_grad_norm"
             )

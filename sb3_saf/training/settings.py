@@ -233,7 +233,9 @@ def load_settings(
     content = read_config(spec.config) if config is None else read_file(config)
     _check_environments(content, environment, source)
     own = _checked_keys(entry_of(content, environment.yaml_keys, size), spec, source)
-    given = _exclusive(_checked(overrides or {}, spec, "the given settings"))
+    overrides = overrides or {}
+    trained_by = find_algorithm(algo, overrides.get(_ALGO, overrides.get("algorithm")))
+    given = _exclusive(_checked(overrides, trained_by, "the given settings"))
     level = entry_of(read_config("levels"), environment.yaml_keys, size)
     own = _known_to(given.get("algorithm"), algo, own)
     layers = (level, own, given, {"env_kwargs": env_kwargs or {}}, {"policy_kwargs": dict(spec.policy_kwargs)})
@@ -255,7 +257,8 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
         raise ValueError(f"expected saved hyperparams to map names to values, got {saved['hyperparams']!r}")
     spec = find_algorithm(saved["algo"])
     own = {key: saved[key] for key in _OWN_KEYS if key in saved and saved[key] != spec.algorithm.__name__}
-    entry = merge(_checked({**own, **saved["hyperparams"]}, spec, "the saved settings"))
+    trained_by = find_algorithm(saved["algo"], own.get("algorithm"))
+    entry = merge(_checked({**own, **saved["hyperparams"]}, trained_by, "the saved settings"))
     # Reading N from the file avoids importing the games' package for plots.
     n_agents = None if env_kwargs else saved.get("n_agents")
     return _build(
