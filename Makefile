@@ -49,9 +49,10 @@ format-check: $(INSTALLED)
 	@echo "== format"
 	@$(RUN) ruff format --check . || { echo "The files above are not formatted: run 'make format'." >&2; exit 1; }
 
-lint: $(INSTALLED) ## ruff's rules (pyproject.toml)
+lint: $(INSTALLED) ## ruff's rules (pyproject.toml), and no room imports a room above it (setup.cfg)
 	@echo "== lint"
 	@$(RUN) ruff check .
+	@$(VENV)/bin/lint-imports --no-cache --no-logo
 
 types: $(INSTALLED) ## mypy over everything (setup.cfg)
 	@echo "== types"

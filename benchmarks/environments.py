@@ -30,7 +30,8 @@ from benchmarks.rates import Rate, Work, one_line, random_actions, rate, table, 
 from benchmarks.rollout_memory import memory_table
 from benchmarks.two_threads import threads_table
 from benchmarks.workers import Worker
-from hecogrid_envs import TASK_NAMES, make_vec_env, parallel_env
+from hecogrid_envs import TASK_NAMES, parallel_env
+from sb3_saf import make_vec_env
 
 ROUNDS = 7
 SECONDS = 0.3

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_saf
-from hecogrid_envs import TASK_NAMES, make_vec_env
+from hecogrid_envs import TASK_NAMES
+from sb3_saf import make_vec_env
 from sb3_saf.training.settings import load_settings
 
 N_GAMES: Final = 128

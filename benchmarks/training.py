@@ -26,8 +26,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from hecogrid_envs import make_vec_env
-from sb3_saf import CentralizedValueWrapper, PaperCNN, TeamMonitor, TeamRolloutBuffer
+from sb3_saf import CentralizedValueWrapper, PaperCNN, TeamMonitor, TeamRolloutBuffer, make_vec_env
 
 N_STEPS: Final = 50
 N_EPOCHS: Final = 10

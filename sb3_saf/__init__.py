@@ -10,8 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from typing import NoReturn
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.actor import Actor
+from sb3_saf.teams.errors import ExportError
 
 
 def _is_installed(name: str) -> bool:
@@ -33,11 +33,9 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.envs.curriculum import Curriculum, Stage
     from sb3_saf.envs.gymnasium_team import GymnasiumTeam
     from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-    from sb3_saf.envs.make import make_team_env
     from sb3_saf.envs.monitor import TeamMonitor
     from sb3_saf.envs.team_game import EqualSpaces
     from sb3_saf.envs.turns import TurnsInParallel
-    from sb3_saf.errors import CheckpointError, NonFiniteError
     from sb3_saf.evaluation import (
         EvaluationResult,
         RandomPolicy,
@@ -50,6 +48,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
     from sb3_saf.inspection.replay import replay
+    from sb3_saf.make import make_team_env
     from sb3_saf.policies.extractors import (
         LightEncoder,
         MLPEncoder,
@@ -64,6 +63,8 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
+    from sb3_saf.suites.hecogrid import make_vec_env
+    from sb3_saf.teams.errors import CheckpointError, NonFiniteError
     from sb3_saf.training.ppo_settings import ppo_settings
 
     register_all()
@@ -129,6 +130,7 @@ __all__ = [
     "inspect_team",
     "load_weights",
     "make_team_env",
+    "make_vec_env",
     "ppo_settings",
     "replay",
     "resumable_learn",

@@ -19,17 +19,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wr
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.teams import (
-    ACTION_MASK_KEY,
-    AGENT_KEY,
-    IS_SUCCESS,
-    STAGGERED,
-    Array,
-    check_count,
-    chosen_rows,
-    find_n_agents,
-    team_dones,
-)
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, STAGGERED, Array
+from sb3_saf.teams.vec_env import chosen_indices, find_n_agents, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -220,7 +212,7 @@ class _GameRows(VecEnvWrapper):
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Return True for SB3's Monitor if there is a TeamMonitor, so that SB3 uses its unmodified episodes."""
-        return [self._monitored and wrapper_class is Monitor for _ in chosen_rows(indices, self.num_envs)]
+        return [self._monitored and wrapper_class is Monitor for _ in chosen_indices(indices, self.num_envs)]
 
 
 def _whole(info: dict[str, Any]) -> dict[str, Any]:

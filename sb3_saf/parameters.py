@@ -15,10 +15,10 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from torch import nn
 
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.parts import Declaration
 from sb3_saf.registration import DECLARATIONS
+from sb3_saf.teams.rows import TeamSpaces
 
 N_AGENTS: Final = 10
 #: Parts of the released code only, which the paper's number for SAF includes.

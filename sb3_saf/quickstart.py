@@ -19,10 +19,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from hecogrid_envs import TASK_NAMES
 from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
+from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.folders import write_run
 from sb3_saf.training.run import RunOptions, train
-from sb3_saf.training.seeds import evaluation_seed
 from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.watching import play, write_video
 

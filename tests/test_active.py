@@ -17,10 +17,9 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, RandomPolicy, SAFPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.envs.row_spaces import RowSpaces
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.policies.distributions import actor_distribution
+from sb3_saf.teams.rows import RowSpaces, TeamSpaces
 from tests.team_venv import Array
 from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv, UnequalEnv
 

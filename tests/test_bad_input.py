@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import hecogrid_envs
+import sb3_saf
 from hecogrid_envs import GameBatch, HECOGridEnv, HECOGridParams
 from hecogrid_envs.params import MAX_AGENTS
 
@@ -153,7 +154,7 @@ WRONG_ACTIONS: list[tuple[Any, str]] = [
 
 
 def vec(**changes: Any) -> Any:
-    return hecogrid_envs.make_vec_env("TeamSupport", **{"n_envs": 2, "seed": 0, **SMALL, **changes})
+    return sb3_saf.make_vec_env("TeamSupport", **{"n_envs": 2, "seed": 0, **SMALL, **changes})
 
 
 def started() -> Any:

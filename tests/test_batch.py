@@ -49,7 +49,8 @@ def test_game_seeds_do_not_depend_on_their_number_and_never_repeat() -> None:
     assert game_seeds(3, 4, first=2) == game_seeds(3, 6)[2:]
     seeds = [seed for run in range(200) for seed in game_seeds(run, 50)]
     assert len(set(seeds)) == len(seeds)
-    assert all(0 <= seed < 2**63 for seed in seeds)
+    assert len(set(game_seeds(0, 100_000))) == 100_000
+    assert all(0 <= seed < 2**32 for seed in seeds), "np.random.seed and RandomState take 32 bits"
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)

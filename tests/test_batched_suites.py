@@ -15,8 +15,8 @@ from hecogrid_envs.core.rng import game_seeds
 from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.checkpoints.data import read_tree, write_tree
 from sb3_saf.checkpoints.environments import check_environment_state, environment_state, load_environment_state
-from sb3_saf.errors import CheckpointError
 from sb3_saf.suites.registry import find_task, suites
+from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.training.settings import load_settings
 
 Array = npt.NDArray[Any]

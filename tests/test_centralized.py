@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeI
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.teams import TeamSpaces, find_n_agents
+from sb3_saf.teams.rows import TeamSpaces
+from sb3_saf.teams.vec_env import find_n_agents
 from tests.team_venv import VECTOR, Array, TeamVenv, see_where, still
 
 

@@ -17,7 +17,7 @@ import torch as th
 
 from sb3_saf.checkpoints.data import decode, encode, write_tree
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
+from sb3_saf.teams.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 
 TREE: dict[str, Any] = {
     "numbers": [1, -1.5, float("-inf"), True, None, 2**127, "text"],

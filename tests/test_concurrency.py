@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3 import PPO
 
 import sb3_saf
-from hecogrid_envs import make_vec_env
+from sb3_saf import make_vec_env
 from tests.toy_envs import LazyEnv
 
 LEVEL: Final[dict[str, Any]] = {

@@ -20,13 +20,13 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_saf
 from sb3_saf import SAFLstmPolicy, evaluate_team, make_team_env
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.policies.distributions import actor_distribution, distribution_of, mixture_of
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from sb3_saf.registration import DECLARATIONS
+from sb3_saf.teams.rows import TeamSpaces
 from tests.contrib_teams import CueTeams, MaskedTeams, choices_of, is_allowed, random_masks
 from tests.test_policies import ACTIONS, equal_weights
 from tests.toy_envs import CounterEnv

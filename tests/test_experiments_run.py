@@ -18,7 +18,6 @@ import torch as th
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from hecogrid_envs.vec_env import NativeVecEnv
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, curve, run_job
 from sb3_saf.experiments.definitions import Level, find_experiment
@@ -26,7 +25,8 @@ from sb3_saf.experiments.files import differences
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
-from sb3_saf.training.seeds import evaluation_seed
+from sb3_saf.suites.hecogrid import NativeVecEnv
+from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training.train import main as train_main
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 

@@ -15,8 +15,8 @@ import torch as th
 from sb3_contrib import RecurrentPPO
 
 from sb3_saf import Actor, ExportError, MAPPOPolicy, SAFPolicy, export_actors, make_team_env
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.teams.rows import TeamSpaces
 from tests import test_contrib
 from tests.contrib_teams import random_masks
 from tests.test_contrib import MASKABLE

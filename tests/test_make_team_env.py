@@ -13,10 +13,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.envs.make import make_team_env
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import RandomPolicy, evaluate_team
+from sb3_saf.make import make_team_env
 from tests.team_venv import Array, TeamVenv
 from tests.toy_envs import CounterEnv
 

@@ -20,12 +20,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.layers import Linear, Rows
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import DECLARATIONS, register
+from sb3_saf.teams.rows import TeamSpaces
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, gather_rows, team_rows, to_numpy
 
 #: All policies declared for PPO, sorted by name.

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
 from sb3_saf.checkpoints.data import read_tree, write_tree
-from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.teams.rows import TeamSpaces
 
 N_AGENTS, N_GAMES, N_ACTIONS = 2, 3, 4
 OWN = spaces.Box(0, 255, (3,), np.uint8)

@@ -27,7 +27,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import sb3_saf
 from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
-from sb3_saf.envs.teams import TeamVecEnvWrapper
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from tests.killed_runs import ALGOS
 from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv
 

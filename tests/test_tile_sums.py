@@ -10,8 +10,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from hecogrid_envs import make_vec_env
-from sb3_saf import LightEncoder, PaperCNN
+from sb3_saf import LightEncoder, PaperCNN, make_vec_env
 from sb3_saf.networks.layers import mlp
 from sb3_saf.networks.tanh import Tanh
 from sb3_saf.networks.tile_sums import (

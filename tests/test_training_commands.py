@@ -25,7 +25,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from hecogrid_envs.play import main as play_main
 from sb3_saf import QPLEX, SAFPolicy, evaluate_team, quickstart
 from sb3_saf.experiments.cli import main as experiments_main
-from sb3_saf.randomness import own_randomness
+from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import folders
 from sb3_saf.training import plot as zoo_plot

@@ -19,8 +19,8 @@ from hecogrid_envs.core.rng import game_seeds
 from hecogrid_envs.params import HECOGridParams
 from sb3_saf import LightEncoder, TeamRolloutBuffer
 from sb3_saf.suites.registry import suites
+from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
 from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.seeds import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ENV_IDS, SIZES, Settings, load_settings, saved_settings
 from sb3_saf.training.yaml_files import Size, config_names, load_yaml, read_config
 

@@ -15,9 +15,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
 from sb3_saf.envs.joint_observation import TimeLimit
-from sb3_saf.envs.teams import TeamSpaces
 from sb3_saf.networks.value_normalizer import MIN_STD, Rescaling, ValueNormalizer
 from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.teams.rows import TeamSpaces
 from tests.probe_envs import DelayedReward
 from tests.test_policies import NAMES, POLICIES, equal_weights, make_policy
 from tests.toy_teams import VECTOR, ToyTeams, team_rows

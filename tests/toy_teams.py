@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.teams.rows import TeamSpaces
 
 VECTOR = spaces.Box(-1.0, 1.0, (5,), np.float32)
 PICTURE = spaces.Box(0, 255, (3, 12, 12), np.uint8)

@@ -19,29 +19,28 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
 
-#: Game seeds fit into a signed 64-bit integer, which all wrappers accept.
-_SEED_BITS = 63
+#: Game seeds have 32 bits, the most that ``np.random.seed`` and ``RandomState`` of other games take.
+_SEED_BITS = 32
+#: Odd, so that the seeds of a run's games differ: 2**32 over the golden ratio.
+_STRIDE = 0x9E3779B1
 
 
 def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
     """
     Return the seeds of the games of a vector environment.
 
-    Game ``i`` gets the same seed for any number of games; seeds of runs ``seed`` and ``seed + 1`` are unrelated.
+    Game ``i`` gets the same seed for any number of games, and the games of a run have different seeds; seeds of runs
+    ``seed`` and ``seed + 1`` are unrelated.
 
     :param seed: the run's seed, 0 or larger
     :param n_games: E, number of games
     :param first: index of the first game
-    :return: E integers below 2**63
+    :return: E integers below 2**32
     :raises ValueError: for an invalid seed
     """
     check_seed(seed)
-    return [_game_seed(seed, index) for index in range(first, first + n_games)]
-
-
-def _game_seed(seed: int, index: int) -> int:
-    words = np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)
-    return int(words[0]) >> (64 - _SEED_BITS)
+    start = int(np.random.SeedSequence(seed).generate_state(1, np.uint32)[0])
+    return [(start + index * _STRIDE) % 2**_SEED_BITS for index in range(first, first + n_games)]
 
 
 def check_seed(seed: object) -> None:

@@ -19,17 +19,8 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_list, check_whole
-from sb3_saf.envs.teams import (
-    ACTION_MASK_KEY,
-    ACTIVE_KEY,
-    AGENT_KEY,
-    OBS_KEY,
-    STATE_KEY,
-    Array,
-    TeamSpaces,
-    check_count,
-    check_whole_teams,
-)
+from sb3_saf.teams.checks import check_count, check_whole_teams
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 Indices = npt.NDArray[np.int64]
 

@@ -14,18 +14,9 @@ from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf.buffers.later import LaterValues, compute_together
-from sb3_saf.envs.teams import (
-    ACTION_MASK_KEY,
-    ACTIVE_KEY,
-    AGENT_KEY,
-    OBS_KEY,
-    STATE_KEY,
-    TEAM_KEY,
-    Array,
-    TeamSpaces,
-    check_whole_teams,
-)
 from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
+from sb3_saf.teams.checks import check_whole_teams
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, TEAM_KEY, Array, TeamSpaces
 
 #: Arrays with one entry per step and row, without the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")

@@ -7,7 +7,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf.errors import SettingsError
+from sb3_saf.teams.errors import SettingsError
 
 
 class EntropySchedule(BaseCallback):

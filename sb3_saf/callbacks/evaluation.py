@@ -9,8 +9,8 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, show_game_steps, team_steps
-from sb3_saf.envs.teams import check_other_games, require_n_agents
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
+from sb3_saf.teams.vec_env import check_other_games, require_n_agents
 
 
 class TeamEvalCallback(EvalCallback):

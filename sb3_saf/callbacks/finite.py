@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch.utils.hooks import RemovableHandle
 
 from sb3_saf.callbacks.game_steps import game_steps
-from sb3_saf.errors import NonFiniteError
+from sb3_saf.teams.errors import NonFiniteError
 
 #: Arrays of SB3's rollout buffers, in the order of computation.
 _ROLLOUT: Final = ("observations", "rewards", "values", "log_probs", "returns", "advantages")

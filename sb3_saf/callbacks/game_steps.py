@@ -12,8 +12,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
-from sb3_saf.envs.teams import TEAM_KEY, TEAM_KEYS, find_n_agents
 from sb3_saf.policies.rows import TeamRowsPolicy
+from sb3_saf.teams.rows import TEAM_KEY, TEAM_KEYS
+from sb3_saf.teams.vec_env import find_n_agents
 
 GAME_STEPS_TAG = "time/game_steps"
 GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"

@@ -22,8 +22,9 @@ from sb3_saf.checkpoints.logs import logger_state
 from sb3_saf.checkpoints.models import is_off_policy, model_state, require_resumable
 from sb3_saf.checkpoints.runs import callback_descriptions, description, software
 from sb3_saf.checkpoints.store import CheckpointFolder, Loaded
-from sb3_saf.envs.teams import check_count, require_n_agents
-from sb3_saf.errors import CheckpointError
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.vec_env import require_n_agents
 
 
 class Run(NamedTuple):

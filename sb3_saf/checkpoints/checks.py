@@ -16,8 +16,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_saf.checkpoints.data import Tree
-from sb3_saf.envs.teams import bounds_of
-from sb3_saf.errors import CheckpointError
+from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.rows import bounds_of
 
 _LARGEST: Final = 2**63
 

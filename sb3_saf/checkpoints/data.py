@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_saf.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
+from sb3_saf.teams.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 
 FORMAT: Final = 2
 #: Versions that read earlier formats.

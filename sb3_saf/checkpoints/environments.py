@@ -12,8 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_observations, check_real
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.envs.curriculum import Curriculum
-from sb3_saf.envs.teams import layers
-from sb3_saf.errors import CheckpointError
+from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.vec_env import layers
 
 
 @runtime_checkable

@@ -31,8 +31,8 @@ from sb3_saf.checkpoints.models import check_model_state, is_off_policy, load_mo
 from sb3_saf.checkpoints.runs import check_descriptions, check_software, warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.envs.game_copies import ForeignGamesError, pickled_games, sign_games
-from sb3_saf.envs.teams import require_n_agents
-from sb3_saf.errors import CheckpointError, NonFiniteError
+from sb3_saf.teams.errors import CheckpointError, NonFiniteError
+from sb3_saf.teams.vec_env import require_n_agents
 
 #: Torch's error message for action distributions with NaN parameters.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)

@@ -31,8 +31,8 @@ from sb3_saf.checkpoints.checks import (
 )
 from sb3_saf.checkpoints.data import Tree
 from sb3_saf.checkpoints.environments import check_stateful
-from sb3_saf.errors import CheckpointError
 from sb3_saf.qplex.qplex import QPLEX
+from sb3_saf.teams.errors import CheckpointError
 
 _COUNTERS: Final = (
     *("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"),

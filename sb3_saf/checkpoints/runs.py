@@ -28,8 +28,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_saf.callbacks.entropy import EntropySchedule
 from sb3_saf.checkpoints.checks import check_keys, check_list, check_text, refused
 from sb3_saf.checkpoints.data import Tree
-from sb3_saf.envs.teams import game_seeds_of
-from sb3_saf.errors import CheckpointError
+from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.vec_env import game_seeds_of
 
 #: Arguments that must equal those of the first start. Schedules are compared by their values.
 _ARGUMENTS: Final = (

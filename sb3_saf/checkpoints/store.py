@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from sb3_saf.checkpoints.data import Tree, read_tree
-from sb3_saf.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
+from sb3_saf.teams.errors import CheckpointError, DamagedCheckpointError, UnknownFormatError
 
 try:
     import fcntl

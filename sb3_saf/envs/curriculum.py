@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_whole
-from sb3_saf.envs.teams import TeamVecEnvWrapper, check_count
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 
 
 class Stage(NamedTuple):

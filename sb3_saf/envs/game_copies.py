@@ -31,8 +31,8 @@ from gymnasium.utils import EzPickle
 
 from sb3_saf.checkpoints.data import decode, encode
 from sb3_saf.envs.game_layers import layers_of
-from sb3_saf.envs.teams import ACTION_MASK_KEY
-from sb3_saf.errors import CheckpointError
+from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.rows import ACTION_MASK_KEY
 
 if TYPE_CHECKING:
     from sb3_saf.envs.supersuit_game import TeamMarkovVectorEnv

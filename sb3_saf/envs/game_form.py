@@ -10,7 +10,6 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_saf.envs import parallel_calls
-from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.space_reader import (
     FlatReader,
     SpaceReader,
@@ -18,7 +17,7 @@ from sb3_saf.envs.space_reader import (
     counted_from_zero,
     leaves_of,
 )
-from sb3_saf.envs.teams import ACTION_MASK_KEY, FIXED_SHAPE
+from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, RowSpaces
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_saf.envs.teams import IS_SUCCESS
+from sb3_saf.teams.rows import IS_SUCCESS
 
 
 class GymnasiumTeam(ParallelEnv[str, Any, Any]):

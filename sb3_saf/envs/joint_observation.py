@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_array, check_range, check_whole
-from sb3_saf.envs.row_spaces import RowSpaces, channels_first
-from sb3_saf.envs.teams import (
+from sb3_saf.teams.checks import check_choice
+from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
     AGENT_KEY,
@@ -23,14 +23,11 @@ from sb3_saf.envs.teams import (
     STATE_KEY,
     TEAM_KEY,
     Array,
+    RowSpaces,
     TeamSpaces,
-    TeamVecEnvWrapper,
-    check_choice,
-    check_finite,
-    chosen_rows,
-    require_n_agents,
-    team_dones,
+    channels_first,
 )
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, chosen_indices, require_n_agents, team_dones
 
 TimeLimit = Literal["terminal", "bootstrap"]
 
@@ -124,7 +121,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._has_asked_for_masks |= method_name == _ACTION_MASKS
         if self._shows_masks(method_name) and not super().has_attr(method_name):
             assert self._masks_shown is not None, "algorithms reset the environment before they ask"
-            return [self._masks_shown[row].astype(bool) for row in chosen_rows(indices, self.num_envs)]
+            return [self._masks_shown[row].astype(bool) for row in chosen_indices(indices, self.num_envs)]
         return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
     def _shows_masks(self, method_name: str) -> bool:

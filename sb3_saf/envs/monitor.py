@@ -15,7 +15,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_array, check_real, check_whole
-from sb3_saf.envs.teams import Array, TeamVecEnvWrapper, check_finite, team_dones
+from sb3_saf.teams.rows import Array
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
 #: Game steps after which the rewards are tested.

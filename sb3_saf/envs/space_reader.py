@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_saf.envs.teams import FIXED_SHAPE, Array, bounds_of
+from sb3_saf.teams.rows import FIXED_SHAPE, Array, bounds_of
 
 
 def parts_of(space: spaces.Space[Any]) -> dict[Any, spaces.Space[Any]]:

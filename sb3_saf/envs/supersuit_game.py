@@ -17,7 +17,7 @@ from sb3_saf.envs.game_form import OBSERVATION, AnyParallelEnv, GameForm
 from sb3_saf.envs.game_layers import get_attribute
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.space_reader import SpaceReader
-from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
 
 Info: TypeAlias = "dict[str, Any]"
 Infos: TypeAlias = "list[Info]"

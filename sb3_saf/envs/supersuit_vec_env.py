@@ -14,7 +14,6 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
 from sb3_saf.envs import game_layers
 from sb3_saf.envs.game_copies import check_signature, signature
@@ -22,7 +21,9 @@ from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, Signals, check_i
 from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
 from sb3_saf.envs.supersuit_games import GameSource, Question, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
-from sb3_saf.envs.teams import Array, check_count
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.rows import Array
+from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 
 class SuperSuitVecEnv(TeamVecEnv):

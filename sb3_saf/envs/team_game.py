@@ -12,7 +12,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from sb3_saf.envs.game_form import OBSERVATION, has_masks_inside
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam, is_gymnasium_team
-from sb3_saf.envs.teams import ACTION_MASK_KEY
+from sb3_saf.teams.rows import ACTION_MASK_KEY
 
 
 def team_game(env: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_saf.envs.teams import TeamVecEnvWrapper
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 
 #: Each agent its own reward; each the sum, or the mean, over the agents of its team.
 TeamReward = Literal["given", "sum", "mean"]

@@ -14,7 +14,7 @@ from pettingzoo.utils.conversions import turn_based_aec_to_parallel
 
 ACTION_MASK: Final = "action_mask"
 
-#: Upper limit for seeds of OpenSpiel's generators and NumPy's older one; seeds of games here have 63 bits.
+#: Upper limit for seeds of OpenSpiel's generators and NumPy's older one.
 _SEEDS: Final = 2**31
 
 

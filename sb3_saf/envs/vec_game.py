@@ -11,8 +11,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.envs.row_spaces import RowSpaces
-from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, RowSpaces
 
 
 class VecGame(ParallelEnv[Any, Any, Any]):

@@ -21,14 +21,14 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_saf import RandomPolicy, evaluate_team
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.envs.teams import require_n_agents
-from sb3_saf.errors import CheckpointError
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.files import plain, read_json, write_json
 from sb3_saf.experiments.grid import Cell, RunConfig
+from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.vec_env import require_n_agents
 from sb3_saf.training.folders import software_versions
 from sb3_saf.training.run import CHECKPOINTS, RunOptions, load_parameters, train
-from sb3_saf.training.seeds import evaluation_seed
 
 #: Maximum number of points of a learning curve.
 CURVE_POINTS: Final = 100

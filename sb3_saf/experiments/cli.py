@@ -17,6 +17,7 @@ from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, PROGRAM,
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
 from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
+from sb3_saf.teams.checks import check_seed, unknown_name
 from sb3_saf.training.commands import (
     OneLineParser,
     add_key_values,
@@ -26,8 +27,6 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.names import unknown_name
-from sb3_saf.training.seeds import check_seed
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"

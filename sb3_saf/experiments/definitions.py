@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sb3_saf.training.names import unknown_name
+from sb3_saf.teams.checks import unknown_name
 
 #: The command, as users type it.
 PROGRAM: Final = "python -m sb3_saf.experiments"

@@ -8,12 +8,12 @@ from typing import Final, TypeAlias
 import numpy as np
 import torch as th
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import MemoryNet
 from sb3_saf.export.network import AgentNetwork, States
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.teams.errors import ExportError
 
 #: Policies whose actors read only one agent's own observation, index, mask and memory.
 ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy

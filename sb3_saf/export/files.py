@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import DATA_FILES, FORMAT, MANIFEST_FILE, SCRIPT_FILE, DataFile
+from sb3_saf.teams.errors import ExportError
 
 #: All names in a folder of an export. The cache is created by importing ``act.py``.
 _KNOWN: Final = frozenset({MANIFEST_FILE, SCRIPT_FILE, "__pycache__", *DATA_FILES})

@@ -14,8 +14,8 @@ from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from sb3_saf.errors import ExportError
 from sb3_saf.networks.spaces import MAX_SIZE, Size, SpaceSpec
+from sb3_saf.teams.errors import ExportError
 
 FORMAT: Final = "sb3_saf.actor"
 #: Version 2 had no actor_identity and one_hot_codes, and its graphs did not choose actions.

@@ -16,7 +16,6 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import nn
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.manifest import (
     MANIFEST_FILE,
     WEIGHTS_FILE,
@@ -38,6 +37,7 @@ from sb3_saf.networks.distributions import (
 )
 from sb3_saf.networks.encoders import preprocess
 from sb3_saf.networks.spaces import ObservationSpec, SpaceSpec
+from sb3_saf.teams.errors import ExportError
 
 Array = npt.NDArray[Any]
 States = tuple[th.Tensor, ...]

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.act import feeds
 from sb3_saf.export.files import read_checked
 from sb3_saf.export.manifest import ONNX_FILE, Manifest
 from sb3_saf.export.runtime import Array, Inputs, Rng, Runtime, States
 from sb3_saf.networks.spaces import MAX_SIZE
+from sb3_saf.teams.errors import ExportError
 
 if TYPE_CHECKING:
     from sb3_saf.networks.actor import PoolOutput

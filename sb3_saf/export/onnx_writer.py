@@ -11,7 +11,6 @@ from contextlib import contextmanager
 import torch as th
 from torch import nn
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.comparison import check_close
 from sb3_saf.export.network import AgentNetwork, Array, decide
 from sb3_saf.export.onnx_runtime import make_session
@@ -24,6 +23,7 @@ from sb3_saf.networks.distributions import (
     policy_parameters,
 )
 from sb3_saf.networks.spaces import SpaceSpec
+from sb3_saf.teams.errors import ExportError
 
 _OPSET = 18
 #: NumPy's name of the noise that samples actions when added to parameters, by kind of space.

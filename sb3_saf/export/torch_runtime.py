@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import torch as th
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.files import read_checked
 from sb3_saf.export.manifest import WEIGHTS_FILE, Manifest
 from sb3_saf.export.network import decide, load_network
 from sb3_saf.export.runtime import Array, Inputs, Rng, States
 from sb3_saf.networks.actor import PoolOutput
 from sb3_saf.networks.distributions import masked_parameters, mixture_log_prob, mixture_log_probs
+from sb3_saf.teams.errors import ExportError
 
 
 class TorchRuntime:

@@ -12,8 +12,8 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.network import check_tensors
+from sb3_saf.teams.errors import ExportError
 
 _ENTRY: Final = "policy.pth"
 #: Maximum bytes of a file of tensors in addition to the tensors.

@@ -18,7 +18,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
-from sb3_saf.errors import ExportError
 from sb3_saf.export.comparison import ExportablePolicy, check_network, some_inputs
 from sb3_saf.export.files import write_folder
 from sb3_saf.export.manifest import (
@@ -42,6 +41,7 @@ from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.teams.errors import ExportError
 
 
 def export_actors(

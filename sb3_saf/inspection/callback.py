@@ -14,12 +14,13 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.envs.teams import check_count, require_n_agents
 from sb3_saf.inspection.games import Zones, check_zones
 from sb3_saf.inspection.inspection import Inspection, inspect_team
 from sb3_saf.inspection.reading import require_our_policy
 from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.vec_env import require_n_agents
 
 
 class InspectionCallback(BaseCallback):

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.envs.teams import require_n_agents
+from sb3_saf.teams.vec_env import require_n_agents
 
 Ints = npt.NDArray[np.int64]
 Picture = npt.NDArray[np.uint8]

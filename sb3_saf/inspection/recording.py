@@ -17,7 +17,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.envs.teams import ACTIVE_KEY, OBS_KEY, check_count, require_n_agents, team_dones
 from sb3_saf.inspection.calibration import lambda_returns
 from sb3_saf.inspection.games import Picture, ZoneFunction, Zones, draws_pictures, picture, zone_function, zones_now
 from sb3_saf.inspection.reading import (
@@ -30,7 +29,10 @@ from sb3_saf.inspection.reading import (
     require_our_policy,
 )
 from sb3_saf.policies.base import TeamMaskablePolicy
-from sb3_saf.randomness import own_randomness
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.randomness import own_randomness
+from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY
+from sb3_saf.teams.vec_env import require_n_agents, team_dones
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]

@@ -22,12 +22,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.envs.teams import OBS_KEY, TeamSpaces, check_count, require_n_agents
 from sb3_saf.export.actor import Actor
 from sb3_saf.inspection.film import png
 from sb3_saf.inspection.games import draws_pictures, picture
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
-from sb3_saf.randomness import own_randomness
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.randomness import own_randomness
+from sb3_saf.teams.rows import OBS_KEY, TeamSpaces
+from sb3_saf.teams.vec_env import require_n_agents
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
 MAX_STEPS: Final = 2000

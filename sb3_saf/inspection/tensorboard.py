@@ -16,8 +16,8 @@ from typing import Any, Final, NamedTuple
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
-from sb3_saf.envs.teams import require_n_agents
 from sb3_saf.inspection.reading import OurPolicy
+from sb3_saf.teams.vec_env import require_n_agents
 
 #: Formats for numbers only.
 _NUMBERS_ONLY: Final = ("stdout", "log", "json", "csv")

@@ -26,7 +26,6 @@ from torch import nn
 
 from sb3_saf.buffers.later import LaterValues
 from sb3_saf.buffers.rollout import TeamMinibatch
-from sb3_saf.envs.teams import ACTIVE_KEY, AGENT_KEY, STATE_KEY
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.distributions import masked_parameters
@@ -37,6 +36,7 @@ from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import TeamParts
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, entry_of, pop_named
+from sb3_saf.teams.rows import ACTIVE_KEY, AGENT_KEY, STATE_KEY
 
 #: Action masks of MaskablePPO, (B, M).
 Masks = npt.NDArray[Any] | th.Tensor

@@ -22,7 +22,6 @@ from torch import nn
 from torch.distributions import Categorical, register_kl
 from torch.distributions import Distribution as TorchDistribution
 
-from sb3_saf.errors import NonFiniteError
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, PoolOutput, draw_policy
 from sb3_saf.networks.distributions import (
     masked_parameters,
@@ -34,6 +33,7 @@ from sb3_saf.networks.distributions import (
     policy_parameters,
 )
 from sb3_saf.networks.spaces import spec_of
+from sb3_saf.teams.errors import NonFiniteError
 
 
 def actor_distribution(

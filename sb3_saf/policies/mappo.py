@@ -9,7 +9,6 @@ import torch as th
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
-from sb3_saf.envs.teams import STATE_KEY, check_choice
 from sb3_saf.networks.critic import (
     JointStates,
     JointValueHead,
@@ -30,6 +29,8 @@ from sb3_saf.policies.parts import (
     team_policies,
 )
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
+from sb3_saf.teams.checks import check_choice
+from sb3_saf.teams.rows import STATE_KEY
 
 
 class JointCritic(TeamCritic):

@@ -21,10 +21,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.envs.teams import check_choice, check_flag
 from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
 from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.layers import NetworkSpec
+from sb3_saf.teams.checks import check_choice, check_flag
 
 #: Input of a critic: the agent's own features, the whole team's, or the state of the game.
 CriticInput = Literal["own", "team", "state"]

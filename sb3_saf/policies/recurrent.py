@@ -18,11 +18,11 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.envs.teams import check_count
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.row_encoder import EncodedRows
 from sb3_saf.policies.base import Encoded, NetArch, TeamPolicy
+from sb3_saf.teams.checks import check_count
 
 LstmStates = tuple[th.Tensor, ...]
 

@@ -15,7 +15,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_saf.buffers.rollout import TeamMinibatch
-from sb3_saf.envs.teams import (
+from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
+from sb3_saf.networks.spaces import pixels_to_codes
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
     AGENT_KEY,
@@ -23,11 +26,8 @@ from sb3_saf.envs.teams import (
     OBS_KEY,
     TEAM_KEY,
     TeamSpaces,
-    check_count,
     check_masks,
 )
-from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
-from sb3_saf.networks.spaces import pixels_to_codes
 
 #: Keys of PettingZoo's observations with masks.
 _CLASSIC: Final = {"observation", ACTION_MASK_KEY}

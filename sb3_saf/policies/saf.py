@@ -10,7 +10,6 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from torch import nn
 
-from sb3_saf.envs.teams import check_choice, check_count
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
 from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
@@ -26,6 +25,7 @@ from sb3_saf.policies.parts import (
     team_policies,
 )
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
+from sb3_saf.teams.checks import check_choice, check_count
 
 
 class Communicated(NamedTuple):

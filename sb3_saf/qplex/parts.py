@@ -9,11 +9,11 @@ from typing import get_args
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.envs.teams import check_choice, check_count
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
 from sb3_saf.qplex.heads import AgentMemory
 from sb3_saf.qplex.mixers import MIXER_NAMES, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
+from sb3_saf.teams.checks import check_choice, check_count
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.buffers.replay import TeamSteps
-from sb3_saf.envs.teams import STATE_KEY, Array
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
 from sb3_saf.policies.extractors import ObservationEncoder
@@ -24,6 +23,7 @@ from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, pop_named
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
 from sb3_saf.qplex.parts import QPLEXLstmParts, QPLEXParts, QPLEXPoolParts
+from sb3_saf.teams.rows import STATE_KEY, Array
 
 #: A recurrent policy's state: hidden (B, H), cell (B, H), last action (B,).
 State = tuple[Array, ...]

@@ -29,20 +29,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION
-from sb3_saf.envs.teams import (
-    ACTION_MASK_KEY,
-    ACTIVE_KEY,
-    AGENT_KEY,
-    OBS_KEY,
-    STATE_KEY,
-    Array,
-    TeamSpaces,
-    check_count,
-    check_whole_teams,
-)
 from sb3_saf.qplex.learning import TeamError, team_errors
 from sb3_saf.qplex.mixers import MixerName
 from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy, State
+from sb3_saf.teams.checks import check_count, check_whole_teams
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
 

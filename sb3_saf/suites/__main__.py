@@ -7,12 +7,12 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sb3_saf.envs.make import make_team_env
-from sb3_saf.envs.teams import TeamSpaces
+from sb3_saf.make import make_team_env
 from sb3_saf.suites.registry import suites
 from sb3_saf.suites.suite import Suite
+from sb3_saf.teams.checks import unknown_name
+from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.training.commands import USAGE_ERROR, OneLineParser
-from sb3_saf.training.names import unknown_name
 
 PROGRAM: Final = "python -m sb3_saf.suites"
 

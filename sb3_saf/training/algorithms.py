@@ -7,7 +7,7 @@ from typing import Final
 
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS, DECLARATIONS
-from sb3_saf.training.names import unknown_name
+from sb3_saf.teams.checks import unknown_name
 
 #: All declared algorithms.
 ALGOS: Final[dict[str, AlgorithmSpec]] = COMMANDS

@@ -15,9 +15,9 @@ from tqdm.rich import tqdm
 
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.callbacks.game_steps import team_steps
-from sb3_saf.envs.teams import require_n_agents
-from sb3_saf.randomness import own_randomness
-from sb3_saf.training.seeds import evaluation_seed
+from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.randomness import own_randomness
+from sb3_saf.teams.vec_env import require_n_agents
 
 #: Minimum seconds over which the rate of training is measured, from the end of the first rollout.
 _MEASURED_SECONDS: Final = 20.0

@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.weights import load_weights
+from sb3_saf.teams.checks import check_seed
 from sb3_saf.training.algorithms import ALGOS, find_algorithm
 from sb3_saf.training.commands import (
     DefaultsFormatter,
@@ -26,7 +27,6 @@ from sb3_saf.training.commands import (
 )
 from sb3_saf.training.environments import find_environment
 from sb3_saf.training.folders import find_model, read_run
-from sb3_saf.training.seeds import check_seed
 from sb3_saf.training.settings import Settings, saved_settings
 from sb3_saf.training.wrappers import load_normalization
 

@@ -17,7 +17,7 @@ from hecogrid_envs.task import TaskName
 from sb3_saf.envs.team_game import team_game
 from sb3_saf.envs.vec_game import VecGame
 from sb3_saf.suites.registry import SuiteTask, find_task
-from sb3_saf.training.names import unknown_name
+from sb3_saf.teams.checks import unknown_name
 
 #: HECOGrid's environments by names in the style of RL-Zoo3 and Gymnasium.
 TASK_OF_ENV: Final[dict[str, TaskName]] = {f"{task}-v0": task for task in TASK_NAMES}

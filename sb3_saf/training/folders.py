@@ -19,7 +19,7 @@ from typing import Any, Final
 import yaml
 
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.errors import CheckpointError
+from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.training.environments import TeamEnvironment
 from sb3_saf.training.run import CHECKPOINTS
 from sb3_saf.training.settings import Settings

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.commands import CommandError, OneLineParser, run_command, user_errors
-from sb3_saf.training.names import unknown_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,8 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.envs.teams import TeamSpaces, require_n_agents
+from sb3_saf.teams.rows import TeamSpaces
+from sb3_saf.teams.vec_env import require_n_agents
 
 #: Settings of ``sb3_saf.train --size small`` that also apply to scripts.
 _TAKEN: Final = (
@@ -36,9 +37,9 @@ def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str
     :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
     :raises ValueError: if ``env`` has no teams, or PPO does not train ``algo``
     """
+    from sb3_saf.teams.checks import unknown_name
     from sb3_saf.training.algorithms import ALGOS, find_algorithm
     from sb3_saf.training.environments import HECOGRID
-    from sb3_saf.training.names import unknown_name
     from sb3_saf.training.values import algorithm_arguments, resolve
     from sb3_saf.training.yaml_files import entry_of, read_config
 

@@ -23,8 +23,8 @@ from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection.callback import InspectionCallback
+from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback
-from sb3_saf.training.seeds import evaluation_seed
 from sb3_saf.training.settings import Settings
 from sb3_saf.training.wrappers import load_normalization, make_callbacks, save_normalization
 

@@ -12,9 +12,9 @@ from typing import Any, Final, Literal
 import numpy as np
 import pandas as pd
 
+from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.environments import folder_name
 from sb3_saf.training.folders import read_run, run_number
-from sb3_saf.training.names import unknown_name
 from sb3_saf.training.settings import Settings, load_settings, saved_settings
 
 #: Source of scores: evaluation games, or training games.

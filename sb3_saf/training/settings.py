@@ -20,12 +20,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
-from sb3_saf.envs.make import make_team_env
+from sb3_saf.make import make_team_env
 from sb3_saf.suites.registry import suites
+from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
 from sb3_saf.training.algorithms import ALGOS, AlgorithmSpec, find_algorithm
 from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
-from sb3_saf.training.names import unknown_name
-from sb3_saf.training.seeds import check_seed, evaluation_seed
 from sb3_saf.training.values import algorithm_arguments, policy_arguments, resolve
 from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows, wraps_games
 from sb3_saf.training.yaml_files import DEFAULT, MERGED, SIZES, Size, entry_of, merge, read_config, read_file

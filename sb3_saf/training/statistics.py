@@ -16,7 +16,7 @@ import pandas as pd
 import torch as th
 
 from sb3_saf.evaluation import confidence_interval
-from sb3_saf.randomness import own_randomness
+from sb3_saf.teams.randomness import own_randomness
 
 Floats = npt.NDArray[np.float64]
 

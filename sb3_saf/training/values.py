@@ -18,7 +18,7 @@ from torch import nn
 
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
-from sb3_saf.training.names import unknown_name
+from sb3_saf.teams.checks import unknown_name
 
 #: Classes by name for each key that takes a class. Names are looked up here only; nothing is imported or evaluated.
 CLASSES: Final[dict[str, dict[str, type]]] = {

@@ -25,7 +25,7 @@ from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
-from sb3_saf.envs.teams import OBS_KEY
+from sb3_saf.teams.rows import OBS_KEY
 from sb3_saf.training.environments import import_by_name
 
 _NAMES = str | list[Any] | dict[str, Any] | None

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, get_args
 
 import yaml
 
-from sb3_saf.training.names import unknown_name
+from sb3_saf.teams.checks import unknown_name
 
 #: Sizes from the paper's experiments to a test that trains in seconds.
 Size = Literal["paper", "medium", "small", "smoke"]

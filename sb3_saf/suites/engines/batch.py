@@ -12,12 +12,12 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from hecogrid_envs.vec_env import TeamVecEnv, chosen_indices
 from sb3_saf.checkpoints.checks import check_keys, check_like, check_list, check_whole
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.space_reader import checked_actions
-from sb3_saf.envs.teams import IS_SUCCESS, Array, check_count
+from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.rows import IS_SUCCESS, Array, RowSpaces
+from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 
 class BatchStep(NamedTuple):
@@ -65,7 +65,7 @@ class Batch(ABC):
         """
         Begin an episode in every game.
 
-        :param seeds: (E,) 63 bits each; None to continue the games' random streams
+        :param seeds: (E,) 32 bits each; None to continue the games' random streams
         :return: (B, ...) rows
         """
 
@@ -98,7 +98,7 @@ class BatchVecEnv(TeamVecEnv):
     """
     VecEnv of a batch of games: row ``e * N + i`` is agent ``i`` of game ``e``.
 
-    Observations of rows are Dicts, see :class:`sb3_saf.envs.row_spaces.RowSpaces`. Infos of done rows hold
+    Observations of rows are Dicts, see :class:`sb3_saf.teams.rows.RowSpaces`. Infos of done rows hold
     ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite reports
     wins. All other infos are one empty dict.
 

@@ -17,10 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_saf.envs.row_spaces import RowSpaces
-from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array
 from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch
 from sb3_saf.suites.engines.jaxmarl_package import spaces as jax_spaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, RowSpaces
 
 _ALL: Final = "__all__"
 _WORLD_STATE: Final = "world_state"

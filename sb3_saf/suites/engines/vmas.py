@@ -18,9 +18,8 @@ with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
     import vmas
     from vmas.simulator.environment import Environment
 
-from sb3_saf.envs.row_spaces import RowSpaces
-from sb3_saf.envs.teams import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array, RowSpaces
 
 #: Game steps after which BenchMARL stops an episode.
 _MAX_STEPS: Final = 100

@@ -1,135 +1,31 @@
-"""HECOGrid as a Stable-Baselines3 VecEnv: one row per agent, game-major, then agent."""
+"""HECOGrid as a vector environment: one row per agent, game-major, then agent."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import partial
-from numbers import Integral
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn, tile_images
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from hecogrid_envs.batch import GameBatch, check_actions
 from hecogrid_envs.constants import N_ACTIONS, RenderMode
-from hecogrid_envs.core.rng import fresh_seed, game_seeds
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import state_option
 from hecogrid_envs.tasks import TASKS
 from hecogrid_envs.tiles import observation_space
+from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 Backend = Literal["native", "supersuit"]
 U8 = npt.NDArray[np.uint8]
 Value = TypeVar("Value")
-
-
-def chosen_indices(indices: int | Iterable[int] | None, n: int, kind: str = "row") -> list[int]:
-    """
-    Return the selected indices out of n rows (or games).
-
-    :param indices: one, several, or None for all; negative ones count from the end
-    :param n: number of rows or games
-    :param kind: ``"row"`` or ``"game"``, for the message
-    :raises ValueError: for an index out of range
-    """
-    listed = range(n) if indices is None else [indices] if isinstance(indices, Integral) else indices
-    chosen = [int(index) for index in cast(Iterable[int], listed)]
-    for index in chosen:
-        if not -n <= index < n:
-            raise ValueError(f"there is no {kind} {index}: expected 0 to {n - 1}")
-    return [index % n for index in chosen]
-
-
-class TeamVecEnv(VecEnv):
-    """
-    Base of vector environments with one row per agent: row ``e * N + i`` is agent ``i`` of game ``e``.
-
-    :param n_games: E
-    :param n_agents: N
-    :param observation_space: of a row
-    :param action_space: of a row
-    :param seed: see :meth:`seed`
-    """
-
-    def __init__(
-        self,
-        n_games: int,
-        n_agents: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        seed: int | None,
-    ) -> None:
-        self.n_games = n_games
-        self.n_agents = n_agents
-        super().__init__(n_games * n_agents, observation_space, action_space)
-        self.seed(seed)
-
-    def per_row(self, of_games: Iterable[Value]) -> list[Value]:
-        """Repeat one value per game for each row of the game."""
-        return [value for value in of_games for _ in range(self.n_agents)]
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """
-        Set the seeds of the games for the next reset; later episodes continue each game's random stream.
-
-        :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None for fresh entropy
-        :return: (B,) the seed of each row's game
-        """
-        chosen = game_seeds(fresh_seed() if seed is None else seed, self.n_games)
-        #: Last seeds of the games, which distinguish evaluation from training; None if drawn at random.
-        self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
-        #: Seeds for the next reset; None continues the games' random streams.
-        self._next_seeds: list[int] | None = chosen
-        return self.per_row(chosen)
-
-    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
-        """
-        Set the options of the next reset.
-
-        :param options: one dict for all games, or a list with one per row, of which a game takes that of its first row
-        """
-        if isinstance(options, (list, tuple)) and len(options) != self.num_envs:
-            raise ValueError(
-                f"expected a dict for all games or a list of {self.num_envs} dicts, one per row ({self.n_games} games "
-                f"of {self.n_agents} agents), got {len(options)}"
-            )
-        super().set_options(options)
-
-    def game_method(
-        self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
-    ) -> list[Any]:
-        """
-        Call a method once per game.
-
-        :param method_name: of the game
-        :param args: positional arguments
-        :param games: which games, None for all
-        :param kwargs: keyword arguments
-        :return: one result per game
-        """
-        raise NotImplementedError
-
-    def get_images(self) -> Sequence[npt.NDArray[Any] | None]:
-        """Return one picture per row, None unless the render mode is ``"rgb_array"``; rows of a game share one."""
-        return self.per_row(self.game_method("render") if self.render_mode == "rgb_array" else [None] * self.n_games)
-
-    def render(self, mode: str | None = None) -> npt.NDArray[Any] | None:
-        """
-        Draw every game once.
-
-        :param mode: None, or the environment's own
-        :return: one picture of all games for ``"rgb_array"``, else None
-        """
-        if self.render_mode is None or mode not in (None, self.render_mode):
-            return super().render(mode)  # raises an explaining error
-        pictures = self.game_method("render")
-        return tile_images(pictures) if self.render_mode == "rgb_array" else None
 
 
 class NativeVecEnv(TeamVecEnv):

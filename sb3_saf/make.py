@@ -15,11 +15,11 @@ from sb3_saf.envs.curriculum import Curriculum, Stage
 from sb3_saf.envs.game_form import AnyParallelEnv, AskMasks, Signals
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.row_spaces import RowSpaces
 from sb3_saf.envs.team_game import make_team_game, team_game
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
-from sb3_saf.envs.teams import check_choice, check_count
 from sb3_saf.suites.registry import SuiteTask, find_task
+from sb3_saf.teams.checks import check_choice, check_count
+from sb3_saf.teams.rows import RowSpaces
 
 Backend = Literal["native", "supersuit"]
 #: Characters that occur in names of modules and functions, but not of tasks.
@@ -180,7 +180,7 @@ def _in_stages(
 def _hecogrid(task: str, request: Request, stagger: bool, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """Make the games of a HECOGrid task."""
     from hecogrid_envs.task import check_task
-    from hecogrid_envs.vec_env import make_vec_env
+    from sb3_saf.suites.hecogrid import make_vec_env
 
     try:
         name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))

@@ -1,0 +1,76 @@
+"""Checks of arguments, and errors for unknown names typed by users."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from numbers import Integral
+from typing import Final
+
+import numpy as np
+
+from hecogrid_envs.task import did_you_mean
+
+#: Largest seed of a run: the limit of NumPy's global generator, which SB3 seeds.
+MAX_SEED: Final = 2**32 - 1
+
+_EVALUATION: Final = 1
+
+
+def check_seed(seed: object) -> int:
+    """Return the seed of a run if it is an integer from 0 to 2**32 - 1; otherwise raise ValueError."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"seed must be a whole number from 0 to {MAX_SEED}, got {seed!r}")
+    return int(seed)
+
+
+def evaluation_seed(seed: int) -> int:
+    """
+    Return the seed from which the seeds of a run's evaluation games are derived, from 2**62 to 2**63 - 1.
+
+    It is a separate branch in the run's tree of seeds, with the top bit of 63 set, which no run can have as its seed.
+    """
+    word = np.random.SeedSequence(check_seed(seed), spawn_key=(_EVALUATION,)).generate_state(1, np.uint64)[0]
+    return (int(word) >> 2) | (1 << 62)
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> ValueError:
+    """Return an error for an unknown name of a kind, such as ``"algorithm"``."""
+    names = list(known)
+    return ValueError(f"unknown {kind} {name!r}{did_you_mean(name, names)}; there is {', '.join(names)}")
+
+
+def check_count(name: str, value: object) -> int:
+    """Check that a value is an integer of at least 1; the ValueError contains ``name``."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+    return int(value)
+
+
+def check_flag(name: str, value: object) -> None:
+    """Check that an argument is True or False; the ValueError contains ``name``."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Check that an argument is one of ``choices``; the ValueError lists them."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+
+
+def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:
+    """
+    Check that the rows are a whole number of teams.
+
+    :param n_rows: B
+    :param n_agents: N
+    :param fix: advice in the error message
+    :return: E = B / N
+    :raises ValueError: if N does not divide B
+    """
+    if n_rows % n_agents:
+        raise ValueError(
+            f"expected rows of whole teams, a multiple of n_agents={n_agents}, got {n_rows} rows "
+            f"({n_rows // n_agents} teams and {n_rows % n_agents} rows over); {fix}"
+        )
+    return n_rows // n_agents
