@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.rates import Work, random_actions
-from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs import GameBatch, HECOGridParams
+from sb3_saf import game_seeds
 
 N_GAMES = 128
 

@@ -28,8 +28,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams
 from hecogrid_envs.core.types import RESET
+from sb3_saf import game_seeds
 
 RECORD: Final = Path(__file__).parent / "instructions.json"
 #: Allowed excess over the record: releases of Python differ by some instructions per call.

@@ -8,7 +8,6 @@ PettingZoo environments (:func:`parallel_env`, :func:`env`) and the batched game
 from __future__ import annotations
 
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.core.rng import game_seeds
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import StateMapping
@@ -30,7 +29,6 @@ __all__ = [
     "TeamTogetherEnv",
     "TileSpace",
     "env",
-    "game_seeds",
     "parallel_env",
     "tile_atlas",
 ]

@@ -48,7 +48,7 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
     from sb3_saf.inspection.replay import replay
-    from sb3_saf.make import make_team_env
+    from sb3_saf.make import make_team_env, make_vec_env
     from sb3_saf.policies.extractors import (
         LightEncoder,
         MLPEncoder,
@@ -63,8 +63,8 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
-    from sb3_saf.suites.hecogrid import make_vec_env
     from sb3_saf.teams.errors import CheckpointError, NonFiniteError
+    from sb3_saf.teams.randomness import game_seeds
     from sb3_saf.training.ppo_settings import ppo_settings
 
     register_all()
@@ -127,6 +127,7 @@ __all__ = [
     "evaluate_policy",
     "evaluate_team",
     "export_actors",
+    "game_seeds",
     "inspect_team",
     "load_weights",
     "make_team_env",

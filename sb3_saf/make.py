@@ -180,7 +180,6 @@ def _in_stages(
 def _hecogrid(task: str, request: Request, stagger: bool, seed: int | None, params: dict[str, Any]) -> VecEnv:
     """Make the games of a HECOGrid task."""
     from hecogrid_envs.task import check_task
-    from sb3_saf.suites.hecogrid import make_vec_env
 
     try:
         name = check_task(task.removeprefix("hecogrid/").removesuffix("-v0"))
@@ -276,3 +275,47 @@ def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParal
 
 def _name(env: object) -> str:
     return getattr(env, "__qualname__", None) or type(env).__name__
+
+
+def make_vec_env(
+    task: str,
+    n_envs: int = 1,
+    seed: int | None = None,
+    backend: Backend = "native",
+    render_mode: Literal["rgb_array", "human"] | None = None,
+    n_threads: int = 1,
+    n_cpus: int = 1,
+    stagger: bool = False,
+    **params: Any,
+) -> VecEnv:
+    """
+    Make a parameter-shared vector environment: one row per agent, game-major, then agent.
+
+    Both backends give the same numbers, row for row, for the same seed.
+
+    :param task: a name of ``TASK_NAMES``, such as ``"TeamSupport"``
+    :param n_envs: E, games
+    :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``
+    :param backend: ``"native"`` drives the batched core; ``"supersuit"`` goes through SuperSuit's
+        ``pettingzoo_env_to_vec_env_v1`` and ``concat_vec_envs_v1``
+    :param render_mode: as in :func:`hecogrid_envs.parallel_env`
+    :param n_threads: threads of the native backend
+    :param n_cpus: worker processes of the SuperSuit backend
+    :param stagger: whether the first episodes of the native backend end at different times (:class:`NativeVecEnv`)
+    :param params: fields of :class:`~hecogrid_envs.params.HECOGridParams`
+    :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
+    :raises ValueError: for an unknown task, backend or parameter, or a value out of range
+    """
+    from hecogrid_envs import TASKS, GameBatch, HECOGridParams
+    from sb3_saf.suites.hecogrid import NativeVecEnv
+
+    if backend not in get_args(Backend):
+        raise ValueError(f"backend must be 'native' or 'supersuit', got {backend!r}")
+    if stagger and backend != "native":
+        raise ValueError(f"stagger=True needs backend='native', got {backend!r}; leave it out")
+    batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
+    if backend == "native":
+        return NativeVecEnv(batch, seed, render_mode, stagger)
+    from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
+
+    return SuperSuitVecEnv(partial(TASKS[batch.task], render_mode=render_mode, **params), n_envs, seed, n_cpus)

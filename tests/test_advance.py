@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import hecogrid_envs
-from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
-from sb3_saf import make_vec_env
+from hecogrid_envs import GameBatch, HECOGridParams
+from sb3_saf import game_seeds, make_vec_env
 
 N_GAMES = 7
 SMALL: dict[str, Any] = {"n_agents": 5, "grid_size": 12, "n_treasures": 40, "max_cycles": 9}

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams
 from hecogrid_envs.constants import TreasureState
+from sb3_saf import game_seeds
 
 PARAMS = HECOGridParams(n_agents=5, grid_size=12, coordination=2, heterogeneity=3, n_treasures=30, n_keys=10)
 

@@ -11,8 +11,7 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
-from hecogrid_envs.core.rng import game_seeds
-from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, game_seeds, make_team_env
 from sb3_saf.checkpoints.data import read_tree, write_tree
 from sb3_saf.checkpoints.environments import check_environment_state, environment_state, load_environment_state
 from sb3_saf.suites.registry import find_task, suites

@@ -15,8 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 import hecogrid_envs
-from hecogrid_envs import game_seeds
-from sb3_saf import make_vec_env
+from sb3_saf import game_seeds, make_vec_env
 
 SMALL: dict[str, Any] = {
     "n_agents": 3,

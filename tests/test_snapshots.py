@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs import GameBatch, HECOGridParams
 from hecogrid_envs.constants import Rules
+from sb3_saf import game_seeds
 
 N_GAMES = 4
 #: Crowded, so that several agents share a cell.

@@ -27,7 +27,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormalize
 
-from hecogrid_envs.core.rng import game_seeds
+from sb3_saf import game_seeds
 from sb3_saf.envs import supersuit_workers
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from tests import toy_envs

@@ -12,7 +12,8 @@ import time
 import numpy as np
 import pytest
 
-from hecogrid_envs import GameBatch, HECOGridParams, game_seeds
+from hecogrid_envs import GameBatch, HECOGridParams
+from sb3_saf import game_seeds
 
 PARAMS = HECOGridParams(n_agents=5, grid_size=12, n_treasures=30, observation="tiles")
 

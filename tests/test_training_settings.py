@@ -15,9 +15,8 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
-from hecogrid_envs.core.rng import game_seeds
 from hecogrid_envs.params import HECOGridParams
-from sb3_saf import LightEncoder, TeamRolloutBuffer
+from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
 from sb3_saf.training.algorithms import ALGOS

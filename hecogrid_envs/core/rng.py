@@ -1,5 +1,5 @@
 """
-Random numbers of games: their seeds, and the small generator that kernels draw from (SplitMix64, Steele et al. 2014).
+Random numbers of games: the small generator that kernels draw from (SplitMix64, Steele et al. 2014).
 
 The generator's whole state is one word per game, so a game does not depend on the other games of its batch.
 """
@@ -18,29 +18,6 @@ _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
-
-#: Game seeds have 32 bits, the most that ``np.random.seed`` and ``RandomState`` of other games take.
-_SEED_BITS = 32
-#: Odd, so that the seeds of a run's games differ: 2**32 over the golden ratio.
-_STRIDE = 0x9E3779B1
-
-
-def game_seeds(seed: int, n_games: int, first: int = 0) -> list[int]:
-    """
-    Return the seeds of the games of a vector environment.
-
-    Game ``i`` gets the same seed for any number of games, and the games of a run have different seeds; seeds of runs
-    ``seed`` and ``seed + 1`` are unrelated.
-
-    :param seed: the run's seed, 0 or larger
-    :param n_games: E, number of games
-    :param first: index of the first game
-    :return: E integers below 2**32
-    :raises ValueError: for an invalid seed
-    """
-    check_seed(seed)
-    start = int(np.random.SeedSequence(seed).generate_state(1, np.uint32)[0])
-    return [(start + index * _STRIDE) % 2**_SEED_BITS for index in range(first, first + n_games)]
 
 
 def check_seed(seed: object) -> None:
@@ -63,7 +40,7 @@ def generator_word(seed: int) -> np.uint64:
 
 def fresh_seed() -> int:
     """Draw a seed from the operating system, for unseeded games; no global generator is used."""
-    return secrets.randbits(_SEED_BITS)
+    return secrets.randbits(63)
 
 
 @inlined

@@ -22,7 +22,7 @@ that step many games in one call: an SB3 VecEnv of B rows, game-major, then agen
 - ``action_space`` of one row, counted from 0;
 - ``seed(seed)``, for the next reset, where game ``e`` gets its own random stream, independent of E; and
   ``seeded_with``, a tuple of the seeds of the games, None for random ones, which distinguishes evaluation from
-  training. ``hecogrid_envs.core.rng.game_seeds(seed, E)`` makes 32-bit seeds. ``vec_env(..., seed=None)`` draws one;
+  training. ``sb3_saf.game_seeds(seed, E)`` makes 32-bit seeds. ``vec_env(..., seed=None)`` draws one;
 - ``reset()``: observations of the rows, a NumPy array or a dict of arrays as in the space;
 - ``step_async(actions)``, (B, ...) NumPy; ``step_wait()``: observations, each agent's rewards (B,) float32, dones (B,)
   bool, equal within a team, and infos, a list of B dicts. Games of done teams have been reset: observations are those

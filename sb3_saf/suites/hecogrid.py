@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from functools import partial
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from hecogrid_envs.batch import GameBatch, check_actions
 from hecogrid_envs.constants import N_ACTIONS, RenderMode
 from hecogrid_envs.parallel_env import HECOGridEnv
-from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import state_option
 from hecogrid_envs.tasks import TASKS
 from hecogrid_envs.tiles import observation_space
@@ -210,45 +207,3 @@ def _check_seeds(seeds: Any, n_games: int, n_agents: int) -> None:
         raise ValueError(
             f"expected {n_games * n_agents} seeds of at least 0 or None, one for each row, got {seeds!r:.80}"
         )
-
-
-def make_vec_env(
-    task: str,
-    n_envs: int = 1,
-    seed: int | None = None,
-    backend: Backend = "native",
-    render_mode: RenderMode | None = None,
-    n_threads: int = 1,
-    n_cpus: int = 1,
-    stagger: bool = False,
-    **params: Any,
-) -> VecEnv:
-    """
-    Make a parameter-shared vector environment: one row per agent, game-major, then agent.
-
-    Both backends give the same numbers, row for row, for the same seed.
-
-    :param task: a name of ``TASK_NAMES``, such as ``"TeamSupport"``
-    :param n_envs: E, games
-    :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``
-    :param backend: ``"native"`` drives the batched core; ``"supersuit"`` goes through SuperSuit's
-        ``pettingzoo_env_to_vec_env_v1`` and ``concat_vec_envs_v1``
-    :param render_mode: as in :func:`hecogrid_envs.parallel_env`
-    :param n_threads: threads of the native backend
-    :param n_cpus: worker processes of the SuperSuit backend
-    :param stagger: whether the first episodes of the native backend end at different times (:class:`NativeVecEnv`)
-    :param params: fields of :class:`~hecogrid_envs.params.HECOGridParams`
-    :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
-    :raises ValueError: for an unknown task, backend or parameter, or a value out of range
-    """
-    if backend not in get_args(Backend):
-        raise ValueError(f"backend must be 'native' or 'supersuit', got {backend!r}")
-    if stagger and backend != "native":
-        raise ValueError(f"stagger=True needs backend='native', got {backend!r}; leave it out")
-    batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
-    if backend == "native":
-        return NativeVecEnv(batch, seed, render_mode, stagger)
-    # Only this backend needs sb3_saf.
-    from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-
-    return SuperSuitVecEnv(partial(TASKS[batch.task], render_mode=render_mode, **params), n_envs, seed, n_cpus)

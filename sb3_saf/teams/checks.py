@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from numbers import Integral
 from typing import Final
 
 import numpy as np
-
-from hecogrid_envs.task import did_you_mean
 
 #: Largest seed of a run: the limit of NumPy's global generator, which SB3 seeds.
 MAX_SEED: Final = 2**32 - 1
@@ -36,7 +35,9 @@ def evaluation_seed(seed: int) -> int:
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ValueError:
     """Return an error for an unknown name of a kind, such as ``"algorithm"``."""
     names = list(known)
-    return ValueError(f"unknown {kind} {name!r}{did_you_mean(name, names)}; there is {', '.join(names)}")
+    nearest = get_close_matches(str(name), names, n=1)
+    did_you_mean = f" (did you mean {nearest[0]!r}?)" if nearest else ""
+    return ValueError(f"unknown {kind} {name!r}{did_you_mean}; there is {', '.join(names)}")
 
 
 def check_count(name: str, value: object) -> int:

@@ -1,13 +1,42 @@
-"""Context manager for random numbers that do not affect those of training."""
+"""Seeds of games, and random numbers that do not affect those of training."""
 
 from __future__ import annotations
 
 import random
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Integral
+from typing import Final
 
 import numpy as np
 import torch as th
+
+#: Game seeds have 32 bits, the most that ``np.random.seed`` and ``RandomState`` of other games take.
+_SEED_BITS: Final = 32
+#: Odd, so that the seeds of a run's games differ: 2**32 over the golden ratio.
+_STRIDE: Final = 0x9E3779B1
+
+
+def game_seeds(seed: int | None, n_games: int, first: int = 0) -> list[int]:
+    """
+    Return the seeds of the games of a vector environment.
+
+    Game ``i`` gets the same seed for any number of games, and the games of a run have different seeds; seeds of runs
+    ``seed`` and ``seed + 1`` are unrelated.
+
+    :param seed: the run's seed, 0 or larger, of any size; None draws one from the operating system
+    :param n_games: E, number of games
+    :param first: index of the first game
+    :return: E integers below 2**32
+    :raises ValueError: for an invalid seed
+    """
+    if seed is None:
+        seed = secrets.randbits(64)
+    elif isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0:
+        raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
+    start = int(np.random.SeedSequence(int(seed)).generate_state(1, np.uint32)[0])
+    return [(start + index * _STRIDE) % 2**_SEED_BITS for index in range(first, first + n_games)]
 
 
 @contextmanager

@@ -15,9 +15,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, tile_images
 
-from hecogrid_envs.core.rng import fresh_seed, game_seeds
 from sb3_saf.teams.checks import check_count, check_whole_teams
 from sb3_saf.teams.errors import NonFiniteError
+from sb3_saf.teams.randomness import game_seeds
 from sb3_saf.teams.rows import Array
 
 #: Attributes with the shape of a vector environment of flattened teams.
@@ -78,7 +78,7 @@ class TeamVecEnv(VecEnv):
         :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None for fresh entropy
         :return: (B,) the seed of each row's game
         """
-        chosen = game_seeds(fresh_seed() if seed is None else seed, self.n_games)
+        chosen = game_seeds(seed, self.n_games)
         #: Last seeds of the games, which distinguish evaluation from training; None if drawn at random.
         self.seeded_with: tuple[int | None, ...] = (None,) * self.n_games if seed is None else tuple(chosen)
         #: Seeds for the next reset; None continues the games' random streams.

@@ -16,10 +16,10 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
-from hecogrid_envs.core.rng import game_seeds
 from sb3_saf.envs.game_form import has_masks_inside
 from sb3_saf.envs.space_reader import FlatReader, can_be_flattened
 from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.randomness import game_seeds
 from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, OBS_KEY, TeamSpaces
 from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.wrappers import load_normalization
