@@ -2,8 +2,9 @@
 The paper's parameter table: ``python -m sb3_saf.parameters`` counts every weight and prints it beside the paper's
 numbers.
 
-The table is for 10 agents, 28 x 28 x 3 observations, 7 actions, one head per agent. Declarations define which
-algorithms are in it, and with which arguments.
+The table is for 10 agents, 28 x 28 x 3 observations, 7 actions, one head per agent; the paper's text and its final
+code share MAPPO's heads instead (docs/reference/differences.md, 17). Declarations define which algorithms are in it,
+and with which arguments.
 """
 
 from __future__ import annotations

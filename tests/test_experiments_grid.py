@@ -31,11 +31,11 @@ SIZES = {
     "coordination": (3 * 3 * 3 * 3, 3 * 3 * 3),
     "heterogeneity": (3 * 3 * 5 * 3, 3 * 5 * 3),
     "joint": (3 * 1 * 3 * 3, 3 * 3),
-    "ablation": (4 * 3 * 7 * 3, 3 * 7 * 3),
+    "ablation": (5 * 3 * 7 * 3, 3 * 7 * 3),
     "ood-coordination": (3 * 2 * 1 * 3, 2 * 3 * 3),
     "ood-heterogeneity": (3 * 2 * 1 * 3, 2 * 5 * 3),
-    "ood-ablation": (2 * 2 * 2 * 3, 2 * 7 * 3),
-    "qplex": (2 * 3 * 1 * 3, 3 * 3),
+    "ood-ablation": (3 * 2 * 2 * 3, 2 * 7 * 3),
+    "qplex": (2 * 3 * 3 * 3, 3 * 3 * 3),
 }
 
 
@@ -58,9 +58,17 @@ def test_levels_of_the_paper() -> None:
     assert levels["heterogeneity"] == [at(1, h) for h in (1, 2, 3, 4, 5)]
     assert levels["joint"] == [at(2, 2), at(3, 3), at(4, 4)]
     assert set(levels["ablation"]) == {*levels["coordination"], *levels["heterogeneity"]}
+    assert levels["qplex"] == [Level.of(coordination=c, heterogeneity=1, n_agents=5) for c in (1, 2, 3)]
     cells = trained(grid_of("ood-heterogeneity", selection=Selection((5,), ("saf",))))
     assert [(cell.task, cell.level) for cell in cells] == [("TeamTogether", at(1, 2)), ("TeamSupport", at(1, 2))]
     assert [cell.tests for cell in cells] == [tuple(levels["heterogeneity"])] * 2
+
+
+@pytest.mark.parametrize("name", ["ablation", "ood-ablation"])
+def test_ablations_have_the_papers_form_beside_the_shared_one(name: str) -> None:
+    """The paper's SAF without pool has an actor for each agent."""
+    methods = {cell.method for cell in trained(grid_of(name))}
+    assert {"saf", "saf-no-pool", "saf-no-pool-separate"} <= methods
 
 
 def test_paper_size_is_the_papers() -> None:

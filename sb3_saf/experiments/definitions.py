@@ -180,7 +180,11 @@ _BY_HETEROGENEITY: Final = View(HETEROGENEITY, tuple(_level(1, h) for h in (1, 2
 _BOTH: Final = View(COORDINATION, tuple(_level(n, n) for n in (2, 3, 4)), label=f"{COORDINATION} = {HETEROGENEITY}")
 _OOD_COORDINATION: Final = _BY_COORDINATION._replace(train=_level(2, 1))
 _OOD_HETEROGENEITY: Final = _BY_HETEROGENEITY._replace(train=_level(1, 2))
-_FIVE_AGENTS: Final = View(COORDINATION, (Level.of(coordination=1, heterogeneity=1, n_agents=5),))
+_FIVE_AGENTS: Final = View(
+    COORDINATION, tuple(Level.of(coordination=c, heterogeneity=1, n_agents=5) for c in (1, 2, 3))
+)
+#: SAF without pool: an actor for each agent, as in the paper's ablation, and one actor that all agents share.
+_WITHOUT_POOL: Final = ("saf-no-pool-separate", "saf-no-pool")
 
 _ALL: Final = (
     Experiment("coordination", "how hard is coordination?", _THREE_TASKS, _METHODS, (_BY_COORDINATION,)),
@@ -190,7 +194,7 @@ _ALL: Final = (
         "ablation",
         "what does each part of SAF give?",
         _THREE_TASKS,
-        ("saf-no-pool", *_METHODS),
+        (*_WITHOUT_POOL, *_METHODS),
         (_BY_COORDINATION, _BY_HETEROGENEITY),
     ),
     Experiment("ood-coordination", "robustness to unseen coordination", _TWO_TASKS, _METHODS, (_OOD_COORDINATION,)),
@@ -199,7 +203,7 @@ _ALL: Final = (
         "ood-ablation",
         "what does the pool give out of distribution?",
         _TWO_TASKS,
-        ("saf-no-pool", "saf"),
+        (*_WITHOUT_POOL, "saf"),
         (_OOD_COORDINATION, _OOD_HETEROGENEITY),
     ),
     Experiment(

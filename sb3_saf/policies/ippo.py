@@ -1,4 +1,8 @@
-"""IPPO: independent agents with shared weights; actor and critic read the agent's own observation."""
+"""
+IPPO: independent agents with shared weights; actor and critic read the agent's own observation.
+
+The SAF paper's IPPO has a head for each agent ("IPPO trains separate networks"): ``heads="per_agent"``.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +56,7 @@ DECLARATION: Final = Declaration(
     team_policies(IPPOPolicy, IPPOLstmPolicy, IPPOMaskablePolicy),
     {
         "ippo": AlgorithmSpec(PPO, "IPPOPolicy", "ippo"),
-        # As in the paper: an actor and a critic for each agent.
+        # The paper's IPPO: an actor and a critic for each agent.
         "ippo-separate": AlgorithmSpec(PPO, "IPPOPolicy", "ippo", {"heads": "per_agent"}),
         "ippo-lstm": AlgorithmSpec(RecurrentPPO, "IPPOLstmPolicy", "ippo-lstm"),
     },

@@ -1,4 +1,9 @@
-"""MAPPO: the actor of IPPO, and a critic that reads the observations of the whole team."""
+"""
+MAPPO: the actor of IPPO, and a critic that reads the observations of the whole team.
+
+Shared heads are MAPPO of the SAF paper's text ("the actor and critic parameters are shared across all agents") and of
+its final code, a head for each agent that of its parameter table.
+"""
 
 from __future__ import annotations
 
@@ -141,7 +146,7 @@ DECLARATION: Final = Declaration(
     team_policies(MAPPOPolicy, MAPPOLstmPolicy, MAPPOMaskablePolicy),
     {
         "mappo": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo"),
-        # As in the paper: an actor and a critic for each agent.
+        # An actor and a critic for each agent: MAPPO of the paper's parameter table.
         "mappo-separate": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo", {"heads": "per_agent"}),
         "mappo-lstm": AlgorithmSpec(RecurrentPPO, "MAPPOLstmPolicy", "mappo-lstm"),
     },

@@ -199,7 +199,7 @@ DECLARATION: Final = Declaration(
         "saf": AlgorithmSpec(PPO, "SAFPolicy", "saf"),
         # Ablations use SAF's settings and differ in these arguments only.
         "saf-no-pool": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1}),
-        # As in the paper's ablation, with an actor for each agent.
+        # The paper's ablation: an actor for each agent, so that sharing is compared with not sharing.
         "saf-no-pool-separate": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1, "heads": "per_agent"}),
         "saf-no-ks": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"knowledge_source": False}),
         "saf-lstm": AlgorithmSpec(RecurrentPPO, "SAFLstmPolicy", "saf-lstm"),
