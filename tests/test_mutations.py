@@ -25,7 +25,7 @@ from sb3_saf.experiments.definitions import find_experiment
 from sb3_saf.experiments.files import pack, unpack
 from sb3_saf.experiments.grid import Selection
 from sb3_saf.training.settings import ALGOS, ENV_IDS, load_settings
-from sb3_saf.training.yaml_files import SIZES, load_yaml
+from sb3_saf.training.yaml_files import SIZES
 
 COUNT = int(os.environ.get("MUTATIONS", "100"))
 #: Processor seconds after which a mutation counts as a hang.
@@ -126,7 +126,6 @@ def test_settings_that_unfold_without_end_are_refused(text: str, tmp_path: Path)
     path = tmp_path / "settings.yml"
     path.write_text(text, encoding="utf-8")
     assert refused(lambda: load_settings("saf", ENV_IDS[0], "smoke", config=path))
-    assert refused(lambda: load_yaml(text, "it"))
 
 
 def a_game(seed: int = 0) -> hecogrid_envs.HECOGridEnv:

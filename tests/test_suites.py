@@ -428,7 +428,7 @@ def test_pictures_beside_numbers_are_encoded_each_in_their_way(tmp_path: Path) -
 
 
 def test_settings_name_reward_state_and_algorithm() -> None:
-    given = {"algo": "MaskablePPO", "team_reward": "sum", "state": True}
+    given = {"algorithm": "MaskablePPO", "team_reward": "sum", "state": True}
     settings = load_settings("saf", "tests.toy_envs:TellingEnv", "smoke", overrides=given)
     assert saved_settings(settings.as_dict()) == settings
     env = settings.make_env(0)
@@ -436,7 +436,7 @@ def test_settings_name_reward_state_and_algorithm() -> None:
     model = settings.make_model(env, 0)
     assert isinstance(model, MaskablePPO) and isinstance(model.policy, SAFMaskablePolicy)
     with pytest.raises(ValueError, match="unknown algorithm that trains QPLEXPolicy 'MaskablePPO'; there is QPLEX"):
-        load_settings("qplex", "tests.toy_envs:TellingEnv", "smoke", overrides={"algo": "MaskablePPO"})
+        load_settings("qplex", "tests.toy_envs:TellingEnv", "smoke", overrides={"algorithm": "MaskablePPO"})
 
 
 def test_masks_that_nobody_asks_for_are_told_of_once() -> None:

@@ -13,8 +13,8 @@ pytest.importorskip("rliable")
 from rliable import metrics
 
 from sb3_saf import confidence_interval
-from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_differences, draw_levels, method_styles
+from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import (
     interquartile_means,
     learning_curve,

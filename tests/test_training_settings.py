@@ -19,9 +19,8 @@ from hecogrid_envs.params import HECOGridParams
 from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
-from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.settings import ENV_IDS, SIZES, Settings, load_settings, saved_settings
-from sb3_saf.training.yaml_files import Size, config_names, load_yaml, read_config
+from sb3_saf.training.settings import ALGOS, ENV_IDS, SIZES, Settings, load_settings, saved_settings
+from sb3_saf.training.yaml_files import Size, config_names, read_settings
 
 ENV = "TeamTogether-v0"
 
@@ -81,7 +80,7 @@ def _defaults(algorithm: type) -> dict[str, Any]:
 
 @pytest.mark.parametrize("config", [name for name in config_names() if name != "levels"])
 def test_files_have_only_what_differs(config: str) -> None:
-    content = read_config(config)
+    content = read_settings(config)
     assert {key for key in content if "/" not in key} <= {"default", "hecogrid", *ENV_IDS, *suites()}
     algorithm = next((spec.algorithm for spec in ALGOS.values() if spec.config == config), PPO)
     defaults = _defaults(algorithm)
@@ -124,23 +123,21 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
 
 @pytest.mark.parametrize("algorithm", ["A2C", "TRPO"])
 def test_another_algorithm_takes_the_settings_that_it_has(algorithm: str) -> None:
-    settings = load_settings("saf", ENV, "small", overrides={"algo": algorithm, "n_envs": 2})
+    settings = load_settings("saf", ENV, "small", overrides={"algorithm": algorithm, "n_envs": 2})
     with closing(settings.make_env(0)) as env:
         model = settings.make_model(env, 0, device="cpu")
         model.learn(model.n_envs)
     assert type(model).__name__ == algorithm
     assert (model.gamma, model.gae_lambda, model.n_steps) == (0.9, 0.9, 10)  # type: ignore[attr-defined]
     if algorithm == "A2C":  # its own settings, also when they are read again
-        own = load_settings("saf", ENV, "small", overrides={"algo": algorithm, "use_rms_prop": False})
+        own = load_settings("saf", ENV, "small", overrides={"algorithm": algorithm, "use_rms_prop": False})
         assert saved_settings(own.as_dict()).hyperparams["use_rms_prop"] is False
     with pytest.raises(ValueError, match="unknown setting 'clip_range'"):
-        load_settings("saf", ENV, "small", overrides={"algo": algorithm, "clip_range": 0.1})
+        load_settings("saf", ENV, "small", overrides={"algorithm": algorithm, "clip_range": 0.1})
 
 
 def test_a_batch_size_replaces_the_number_of_minibatches() -> None:
     assert load_settings("saf", ENV, "small", overrides={"batch_size": 500}).hyperparams["batch_size"] == 500
-    with pytest.raises(ValueError, match="say the same thing"):
-        load_settings("saf", ENV, overrides={"batch_size": 500, "n_minibatches": 2})
 
 
 def test_minibatches_are_whole_teams() -> None:
@@ -172,35 +169,42 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"algo": "sfa"}, r"unknown algorithm 'sfa' \(did you mean 'saf'\?\)"),
-        ({"env_id": "TeamTogeter-v0"}, r"unknown environment .* \(did you mean 'TeamTogether-v0'\?\)"),
-        ({"size": "smal"}, r"unknown size 'smal' \(did you mean 'small'\?\)"),
-        ({"env_kwargs": {"coordinaton": 2}}, r"unknown parameter .* \(did you mean 'coordination'\?\)"),
-        ({"env_kwargs": {"coordination": 11}}, "coordination must be an integer from 1 to 10"),
-        ({"env_kwargs": {"grid_size": 6}}, "n_treasures must be"),
-        ({"overrides": {"learning_rat": 1}}, r"unknown setting .* \(did you mean 'learning_rate'\?\)"),
-        ({"overrides": {"seed": 1}}, "unknown setting 'seed'"),  # set per run
+        ({"algo": "sfa"}, "did you mean 'saf'"),
+        ({"env_id": "TeamTogeter-v0"}, "did you mean 'TeamTogether-v0'"),
+        ({"size": "smal"}, "did you mean 'small'"),
+        ({"env_kwargs": {"coordinaton": 2}}, "did you mean 'coordination'"),
+        ({"env_kwargs": {"coordination": 11}}, "coordination"),
+        ({"env_kwargs": {"grid_size": 6}}, "n_treasures"),
+        ({"overrides": {"learning_rat": 1}}, "did you mean 'learning_rate'"),
+        ({"overrides": {"seed": 1}}, "'seed'"),  # set per run
+        ({"overrides": {"algo": "MaskablePPO"}}, "'algo'"),  # the method; its algorithm has another name
         ({"overrides": {"n_timesteps": 1, "game_steps": 1}}, "say the same thing"),
-        ({"overrides": {"normalize": "yes"}}, "normalize must be true or false or a mapping"),
+        ({"overrides": {"batch_size": 500, "n_minibatches": 2}}, "say the same thing"),
+        ({"overrides": {"normalize": "yes"}}, "normalize='yes'"),
         ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),
-        ({"overrides": {"learning_rate": "fast"}}, "learning_rate must be a number or a schedule"),
-        ({"overrides": {"learning_rate": "lin_x"}}, "learning_rate must be a number or a schedule"),
-        ({"overrides": {"gamma": float("nan")}}, "gamma must be a number"),
-        ({"overrides": {"n_steps": 1.5}}, "n_steps must be a whole number, got 1.5"),
-        ({"overrides": {"n_envs": 0}}, "n_envs must be from 1 to 100000"),
-        ({"overrides": {"n_envs": True}}, "n_envs must be a whole number"),
-        ({"overrides": {"normalize_advantage": "yes"}}, "normalize_advantage must be true or false"),
-        ({"overrides": {"time_limit": "end"}}, "time_limit must be 'terminal' or 'bootstrap'"),
-        ({"overrides": {"policy_kwargs": "dict(n_slots=8)"}}, "must be a mapping, written {key: value}, got"),
-        ({"overrides": {"policy_kwargs": {"n_policys": 2}}}, r"did you mean 'n_policies'\?"),
-        ({"overrides": {"policy_kwargs": {"selection": "mix"}}}, "selection must be 'mixture' or 'gumbel'"),
+        ({"overrides": {"learning_rate": "fast"}}, "learning_rate='fast': .*lin_7e-4"),
+        ({"overrides": {"learning_rate": "lin_x"}}, "learning_rate='x'"),
+        ({"overrides": {"clip_range": "lin_-0.2"}}, "clip_range='-0.2'"),
+        ({"overrides": {"gamma": float("nan")}}, "gamma=nan"),
+        ({"overrides": {"gamma": 50}}, "gamma=50"),
+        ({"overrides": {"gamma": "9" * 401}}, "gamma='9"),
+        ({"overrides": {"gae_lambda": 7}}, "gae_lambda=7"),
+        ({"overrides": {"max_grad_norm": -1}}, "max_grad_norm=-1"),
+        ({"overrides": {"n_epochs": 0}}, "n_epochs=0"),
+        ({"overrides": {"stats_window_size": -1}}, "stats_window_size=-1"),
+        ({"overrides": {"n_steps": 1.5}}, "n_steps=1.5"),
+        ({"overrides": {"n_envs": 0}}, "n_envs=0"),
+        ({"overrides": {"n_envs": 10**8}}, "n_envs=100000000"),
+        ({"overrides": {"n_envs": True}}, "n_envs=True"),
+        ({"overrides": {"normalize_advantage": "yes"}}, "normalize_advantage='yes'"),
+        ({"overrides": {"time_limit": "end"}}, "time_limit='end'"),
+        ({"overrides": {"policy_kwargs": "dict(n_slots=8)"}}, "policy_kwargs='dict"),
+        ({"overrides": {"policy_kwargs": {"n_policys": 2}}}, "did you mean 'n_policies'"),
+        ({"overrides": {"policy_kwargs": {"selection": "mix"}}}, "selection='mix'"),
         ({"overrides": {"policy_kwargs": {"activation_fn": "nn.Tanh"}}}, "unknown activation_fn"),
         ({"overrides": {"rollout_buffer_class": "os.system"}}, "unknown rollout_buffer_class"),
-        (
-            {"algo": "saf-no-pool", "overrides": {"policy_kwargs": {"n_policies": 4}}},
-            "takes back what this algorithm is",
-        ),
-        ({"config": Path("nowhere.yml")}, "cannot read the settings in nowhere.yml"),
+        ({"algo": "saf-no-pool", "overrides": {"policy_kwargs": {"n_policies": 4}}}, "n_policies is fixed to 1"),
+        ({"config": Path("nowhere.yml")}, "nowhere.yml"),
     ],
 )
 def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
@@ -212,17 +216,15 @@ def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
     ("text", "message"),
     [
         ("default: {n_envs: 2", "not valid YAML"),
-        ("- 1", r"must map 'default' and environment ids to settings, got \[1\]"),
+        ("- 1", "must map 'default'"),
         ("", "must map 'default'"),
-        ("default: 3", "'default' must map names to values"),
+        ("default: 3", "'default' must map"),
         ("default: {n_envs: 2, n_envs: 3}", "'n_envs' is there twice"),
         ("default: {sizes: {tiny: {}}}", "unknown size 'tiny'"),
         ("default: {sizes: 3}", "'sizes' must map"),
         ("TeamTogeter-v0: {}", "did you mean 'TeamTogether-v0'"),
         ("default: {n_env: 2}", "did you mean 'n_envs'"),
-        ("base: sfa", r"unknown base 'sfa' \(did you mean 'saf'\?\)"),
-        ("a: &a {x: 1}\ndefault: {<<: [*a, *a]}", r"merge keys \(<<\) are not supported"),
-        ("#" * 300_000, "it has more than 200,000 bytes"),
+        ("base: sfa", "did you mean 'saf'"),
         ("default: {n_envs: !!python/object/apply:os.getcwd []}", "not valid YAML"),
     ],
 )
@@ -246,10 +248,6 @@ def test_names_of_rl_zoo3_in_files(tmp_path: Path) -> None:
     assert load_settings("saf", ENV, config=tmp_path / "own.yml").game_steps == 100_000
     with pytest.raises(ValueError, match="--algo, which names the policy"):
         load_settings("mappo", ENV, config=tmp_path / "own.yml")
-
-
-def test_equal_keys_may_be_in_different_mappings() -> None:
-    assert load_yaml("a: {x: 1}\nb: {x: 2}", "here") == {"a": {"x": 1}, "b": {"x": 2}}
 
 
 def test_settings_survive_a_file() -> None:

@@ -16,8 +16,7 @@ from optuna.trial import TrialState
 
 from sb3_saf import LightEncoder
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.algorithms import ALGOS
-from sb3_saf.training.settings import load_settings
+from sb3_saf.training.settings import ALGOS, load_settings
 from sb3_saf.training.tune import TrialCallback, sample_overrides, to_overrides
 from tests.test_training_commands import failed
 

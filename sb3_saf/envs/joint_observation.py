@@ -174,8 +174,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         if self.team_spaces.action_mask is None and not self._has_asked_for_masks and self.has_attr(_ACTION_MASKS):
             warnings.warn(
                 "the games have action_masks(), which nobody has asked for: illegal actions may be taken. Train with "
-                'sb3_contrib.MaskablePPO("SAFPolicy", env), which asks (sb3_saf.train: -params algo:MaskablePPO), or '
-                f"give masks in infos[agent][{ACTION_MASK_KEY!r}], which every policy of sb3_saf reads",
+                'sb3_contrib.MaskablePPO("SAFPolicy", env), which asks (sb3_saf.train: -params algorithm:MaskablePPO), '
+                f"or give masks in infos[agent][{ACTION_MASK_KEY!r}], which every policy of sb3_saf reads",
                 UserWarning,
                 stacklevel=3,
             )

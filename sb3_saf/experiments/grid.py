@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
 from sb3_saf.experiments.files import plain
 from sb3_saf.teams.checks import unknown_name
-from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
-from sb3_saf.training.settings import Settings, load_settings
+from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from sb3_saf.training.yaml_files import Size
 
 #: Algorithm whose settings define the environment of the random team; it is the same for all algorithms.

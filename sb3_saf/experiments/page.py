@@ -13,8 +13,8 @@ from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experi
 from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.tables import FEWEST_SEEDS, Compared, comparisons, complete, of_view, strata
-from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import option_words
+from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
 #: Maximum number of missing cells to list.

@@ -15,7 +15,6 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.weights import load_weights
 from sb3_saf.teams.checks import check_seed
-from sb3_saf.training.algorithms import ALGOS, find_algorithm
 from sb3_saf.training.commands import (
     DefaultsFormatter,
     OneLineParser,
@@ -27,7 +26,7 @@ from sb3_saf.training.commands import (
 )
 from sb3_saf.training.environments import find_environment
 from sb3_saf.training.folders import find_model, read_run
-from sb3_saf.training.settings import Settings, saved_settings
+from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
 from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.enjoy"

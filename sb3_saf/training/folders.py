@@ -23,7 +23,7 @@ from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.training.environments import TeamEnvironment
 from sb3_saf.training.run import CHECKPOINTS
 from sb3_saf.training.settings import Settings
-from sb3_saf.training.yaml_files import read_plain_file
+from sb3_saf.training.yaml_files import load_yaml
 
 #: Options that affect a run's results but are not in ``config.yml``.
 _DECIDING: Final = ("eval_freq", "eval_episodes", "n_eval_envs", "eval_env_kwargs", "deterministic_eval", "save_freq")
@@ -92,7 +92,7 @@ def read_run(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name / "config.yml"
     if not path.is_file():
         raise ValueError(f"{folder} is no run of sb3_saf.train: there is no {path}")
-    config = read_plain_file(path)
+    config = load_yaml(path.read_text("utf-8"), str(path))
     if not isinstance(config, dict) or "seed" not in config:
         raise ValueError(f"{path} does not hold the settings of a run of sb3_saf.train")
     return config
@@ -110,7 +110,10 @@ def find_unfinished(
     name, wanted = settings.environment.folder_name, _plain(settings.as_dict())
     for _, folder in reversed(runs_of(log_folder, settings.algo, name)):
         try:
-            saved, given = read_run(folder, name), read_plain_file(folder / name / "args.yml")
+            saved, given = (
+                read_run(folder, name),
+                load_yaml((folder / name / "args.yml").read_text("utf-8"), "args.yml"),
+            )
         except ValueError:  # the run was killed before they were written
             continue
         found = saved.pop("seed")

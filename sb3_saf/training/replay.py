@@ -12,7 +12,6 @@ from sb3_saf.export.actor import Actor
 from sb3_saf.inspection.replay import replay
 from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.teams.errors import ExportError
-from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -25,7 +24,7 @@ from sb3_saf.training.commands import (
 )
 from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import read_run
-from sb3_saf.training.settings import Settings, load_settings, saved_settings
+from sb3_saf.training.settings import ALGOS, Settings, load_settings, saved_settings
 
 PROGRAM: Final = "python -m sb3_saf.replay"
 

@@ -9,7 +9,7 @@ files have only differences from the constructors' defaults. E games, N agents.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -21,15 +21,18 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.make import make_team_env
+from sb3_saf.policies.parts import AlgorithmSpec
+from sb3_saf.registration import COMMANDS, DECLARATIONS
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
-from sb3_saf.training.algorithms import ALGOS, AlgorithmSpec, find_algorithm
 from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
-from sb3_saf.training.values import algorithm_arguments, policy_arguments, resolve
+from sb3_saf.training.values import algorithm_arguments, convert, policy_arguments
 from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows, wraps_games
-from sb3_saf.training.yaml_files import DEFAULT, MERGED, SIZES, Size, entry_of, merge, read_config, read_file
+from sb3_saf.training.yaml_files import DEFAULT, SIZES, Size, entry_of, merge, read_settings
 
-#: Types of this package's keys, in addition to the arguments of the algorithm's constructor.
+#: Methods by their names on the command line, in log folders and YAML files.
+ALGOS: Final[dict[str, AlgorithmSpec]] = COMMANDS
+#: Types of this package's keys, beside the arguments of the algorithm's constructor.
 _OWN_KEYS: Final[dict[str, Any]] = {
     "n_envs": int,
     "game_steps": int,
@@ -39,11 +42,28 @@ _OWN_KEYS: Final[dict[str, Any]] = {
     "policy_kwargs": dict[str, Any],
     **WRAPPER_KEYS,
 }
-#: Key of the method; ``algorithm`` is a class that trains the method's policy instead of its own.
-_ALGO: Final = "algo"
-#: RL-Zoo3's name for game steps.
-_N_TIMESTEPS: Final = "n_timesteps"
 _SAVED_KEYS: Final = ("algo", "env", "size", "n_envs", "game_steps", "time_limit", "env_kwargs", "hyperparams")
+
+
+def find_algorithm(algo: str, algorithm: str | None = None) -> AlgorithmSpec:
+    """
+    Return a method's algorithm and policy.
+
+    :param algo: the method, a name in ``ALGOS``
+    :param algorithm: class that trains the policy instead of the method's own, such as ``"MaskablePPO"``
+    :raises ValueError: for an unknown name, with the nearest one
+    """
+    if algo not in ALGOS:
+        raise unknown_name("algorithm", algo, ALGOS)
+    spec = ALGOS[algo]
+    if algorithm is None:
+        return spec
+    classes = {
+        kind.__name__: kind for one in DECLARATIONS for kind in one.policies if spec.policy in kind.policy_aliases
+    }
+    if algorithm not in classes:
+        raise unknown_name(f"algorithm that trains {spec.policy}", algorithm, classes)
+    return replace(spec, algorithm=classes[algorithm])
 
 
 @dataclass(frozen=True)
@@ -184,7 +204,7 @@ class Settings:
         if issubclass(self.spec.algorithm, MaskablePPO) and not is_masking_supported(env):
             raise ValueError(
                 f"MaskablePPO is for games that tell which actions are legal; {self.env_id} has no action masks: leave "
-                "algo:MaskablePPO out"
+                "algorithm:MaskablePPO out"
             )
 
     def as_dict(self) -> dict[str, Any]:
@@ -224,21 +244,38 @@ def load_settings(
     :param config: a file to read instead of the algorithm's
     :raises ValueError: for an unknown name, a value of the wrong type, games that cannot be made
     """
-    spec = find_algorithm(algo)
-    environment = find_environment(env_id)
+    method, environment = find_algorithm(algo), find_environment(env_id)
     if size not in SIZES:
         raise unknown_name("size", size, SIZES)
-    source = f"zoo_configs/{spec.config}.yml" if config is None else str(config)
-    content = read_config(spec.config) if config is None else read_file(config)
-    _check_environments(content, environment, source)
-    own = _checked_keys(entry_of(content, environment.yaml_keys, size), spec, source)
-    overrides = overrides or {}
-    trained_by = find_algorithm(algo, overrides.get(_ALGO, overrides.get("algorithm")))
-    given = _exclusive(_checked(overrides, trained_by, "the given settings"))
-    level = entry_of(read_config("levels"), environment.yaml_keys, size)
-    own = _known_to(given.get("algorithm"), algo, own)
-    layers = (level, own, given, {"env_kwargs": env_kwargs or {}}, {"policy_kwargs": dict(spec.policy_kwargs)})
-    return _build(algo, environment, size, _for_algorithm(algo, merge(*layers)))
+    content, source = read_settings(config or method.config), str(config or f"zoo_configs/{method.config}.yml")
+    known = (DEFAULT, HECOGRID, *ENV_IDS, *suites(), environment.id)
+    for key in content:
+        if key not in known and not {".", ":", "/"} & set(str(key)):
+            raise ValueError(f"{source}: {unknown_name('environment', key, known)}")
+    own, given = entry_of(content, environment.yaml_keys, size), overrides or {}
+    spec = find_algorithm(algo, given.get("algorithm", own.get("algorithm")))
+    own, given = _checked(own, method, spec, source), _checked(given, spec, spec, "the given settings")
+    for key, value in given["policy_kwargs"].items():
+        if spec.policy_kwargs.get(key, value) != value:
+            raise ValueError(
+                f"{key} is fixed to {spec.policy_kwargs[key]!r} by --algo {algo}, got {value!r}; choose another "
+                f"method, or leave {key} out"
+            )
+    if spec.algorithm is not method.algorithm:
+        # It takes the settings that it has; masks and sequences need buffers of their own.
+        arguments = {*_OWN_KEYS, *algorithm_arguments(spec.algorithm)}
+        if "batch_size" not in arguments:
+            arguments.discard("n_minibatches")
+        if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):
+            arguments.discard("rollout_buffer_class")
+        own = {key: value for key, value in own.items() if key in arguments}
+    if given.get("batch_size") is not None:
+        if given.get("n_minibatches") is not None:
+            raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
+        own.pop("n_minibatches", None)
+    levels = entry_of(read_settings("levels"), environment.yaml_keys, size)
+    last = {"env_kwargs": env_kwargs or {}, "policy_kwargs": dict(spec.policy_kwargs)}
+    return _build(spec, algo, environment, size, merge(levels, own, given, last))
 
 
 def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | None = None) -> Settings:
@@ -254,159 +291,93 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
         raise ValueError(f"expected settings that sb3_saf.train has saved; {', '.join(missing)} is missing")
     if not isinstance(saved["hyperparams"], Mapping):
         raise ValueError(f"expected saved hyperparams to map names to values, got {saved['hyperparams']!r}")
-    spec = find_algorithm(saved["algo"])
-    own = {key: saved[key] for key in _OWN_KEYS if key in saved and saved[key] != spec.algorithm.__name__}
-    trained_by = find_algorithm(saved["algo"], own.get("algorithm"))
-    entry = merge(_checked({**own, **saved["hyperparams"]}, trained_by, "the saved settings"))
-    # Reading N from the file avoids importing the games' package for plots.
-    n_agents = None if env_kwargs else saved.get("n_agents")
-    return _build(
-        saved["algo"],
-        find_environment(saved["env"]),
-        saved["size"],
-        merge(entry, {"env_kwargs": env_kwargs or {}}),
-        None if n_agents is None else resolve("n_agents", n_agents, int),
-    )
+    spec = find_algorithm(saved["algo"], saved.get("algorithm"))
+    own = {key: saved[key] for key in _OWN_KEYS if key in saved} | dict(saved["hyperparams"])
+    entry = merge(_checked(own, spec, spec, "the saved settings"), {"env_kwargs": env_kwargs or {}})
+    # Reading N from the file avoids making a game for plots.
+    n_agents = None if env_kwargs or "n_agents" not in saved else convert("n_agents", saved["n_agents"], int)
+    return _build(spec, saved["algo"], find_environment(saved["env"]), saved["size"], entry, n_agents)
 
 
-def _known_to(algorithm: str | None, algo: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """Leave out settings of the method's file that an algorithm given in place of its own does not have."""
-    if algorithm is None:
-        return entry
-    known = algorithm_arguments(find_algorithm(algo, algorithm).algorithm)
-    left_out = {"n_minibatches"} if "batch_size" not in known else set()
-    return {key: value for key, value in entry.items() if key in {*known, *_OWN_KEYS} - left_out}
+def _checked(entry: Mapping[str, Any], method: AlgorithmSpec, spec: AlgorithmSpec, source: str) -> dict[str, Any]:
+    """
+    Return settings with RL-Zoo3's names replaced by ours.
 
-
-def _for_algorithm(algo: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """Remove entries that an algorithm other than the method's own does not support."""
-    own, spec = ALGOS[algo], find_algorithm(algo, entry.get("algorithm"))
-    if spec.algorithm is own.algorithm:
-        return {key: value for key, value in entry.items() if key != "algorithm"}
-    if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):  # need their own buffers for masks and sequences
-        entry = {key: value for key, value in entry.items() if key != "rollout_buffer_class"}
-    return _checked_keys(entry, spec, f"the settings for {spec.algorithm.__name__}")
-
-
-def _check_environments(content: Mapping[str, Any], environment: TeamEnvironment, source: str) -> None:
-    """Raise ValueError for entries that no environment reads."""
-    known = (DEFAULT, HECOGRID, *ENV_IDS, *suites(), environment.id)
-    for key in content:
-        if key not in known and not {".", ":", "/"} & set(str(key)):
-            raise ValueError(f"{source}: {unknown_name('environment', key, known)}")
-
-
-def _checked_keys(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> dict[str, Any]:
-    """Rename RL-Zoo3's keys; raise ValueError for unknown keys."""
+    :param method: algorithm whose arguments are also allowed: a file is for all algorithms that train its method
+    :raises ValueError: for unknown keys
+    """
     entry = dict(entry)
-    known = [*_OWN_KEYS, *algorithm_arguments(spec.algorithm)]
-    if _N_TIMESTEPS in entry:
+    if "n_timesteps" in entry:
         if "game_steps" in entry:
-            raise ValueError(f"{source}: game_steps and {_N_TIMESTEPS} say the same thing; give one of them")
-        entry["game_steps"] = entry.pop(_N_TIMESTEPS)
-    if _ALGO in entry:
-        entry["algorithm"] = entry.pop(_ALGO)
-    if entry.get("policy") == spec.policy:
-        del entry["policy"]
+            raise ValueError(f"{source}: game_steps and n_timesteps say the same thing; give one of them")
+        entry["game_steps"] = entry.pop("n_timesteps")
+    if (policy := entry.pop("policy", spec.policy)) != spec.policy:
+        raise ValueError(f"{source}: policy={policy!r} is not a setting here; --algo names the policy ({spec.policy})")
+    known = {**_OWN_KEYS, **algorithm_arguments(method.algorithm), **algorithm_arguments(spec.algorithm)}
     for key in entry:
-        if key == "policy":
-            raise ValueError(
-                f"{source}: {key!r} is not a setting here; use --algo, which names the policy ({spec.policy})"
-            )
         if key not in known:
             raise ValueError(f"{source}: {unknown_name('setting', key, known)}")
-    for key in MERGED:
-        resolve(key, entry.get(key, {}), _OWN_KEYS[key])
+    for key in ("env_kwargs", "policy_kwargs"):
+        entry[key] = convert(key, entry.get(key) or {}, dict[str, Any])
     return entry
-
-
-def _checked(entry: Mapping[str, Any], spec: AlgorithmSpec, source: str) -> dict[str, Any]:
-    """Check the keys, and raise ValueError for values that contradict the algorithm; a file is for all its names."""
-    entry = _checked_keys(entry, spec, source)
-    for key, value in entry.get("policy_kwargs", {}).items():
-        if spec.policy_kwargs.get(key, value) != value:
-            raise ValueError(
-                f"{source}: {key}={value!r} takes back what this algorithm is, {spec.policy} with "
-                f"{key}={spec.policy_kwargs[key]!r}; choose another algorithm, or leave {key!r} out"
-            )
-    return entry
-
-
-def _exclusive(given: dict[str, Any]) -> dict[str, Any]:
-    """Remove the number of minibatches if a batch size is given."""
-    if given.get("batch_size") is not None and given.get("n_minibatches") is not None:
-        raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
-    if given.get("batch_size") is not None:
-        return {**given, "n_minibatches": None}
-    return given
 
 
 def _build(
-    algo: str, environment: TeamEnvironment, size: Size, entry: dict[str, Any], n_agents: int | None = None
+    spec: AlgorithmSpec,
+    algo: str,
+    environment: TeamEnvironment,
+    size: Size,
+    entry: Mapping[str, Any],
+    n_agents: int | None = None,
 ) -> Settings:
-    spec = find_algorithm(algo, entry.get("algorithm"))
-    own = {key: entry.pop(key, None) for key in _OWN_KEYS}
-    n_envs = resolve("n_envs", 1 if own["n_envs"] is None else own["n_envs"], int)
-    game_steps = resolve("game_steps", own["game_steps"], int)
-    env_kwargs = environment.complete(own["env_kwargs"] or {})
-    time_limit = resolve("time_limit", own["time_limit"] or get_args(TimeLimit)[0], TimeLimit)
-    wrapping = {
-        key: resolve(key, own[key], _OWN_KEYS[key])
-        for key in WRAPPER_KEYS
-        if own[key] is not None and own[key] is not False
+    """Convert checked settings to arguments of the games and of the constructors, which check ranges."""
+    own = {
+        key: convert(key, entry[key], hint)
+        for key, hint in _OWN_KEYS.items()
+        if entry.get(key) is not None and entry[key] is not False
     }
-    _check_wrapping(wrapping, environment, env_kwargs, spec)
+    if own.get("algorithm") == find_algorithm(algo).algorithm.__name__:
+        del own["algorithm"]
+    env_kwargs = environment.complete(own.get("env_kwargs", {}))
+    wrapping = {key: own[key] for key in WRAPPER_KEYS if key in own}
+    if wrapping.get("normalize") and issubclass(spec.algorithm, OffPolicyAlgorithm):
+        raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {algo}")
+    if "frame_stack" in wrapping and env_kwargs.get("observation") == "tiles":
+        raise ValueError("frame_stack stacks pictures, not tile codes; give the game observation: rgb in env_kwargs")
+    n_envs, game_steps = own.get("n_envs", 1), convert("game_steps", own.get("game_steps"), int)
     for stage in stages_of(wrapping, game_steps):
         environment.complete({**env_kwargs, **stage.params})
     if n_agents is None:
         n_agents = environment.count_agents(env_kwargs)
-    plain = dict(entry)
-    if own["n_minibatches"] is not None:
-        n_minibatches = resolve("n_minibatches", own["n_minibatches"], int)
-        plain["batch_size"] = _teams(spec, plain, n_minibatches, n_envs) * n_agents
     hints = algorithm_arguments(spec.algorithm)
-    hyperparams = {key: resolve(key, value, hints[key]) for key, value in plain.items()}
-    if own["policy_kwargs"]:
-        plain["policy_kwargs"] = own["policy_kwargs"]
-        hyperparams["policy_kwargs"] = _resolved_policy_kwargs(spec, own["policy_kwargs"])
+    plain = {key: value for key, value in entry.items() if key in hints}
+    if "n_minibatches" in own:
+        if plain.get("n_steps") is None:
+            raise ValueError(f"n_minibatches divides a rollout of n_steps; {spec.algorithm.__name__} has none")
+        # Whole teams: one team is the rows of one game at one step.
+        plain["batch_size"] = -(-convert("n_steps", plain["n_steps"], int) * n_envs // own["n_minibatches"]) * n_agents
+    hyperparams = {key: convert(key, value, hints[key]) for key, value in plain.items()}
+    if policy_kwargs := own.get("policy_kwargs"):
+        hints = policy_arguments(spec.policy_class)
+        for key in policy_kwargs:
+            if key not in hints:
+                raise unknown_name(f"argument of {spec.policy}", key, hints)
+        plain["policy_kwargs"] = policy_kwargs
+        hyperparams["policy_kwargs"] = {key: convert(key, value, hints[key]) for key, value in policy_kwargs.items()}
+    time_limit = own.get("time_limit", get_args(TimeLimit)[0])
     return Settings(
-        algo,
-        environment.id,
-        size,
-        n_agents,
-        env_kwargs,
-        time_limit,
-        n_envs,
-        game_steps,
-        hyperparams,
-        plain,
-        wrapping,
+        algo, environment.id, size, n_agents, env_kwargs, time_limit, n_envs, game_steps, hyperparams, plain, wrapping
     )
 
 
-def _check_wrapping(
-    wrapping: Mapping[str, Any], environment: TeamEnvironment, env_kwargs: Mapping[str, Any], spec: AlgorithmSpec
-) -> None:
-    if wrapping.get("normalize") and issubclass(spec.algorithm, OffPolicyAlgorithm):
-        raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {environment.id}")
-    if "frame_stack" in wrapping and env_kwargs.get("observation") == "tiles":
-        raise ValueError("frame_stack stacks pictures, not tile codes; give the game observation: rgb in env_kwargs")
-
-
-def _teams(spec: AlgorithmSpec, plain: Mapping[str, Any], n_minibatches: int, n_envs: int) -> int:
-    """Return the number of teams in a minibatch: one team is the rows of one game at one step."""
-    n_steps = plain.get("n_steps")
-    if n_steps is None:
-        raise ValueError(f"n_minibatches divides a rollout, which needs n_steps; {spec.algorithm.__name__} has none")
-    return -(-int(resolve("n_steps", n_steps, int)) * n_envs // n_minibatches)
-
-
-def _resolved_policy_kwargs(spec: AlgorithmSpec, given: Mapping[str, Any]) -> dict[str, Any]:
-    hints = policy_arguments(spec.policy_class)
-    for key in given:
-        if key not in hints:
-            raise unknown_name(f"argument of {spec.policy}", key, hints)
-    return {key: resolve(key, value, hints[key]) for key, value in given.items()}
-
-
-__all__ = ["ALGOS", "ENV_IDS", "SIZES", "Settings", "Size", "load_settings", "saved_settings"]
+__all__ = [
+    "ALGOS",
+    "ENV_IDS",
+    "SIZES",
+    "AlgorithmSpec",
+    "Settings",
+    "Size",
+    "find_algorithm",
+    "load_settings",
+    "saved_settings",
+]

@@ -20,7 +20,6 @@ import yaml
 
 from sb3_saf.teams.checks import MAX_SEED, check_seed
 from sb3_saf.teams.errors import CheckpointError, NonFiniteError, SettingsError
-from sb3_saf.training.algorithms import ALGOS
 from sb3_saf.training.callbacks import RemainingTime
 from sb3_saf.training.commands import (
     CommandError,
@@ -37,7 +36,7 @@ from sb3_saf.training.commands import (
 )
 from sb3_saf.training.folders import find_unfinished, make_run_folder, write_run
 from sb3_saf.training.run import RunOptions, Training
-from sb3_saf.training.settings import Settings, load_settings
+from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
 
 PROGRAM: Final = "python -m sb3_saf.train"

@@ -19,10 +19,9 @@ from optuna.trial import TrialState
 
 from sb3_saf.evaluation import EvaluationResult
 from sb3_saf.teams.checks import MAX_SEED
-from sb3_saf.training.algorithms import AlgorithmSpec
 from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.run import RunOptions, train
-from sb3_saf.training.settings import Settings
+from sb3_saf.training.settings import AlgorithmSpec, Settings
 from sb3_saf.training.values import algorithm_arguments, policy_arguments
 
 #: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.

@@ -1,16 +1,18 @@
-"""Conversion of plain YAML values to constructor arguments: numbers, schedules, and classes by registered names."""
+"""Plain YAML values as constructor arguments: numbers, schedules, and classes by registered names."""
 
 from __future__ import annotations
 
 import inspect
 import math
+import reprlib
 import types
-from collections.abc import Callable, Mapping
-from collections.abc import Callable as AbstractCallable
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from typing import Any, Final, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_hints
 
+import msgspec
 import torch as th
+from msgspec import Meta
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
@@ -37,147 +39,65 @@ CLASSES: Final[dict[str, dict[str, type]]] = {
     "optimizer_class": {"Adam": th.optim.Adam, "AdamW": th.optim.AdamW, "RMSprop": th.optim.RMSprop},
 }
 
+#: Ranges that the algorithms' constructors do not check.
+RANGES: Final[dict[str, Meta]] = {
+    **dict.fromkeys(("gamma", "gae_lambda", "tau"), Meta(ge=0, le=1)),
+    **dict.fromkeys(("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), Meta(ge=0, le=1)),
+    **dict.fromkeys(("learning_rate", "ent_coef", "vf_coef", "learning_starts"), Meta(ge=0)),
+    **dict.fromkeys(("clip_range", "max_grad_norm", "target_kl"), Meta(gt=0)),
+    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "n_minibatches", "game_steps"), Meta(ge=1)),
+    **dict.fromkeys(("buffer_size", "train_freq", "target_update_interval", "stats_window_size"), Meta(ge=1)),
+    "n_envs": Meta(ge=1, le=100_000),
+    "frame_stack": Meta(ge=1, le=1_000),
+}
+
 #: Constructor arguments that are set by the run, not by its settings.
 _RUN_ARGUMENTS: Final = {
-    "self",
-    "policy",
-    "env",
-    "policy_kwargs",
-    "tensorboard_log",
-    "verbose",
-    "seed",
-    "device",
-    "_init_setup_model",
+    *("self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
 }
 _POLICY_RUN_ARGUMENTS: Final = {"self", "observation_space", "action_space", "lr_schedule", "args", "kwargs"}
 
 
-class Range(NamedTuple):
-    """Valid range of an argument; ``above`` excludes ``low`` itself; ``high`` None means no limit."""
-
-    low: float
-    high: float | None = None
-    above: bool = False
-
-    def __contains__(self, value: object) -> bool:
-        assert isinstance(value, (int, float))
-        return (value > self.low if self.above else value >= self.low) and (self.high is None or value <= self.high)
-
-    def __str__(self) -> str:
-        if self.high is not None:
-            return f"from {self.low} to {self.high}"
-        return f"larger than {self.low}" if self.above else f"at least {self.low}"
-
-
-#: Ranges that the algorithms do not check, or only after the first rollout.
-RANGES: Final[dict[str, Range]] = {
-    **dict.fromkeys(("gamma", "gae_lambda", "tau"), Range(0, 1)),
-    **dict.fromkeys(("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), Range(0, 1)),
-    **dict.fromkeys(("learning_rate", "ent_coef", "vf_coef", "learning_starts"), Range(0)),
-    **dict.fromkeys(("clip_range", "max_grad_norm", "target_kl"), Range(0, above=True)),
-    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "n_minibatches", "game_steps"), Range(1)),
-    **dict.fromkeys(("buffer_size", "train_freq", "target_update_interval", "stats_window_size"), Range(1)),
-    "n_envs": Range(1, 100_000),
-    "frame_stack": Range(1, 1_000),
-}
-
-
-class Kind(NamedTuple):
+def convert(name: str, value: object, hint: Any) -> Any:
     """
-    Kind of value of an argument: whether a type hint allows it, the conversion (``_NO`` for values of another kind),
-    and its description in errors.
-    """
+    Convert a plain value to a constructor argument.
 
-    accepts: Callable[[Any], bool]
-    convert: Callable[[Any], Any]
-    words: str
+    Numbers may be text, since YAML 1.1 reads ``7e-4`` as text. ``lin_0.001`` is RL-Zoo3's schedule, linear from 0.001
+    to 0.
 
-
-_NO: Final = object()
-
-
-def _number(value: object) -> Any:
-    """Return a float; YAML 1.1 reads ``7e-4`` as a string."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        return _NO
-    try:
-        number = float(value)
-    except (ValueError, OverflowError):
-        return _NO
-    return number if math.isfinite(number) else _NO
-
-
-def _whole_number(value: object) -> Any:
-    number = _number(value)
-    return int(number) if number is not _NO and number == int(number) else _NO
-
-
-def _schedule(value: object) -> Any:
-    """Return the schedule of RL-Zoo3's ``lin_0.001``: linear from 0.001 to 0."""
-    if not isinstance(value, str) or not value.startswith("lin_"):
-        return _NO
-    start = _number(value.removeprefix("lin_"))
-    return _NO if start is _NO else LinearSchedule(start, 0.0, 1.0)
-
-
-def _as_tuple(value: object) -> Any:
-    return tuple(value) if isinstance(value, (list, tuple)) else _NO
-
-
-def _instance(*classes: type) -> Callable[[Any], Any]:
-    return lambda value: value if isinstance(value, classes) else _NO
-
-
-_KINDS: Final = (
-    Kind(lambda hint: hint is type(None), lambda value: None if value is None else _NO, "null"),
-    Kind(lambda hint: hint is bool, _instance(bool), "true or false"),
-    Kind(lambda hint: hint is int, _whole_number, "a whole number"),
-    Kind(lambda hint: hint is float, _number, "a number"),
-    Kind(lambda hint: get_origin(hint) is AbstractCallable, _schedule, "a schedule such as 'lin_7e-4'"),
-    Kind(lambda hint: hint is str, _instance(str), "a string"),
-    Kind(lambda hint: get_origin(hint) in (dict, Mapping), _instance(dict), "a mapping, written {key: value}"),
-    Kind(lambda hint: get_origin(hint) is list, _instance(list), "a list"),
-    Kind(lambda hint: get_origin(hint) is tuple, _as_tuple, "a list"),
-)
-
-
-def resolve(name: str, value: object, hint: object) -> Any:
-    """
-    Convert a plain value to a constructor argument; raise ValueError for a wrong type or range.
-
-    :param name: the argument's name, which selects the table of classes
+    :param name: the argument's name, which selects its classes and its range
     :param value: value from YAML or a command line; objects that are not plain data are returned unchanged
     :param hint: the argument's type
+    :raises ValueError: for a wrong type or range
     """
-    resolved = _resolve_type(name, value, hint)
-    number = resolved.start if isinstance(resolved, LinearSchedule) else resolved
-    if name in RANGES and isinstance(number, (int, float)) and number not in RANGES[name]:
-        raise ValueError(f"{name} must be {RANGES[name]}, got {value!r}")
-    return resolved
-
-
-def _resolve_type(name: str, value: object, hint: object) -> Any:
-    if name in CLASSES and isinstance(value, str):
-        if value not in CLASSES[name]:
-            raise unknown_name(name, value, CLASSES[name])
-        return CLASSES[name][value]
-    if not isinstance(value, (bool, int, float, str, list, tuple, dict, type(None))):
+    members = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    is_schedule = any(get_origin(member) is Callable for member in members)
+    if isinstance(value, str):
+        if name in CLASSES:
+            if value not in CLASSES[name]:
+                raise unknown_name(name, value, CLASSES[name])
+            return CLASSES[name][value]
+        if is_schedule and value.startswith("lin_"):
+            return LinearSchedule(convert(name, value.removeprefix("lin_"), float), 0.0, 1.0)
+    if Any in members or not isinstance(value, (bool, int, float, str, list, tuple, dict, type(None))):
         return value
-    hints = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    choices = [choice for hint in hints if get_origin(hint) is Literal for choice in get_args(hint)]
-    if value in choices or Any in hints:
-        return value
-    kinds = [kind for kind in _KINDS if any(kind.accepts(hint) for hint in hints)]
-    for kind in kinds:
-        converted = kind.convert(value)
-        if converted is not _NO:
-            return converted
-    words = [*map(repr, choices), *(kind.words for kind in kinds), *CLASSES.get(name, [])]
-    raise ValueError(f"{name} must be {' or '.join(words) or hint}, got {value!r}")
+    kinds = [member for member in members if get_origin(member) not in (Callable, type)]
+    if name in RANGES:
+        kinds = [Annotated[kind, RANGES[name]] if kind in (int, float) else kind for kind in kinds]
+    try:
+        if not kinds:
+            raise ValueError(f"expected one of {', '.join(CLASSES.get(name, ()))}")
+        result = msgspec.convert(value, Union[tuple(kinds)], strict=False)  # noqa: UP007 (made of a list)
+        if isinstance(result, float) and not math.isfinite(result):
+            raise ValueError("expected a finite number")
+        return result
+    except ValueError as error:
+        schedules = " (or a schedule such as 'lin_7e-4')" if is_schedule else ""
+        raise ValueError(f"invalid setting {name}={reprlib.repr(value)}: {error}{schedules}") from None
 
 
 def algorithm_arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """Return the valid settings of an algorithm with types: its constructor's arguments without those of a run."""
+    """Return the valid settings of an algorithm with types: its constructor's arguments but for the run's."""
     return _init_hints(algorithm, _RUN_ARGUMENTS)
 
 
@@ -199,12 +119,13 @@ def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
 
 def _init_hints(owner: type, without: set[str]) -> dict[str, Any]:
     init = vars(owner).get("__init__") or owner.__init__  # type: ignore[misc]
-    annotations = {name: parameter.annotation for name, parameter in inspect.signature(init).parameters.items()}
-    # One by one: SB3's type of environments, never used in settings, has an unresolvable forward reference.
-    return {name: _hint(annotations[name], init.__globals__) for name in annotations if name not in without}
-
-
-def _hint(annotation: Any, names: dict[str, Any]) -> Any:
-    if annotation is inspect.Parameter.empty:
-        return Any
-    return get_type_hints(types.SimpleNamespace(__annotations__={"argument": annotation}), names)["argument"]
+    hints = {}
+    for name, parameter in inspect.signature(init).parameters.items():
+        if name in without:
+            continue
+        hints[name] = Any
+        if parameter.annotation is not inspect.Parameter.empty:
+            # One by one: SB3's type of environments, never used in settings, has an unresolvable forward reference.
+            one = types.SimpleNamespace(__annotations__={name: parameter.annotation})
+            hints[name] = get_type_hints(one, init.__globals__)[name]
+    return hints
