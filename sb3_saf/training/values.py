@@ -66,7 +66,7 @@ def convert(name: str, value: object, hint: Any) -> Any:
     to 0.
 
     :param name: the argument's name, which selects its classes and its range
-    :param value: value from YAML or a command line; objects that are not plain data are returned unchanged
+    :param value: value from YAML or a command line; classes and functions are returned unchanged
     :param hint: the argument's type
     :raises ValueError: for a wrong type or range
     """
@@ -79,7 +79,7 @@ def convert(name: str, value: object, hint: Any) -> Any:
             return CLASSES[name][value]
         if is_schedule and value.startswith("lin_"):
             return LinearSchedule(convert(name, value.removeprefix("lin_"), float), 0.0, 1.0)
-    if Any in members or not isinstance(value, (bool, int, float, str, list, tuple, dict, type(None))):
+    if Any in members or callable(value):
         return value
     kinds = [member for member in members if get_origin(member) not in (Callable, type)]
     if name in RANGES:
