@@ -19,7 +19,7 @@ from sb3_saf.envs.team_game import make_team_game, team_game
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
 from sb3_saf.suites.registry import SuiteTask, find_task
 from sb3_saf.teams.checks import check_choice, check_count
-from sb3_saf.teams.rows import RowSpaces
+from sb3_saf.teams.rows import TeamSpaces
 
 Backend = Literal["native", "supersuit"]
 #: Characters that occur in names of modules and functions, but not of tasks.
@@ -214,11 +214,12 @@ def _suite(one: SuiteTask, request: Request, seed: int | None, params: dict[str,
         venv = suite.vec_env(one.task, request.n_envs, seed, state=request.signals.state, **params)
     except TypeError as error:  # most often an argument that it does not have
         raise ValueError(f"{one.id} cannot be made with {params}: {error}") from error
-    _check_signals(one.id, RowSpaces.of(venv.observation_space, venv.action_space), request.signals)
+    rows = TeamSpaces.of_rows(venv.observation_space, venv.action_space, venv.n_agents)
+    _check_signals(one.id, rows, request.signals)
     return venv
 
 
-def _check_signals(name: str, rows: RowSpaces, signals: Signals) -> None:
+def _check_signals(name: str, rows: TeamSpaces, signals: Signals) -> None:
     has_masks = rows.n_masked_actions is not None
     if signals.action_masks not in ("auto", has_masks):
         raise ValueError(

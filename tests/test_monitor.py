@@ -159,21 +159,6 @@ def test_keywords_that_are_columns_are_refused() -> None:
         TeamMonitor(TeamVenv(), info_keywords=("score", "l"))
 
 
-def test_opponents_are_told_from_teams() -> None:
-    def caught_by(agent: int, step: int) -> float:
-        return float(step % 7 == 0) * (10.0 if agent else -10.0) - 0.1 * (step % 3)
-
-    def each_for_itself(agent: int, step: int) -> float:
-        return float(step % 7 == agent) - 0.1 * (step % 3)
-
-    def play_long(reward: Any) -> None:
-        play(TeamMonitor(TeamVenv(lengths=(100,) * 10, reward=lambda game, agent, step: reward(agent, step))), 200)
-
-    with pytest.warns(UserWarning, match=r"agents 0 and [12] oppose each other \(correlation -1.00 over 2000 game st"):
-        play_long(caught_by)
-    play_long(each_for_itself)  # warnings are errors
-
-
 def test_missing_info_keyword_is_named() -> None:
     env = TeamMonitor(TeamVenv(lengths=(2,)), info_keywords=("score", "episode_number"))
     with pytest.raises(

@@ -113,7 +113,6 @@ def test_masks_reach_the_team(kwargs: dict[str, Any]) -> None:
     assert rows["action_mask"].tolist() == [[1, 1, 1], [1, 0, 0]] * 16
 
 
-@pytest.mark.filterwarnings("ignore:the rewards of agents 0 and 1 oppose each other")
 def test_players_learn_to_win_from_each_other() -> None:
     env = make_team_env(parallel, n_envs=16, seed=0)
     model = PPO(

@@ -17,7 +17,7 @@ from sb3_saf.envs.space_reader import (
     counted_from_zero,
     leaves_of,
 )
-from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, RowSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, TeamSpaces
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
@@ -63,7 +63,7 @@ class GameForm(NamedTuple):
     agents: tuple[Any, ...]
     own: spaces.Space[Any]
     action_space: spaces.Space[Any]
-    rows: RowSpaces
+    rows: TeamSpaces
     has_masks_inside: bool = False
     masks: MaskSource | None = None
     state: spaces.Space[Any] | None = None
@@ -93,11 +93,13 @@ def game_form(example: Any, first_infos: Callable[[], Mapping[Any, Any]], signal
     masks = _mask_source(inside, action_masks, action_space, first_infos)
     state_space = _state_space(example) if state else None
     is_flattened = action_masks is not None and can_be_flattened(own)
-    rows = RowSpaces(
+    rows = TeamSpaces(
         (FlatReader if is_flattened else SpaceReader)(own, []).rows,
+        len(agents),
         active,
         _n_actions(action_space) if masks else None,
         None if state_space is None else counted_from_zero(state_space),
+        agents,
         is_dict=active or masks is not None or state,
     )
     return GameForm(agents, own, action_space, rows, inside, masks, state_space, is_flattened)

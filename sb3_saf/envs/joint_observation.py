@@ -23,7 +23,6 @@ from sb3_saf.teams.rows import (
     STATE_KEY,
     TEAM_KEY,
     Array,
-    RowSpaces,
     TeamSpaces,
     channels_first,
 )
@@ -51,7 +50,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     ``agent`` ``()``           index of the agent in its team, Discrete(N)
     ========= ================ ======================================================================
 
-    Environments with signals have more keys (:class:`RowSpaces` defines how a VecEnv provides them; ``make_team_env``
+    Environments with signals have more keys (:class:`TeamSpaces` defines how a VecEnv provides them; ``make_team_env``
     does so for any PettingZoo environment):
 
     =============== ============== ================================================================================
@@ -78,20 +77,15 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     def __init__(self, venv: VecEnv, n_agents: int | None = None, time_limit: TimeLimit = "terminal") -> None:
         check_choice("time_limit", time_limit, get_args(TimeLimit))
-        raw = RowSpaces.of(venv.observation_space, venv.action_space)
         n_agents = require_n_agents(venv, n_agents)
         names = getattr(venv, "possible_agents", None)
-        team = TeamSpaces.of(
-            channels_first(raw.own),
-            n_agents,
-            raw.active,
-            raw.n_masked_actions,
-            None if raw.state is None else channels_first(raw.state),
-            names if names is not None and len(names) == n_agents else None,
-        )
+        names = names if names is not None and len(names) == n_agents else None
+        raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
+        state = None if raw.state is None else channels_first(raw.state)
+        team = TeamSpaces.of(channels_first(raw.own), n_agents, raw.has_active, raw.n_masked_actions, state, names)
         if _sb3_would_transpose(team):
             venv = _protected_from_transposition(venv, n_agents)
-            raw = RowSpaces.of(venv.observation_space, venv.action_space)
+            raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
         super().__init__(venv, n_agents, team.to_dict_space())
         self.time_limit = time_limit
         self.team_spaces = team
@@ -198,7 +192,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         raw, team = self._raw, self.team_spaces
         entries = raw.entries(obs, what)
         parts = {OBS_KEY: self._rows(entries[OBS_KEY], raw.own, team.own, what, games)}
-        if raw.active:
+        if raw.has_active:
             parts[ACTIVE_KEY] = np.asarray(entries[ACTIVE_KEY]).reshape(-1, self.n_agents).astype(np.int8)
         if raw.n_masked_actions is not None:
             parts[ACTION_MASK_KEY] = self._masks(entries[ACTION_MASK_KEY], parts.get(ACTIVE_KEY), games is not None)

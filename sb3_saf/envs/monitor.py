@@ -15,14 +15,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_array, check_real, check_whole
-from sb3_saf.teams.rows import Array
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
-#: Game steps after which the rewards are tested.
-_N_STEPS: Final = 2000
-#: Correlation of the rewards of two agents below which they oppose each other.
-_OPPOSED: Final = -0.5
 
 
 class TeamMonitor(TeamVecEnvWrapper):
@@ -37,8 +32,6 @@ class TeamMonitor(TeamVecEnvWrapper):
     It is not a subclass of VecMonitor, because SB3's ``evaluate_policy`` would wait for an ``"episode"`` entry in every
     row and never return. With a TeamMonitor it counts every agent as an episode and warns; use
     ``sb3_saf.evaluate_policy``, which counts teams.
-
-    A warning is issued if the rewards of two agents oppose each other (see :class:`OppositionDetector`).
 
     :param venv: rows of flattened teams, game-major, then agent
     :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none. It
@@ -74,7 +67,6 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
         self._filename = filename
-        self._opposition = OppositionDetector(self.n_agents)
         self._writer: ResultsWriter | None = None
 
     def reset(self) -> VecEnvObs:
@@ -99,7 +91,6 @@ class TeamMonitor(TeamVecEnvWrapper):
         # float64, because sums of many float32 rewards are inexact.
         by_game = rewards.reshape(self.n_games, self.n_agents)
         self._returns += by_game.sum(axis=1, dtype=np.float64) * self._share
-        self._opposition.see(by_game)
         self._lengths += 1
         if ended.any():
             infos = list(infos)
@@ -234,47 +225,3 @@ def _cut(file: IO[Any], size: int) -> None:
         )
         return
     os.truncate(file.fileno(), size)
-
-
-class OppositionDetector:
-    """
-    Warn once if two agents' rewards oppose each other: their correlation over the first game steps is below -0.5.
-
-    The algorithms are made for one team: agents share parameters, and QPLEX maximises the sum of their rewards.
-    Opponents can be trained by self-play only.
-
-    :param n_agents: N
-    """
-
-    def __init__(self, n_agents: int) -> None:
-        self._sum = np.zeros(n_agents)
-        self._products = np.zeros((n_agents, n_agents))
-        self._n_steps = 0
-
-    def see(self, rewards: Array) -> None:
-        """Record the rewards of a step, (E, N)."""
-        if self._n_steps >= _N_STEPS:
-            return
-        rewards = rewards.astype(np.float64)
-        self._sum += rewards.sum(axis=0)
-        self._products += rewards.T @ rewards
-        self._n_steps += len(rewards)
-        if self._n_steps >= _N_STEPS:
-            self._judge()
-
-    def _judge(self) -> None:
-        means = self._sum / self._n_steps
-        covariances = self._products / self._n_steps - np.outer(means, means)
-        scales = np.sqrt(np.maximum(np.diag(covariances), 0.0))
-        scale = np.outer(scales, scales)
-        correlations = np.divide(covariances, scale, out=np.zeros_like(scale), where=scale > 1e-12)
-        first, second = np.unravel_index(int(np.argmin(correlations)), correlations.shape)
-        if correlations[first, second] < _OPPOSED:
-            warnings.warn(
-                f"the rewards of agents {first} and {second} oppose each other (correlation "
-                f"{correlations[first, second]:.2f} over {self._n_steps} game steps): they are opponents, but all "
-                "agents are trained as one team with shared parameters. Where that is meant as self-play, ignore "
-                "this warning; else make a team of one side and play the other inside the environment",
-                UserWarning,
-                stacklevel=4,
-            )

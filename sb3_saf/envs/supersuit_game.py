@@ -51,7 +51,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     def __init__(self, env: AnyParallelEnv, form: GameForm, index: int, notes: list[str]) -> None:
         _add_missing_attributes(env)
         super().__init__(env, black_death=True)
-        self.observation_space = form.rows.to_space()
+        self.observation_space = form.rows.to_row_space()
         self.agents = form.agents
         self.index = index
         self._is_closed = False
@@ -236,7 +236,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         """Return the signals of an agent's row, without the state."""
         rows = self._form.rows
         signals: Info = {}
-        if rows.active:
+        if rows.has_active:
             signals[ACTIVE_KEY] = int(active)
         if rows.n_masked_actions is not None:
             signals[ACTION_MASK_KEY] = np.zeros(rows.n_masked_actions, dtype=np.int8)

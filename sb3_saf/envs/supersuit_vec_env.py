@@ -95,7 +95,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         )
         try:
             super().__init__(
-                n_games, len(form.agents), form.rows.to_space(), counted_from_zero(form.action_space), seed
+                n_games, len(form.agents), form.rows.to_row_space(), counted_from_zero(form.action_space), seed
             )
         except BaseException:
             self.close()

@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, RowSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, TeamSpaces
 
 
 class VecGame(ParallelEnv[Any, Any, Any]):
@@ -31,7 +31,9 @@ class VecGame(ParallelEnv[Any, Any, Any]):
         if venv.num_envs != len(self.possible_agents):
             raise ValueError(f"expected one game of {len(self.possible_agents)} agents, got {venv.num_envs} rows")
         self.agents: list[Any] = []
-        self._rows = RowSpaces.of(venv.observation_space, venv.action_space)
+        self._rows = TeamSpaces.of_rows(
+            venv.observation_space, venv.action_space, len(self.possible_agents), self.possible_agents
+        )
         self._state: Any = None
 
     def observation_space(self, agent: Any) -> spaces.Space[Any]:

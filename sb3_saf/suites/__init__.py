@@ -18,7 +18,7 @@ that step many games in one call: an SB3 VecEnv of B rows, game-major, then agen
 - ``n_games``, ``n_agents`` and ``possible_agents`` (N names) as attributes;
 - ``observation_space`` of one row: the own observation, a Box, Discrete, MultiDiscrete or MultiBinary. With signals it
   is a Dict of ``"obs"`` and any of ``"active"``, Discrete(2); ``"action_mask"``, MultiBinary(A); ``"state"``, a Box
-  that is equal in all rows of a game and there only if ``state=True`` (see :class:`sb3_saf.teams.rows.RowSpaces`);
+  that is equal in all rows of a game and there only if ``state=True`` (see :class:`sb3_saf.teams.rows.TeamSpaces`);
 - ``action_space`` of one row, counted from 0;
 - ``seed(seed)``, for the next reset, where game ``e`` gets its own random stream, independent of E; and
   ``seeded_with``, a tuple of the seeds of the games, None for random ones, which distinguishes evaluation from

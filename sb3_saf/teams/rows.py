@@ -8,7 +8,9 @@ Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple, get_args
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -61,26 +63,35 @@ class AgentSpace(spaces.Discrete):
         self.names = None if names is None else tuple(names)
 
 
-class TeamSpaces(NamedTuple):
+@dataclass(frozen=True)
+class TeamSpaces:
     """
-    Parts of the Dict observation of ``CentralizedValueWrapper``.
+    The form of a row.
 
-    :param own: space of one agent's own observation (key ``"obs"``), shape ``(*shape)``
-    :param team: Box of all own observations of a team (key ``"team"``), shape ``(N, *shape)``, dtype as in ``own``
-    :param agent: Discrete(N), the agent's index (key ``"agent"``)
+    Rows of a VecEnv of flattened teams are own observations (``is_dict=False``), or Dicts with the key ``"obs"`` and
+
+    - ``"active"``, Discrete(2): 1 while the row's agent takes part;
+    - ``"action_mask"``, MultiBinary(A): 1 for legal actions, see :func:`n_mask_entries`;
+    - ``"state"``: the state of the row's game, equal in all its rows.
+
+    ``CentralizedValueWrapper`` adds ``"team"`` and ``"agent"``, and makes ``"active"`` that of the whole team.
+
+    :param own: space of one agent's own observation, shape ``(*shape)``
     :param n_agents: N
-    :param active: MultiBinary(N), which agents of the team take part (key ``"active"``); None if all always do
-    :param action_mask: MultiBinary(A), the row's legal actions (key ``"action_mask"``); None if all always are
-    :param state: space of the game's state (key ``"state"``), or None
+    :param has_active: whether rows have ``"active"``
+    :param n_masked_actions: A if rows have action masks, else None
+    :param state: space of the game's state if rows have it
+    :param names: the agents' names in index order, if they are known
+    :param is_dict: whether rows below ``CentralizedValueWrapper`` are Dicts
     """
 
     own: spaces.Space[Any]
-    team: spaces.Box
-    agent: spaces.Discrete
     n_agents: int
-    active: spaces.MultiBinary | None = None
-    action_mask: spaces.MultiBinary | None = None
+    has_active: bool = False
+    n_masked_actions: int | None = None
     state: spaces.Space[Any] | None = None
+    names: tuple[Any, ...] | None = None
+    is_dict: bool = False
 
     @classmethod
     def of(
@@ -93,7 +104,7 @@ class TeamSpaces(NamedTuple):
         names: Sequence[Any] | None = None,
     ) -> TeamSpaces:
         """
-        Return the spaces of a team whose agents share one observation space.
+        Return the form of rows of a team whose agents share one observation space, which is checked.
 
         :param own: Box, Discrete, MultiDiscrete or MultiBinary
         :param n_agents: N
@@ -101,23 +112,46 @@ class TeamSpaces(NamedTuple):
         :param n_masked_actions: A if rows have action masks
         :param state: space of the game's state if rows have it
         :param names: the agents' names in index order, if they are known
-        :raises ValueError: if ``own`` is another kind of space
+        :raises ValueError: if ``own`` or ``state`` is another kind of space
         """
-        low, high = bounds_of(own)
-        team = spaces.Box(
-            np.repeat(low[np.newaxis], n_agents, axis=0),
-            np.repeat(high[np.newaxis], n_agents, axis=0),
-            dtype=low.dtype.type,
-        )
-        return cls(
-            own,
-            team,
-            AgentSpace(n_agents, names),
-            n_agents,
-            spaces.MultiBinary(n_agents) if active else None,
-            None if n_masked_actions is None else spaces.MultiBinary(n_masked_actions),
-            None if state is None else _checked_state(state),
-        )
+        bounds_of(own)
+        if state is not None:
+            _check_state(state)
+        is_dict = active or n_masked_actions is not None or state is not None
+        return cls(own, n_agents, active, n_masked_actions, state, None if names is None else tuple(names), is_dict)
+
+    @classmethod
+    def of_rows(
+        cls,
+        space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        n_agents: int,
+        names: Sequence[Any] | None = None,
+    ) -> TeamSpaces:
+        """
+        Split the observation space of the rows of a VecEnv of flattened teams into its parts.
+
+        :param space: observation space of the VecEnv
+        :param action_space: its action space
+        :param n_agents: N
+        :param names: the agents' names in index order, if they are known
+        :raises ValueError: if the space has rows of teams already, or an optional key has another form
+        """
+        known = None if names is None else tuple(names)
+        keys = set(space.spaces) if isinstance(space, spaces.Dict) else set()
+        if set(TEAM_KEYS) <= keys <= ALL_KEYS:
+            raise ValueError(
+                "expected a VecEnv of own observations, got one that already has the Dict observation of "
+                "CentralizedValueWrapper; wrap it once (sb3_saf.make_team_env has done so)"
+            )
+        if not isinstance(space, spaces.Dict) or OBS_KEY not in keys or not keys <= {OBS_KEY, *OPTIONAL_KEYS}:
+            return cls(space, n_agents, names=known)
+        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
+        if active is not None and active != spaces.Discrete(2):
+            raise ValueError(f"expected {ACTIVE_KEY!r} of a row to be Discrete(2), got {active}")
+        check_masks(action_mask, action_space)
+        n_masked = None if action_mask is None else int((action_mask.shape or ())[0])
+        return cls(space.spaces[OBS_KEY], n_agents, active is not None, n_masked, state, known, is_dict=True)
 
     @classmethod
     def from_observation_space(cls, space: spaces.Space[Any]) -> TeamSpaces:
@@ -147,55 +181,104 @@ class TeamSpaces(NamedTuple):
             isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
         ):
             raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
-        if state is not None:
-            _checked_state(state)
-        return cls(own, team, agent, n_agents, active, action_mask, state)  # type: ignore[arg-type]
+        n_masked = None if action_mask is None else action_mask.shape[0]
+        return cls.of(own, n_agents, active is not None, n_masked, state, getattr(agent, "names", None))
+
+    @cached_property
+    def team(self) -> spaces.Box:
+        """Box of all own observations of a team (key ``"team"``), shape ``(N, *shape)``, dtype as in ``own``."""
+        low, high = (np.repeat(bound[np.newaxis], self.n_agents, axis=0) for bound in bounds_of(self.own))
+        return spaces.Box(low, high, dtype=low.dtype.type)
+
+    @cached_property
+    def agent(self) -> AgentSpace:
+        """Discrete(N), the agent's index (key ``"agent"``)."""
+        return AgentSpace(self.n_agents, self.names)
 
     @property
-    def keys(self) -> tuple[str, ...]:
-        """Keys of a row's observation."""
-        optional = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
-        return (*TEAM_KEYS, *(key for key, space in optional.items() if space is not None))
+    def active(self) -> spaces.MultiBinary | None:
+        """MultiBinary(N), which agents of the team take part (key ``"active"``); None if all always do."""
+        return spaces.MultiBinary(self.n_agents) if self.has_active else None
 
     @property
-    def names(self) -> tuple[Any, ...] | None:
-        """The agents' names in index order; None if they are unknown."""
-        return getattr(self.agent, "names", None)
+    def action_mask(self) -> spaces.MultiBinary | None:
+        """MultiBinary(A), the row's legal actions (key ``"action_mask"``); None if all always are."""
+        return None if self.n_masked_actions is None else spaces.MultiBinary(self.n_masked_actions)
 
     @property
     def own_shape(self) -> tuple[int, ...]:
         """Shape of one agent's own observation; ``()`` for Discrete."""
-        return self.team.shape[1:]
+        return self.own.shape or ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of a row's joint observation."""
+        return (*TEAM_KEYS, *self._optional)
+
+    @property
+    def _optional(self) -> dict[str, spaces.Space[Any]]:
+        parts = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
+        return {key: part for key, part in parts.items() if part is not None}
 
     def to_dict_space(self) -> spaces.Dict:
-        """Return the observation space of one row; ``own`` stays the same object."""
-        parts: dict[str, spaces.Space[Any] | None] = {
-            OBS_KEY: self.own,
-            TEAM_KEY: self.team,
-            AGENT_KEY: self.agent,
-            ACTIVE_KEY: self.active,
-            ACTION_MASK_KEY: self.action_mask,
-            STATE_KEY: self.state,
-        }
-        return spaces.Dict({key: part for key, part in parts.items() if part is not None})
+        """Return the joint observation space of a row; ``own`` stays the same object."""
+        return spaces.Dict({OBS_KEY: self.own, TEAM_KEY: self.team, AGENT_KEY: self.agent, **self._optional})
+
+    def to_row_space(self) -> spaces.Space[Any]:
+        """Return the observation space of a row below ``CentralizedValueWrapper``."""
+        if not self.is_dict:
+            return self.own
+        active = {ACTIVE_KEY: spaces.Discrete(2)} if self.has_active else {}
+        return spaces.Dict({OBS_KEY: self.own, **self._optional, **active})
+
+    def entries(self, obs: Any, what: str) -> Mapping[str, Any]:
+        """
+        Return the parts of rows below ``CentralizedValueWrapper``.
+
+        :param obs: own observations, or Dicts where rows are Dicts
+        :param what: name of the rows, for the message
+        :raises ValueError: if keys are missing
+        """
+        if not self.is_dict:
+            return {OBS_KEY: obs}
+        keys = [OBS_KEY, *self._optional]
+        if not isinstance(obs, Mapping) or any(key not in obs for key in keys):
+            got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__
+            raise ValueError(f"expected {what} to be a dict with the keys {keys}, got {got}")
+        return {key: obs[key] for key in keys}
 
 
-def _checked_state(state: spaces.Space[Any]) -> spaces.Space[Any]:
-    if isinstance(state, FIXED_SHAPE):
-        return state
-    raise ValueError(
-        f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {state}; flatten it first"
-    )
+def _check_state(state: spaces.Space[Any]) -> None:
+    if not isinstance(state, FIXED_SHAPE):
+        raise ValueError(
+            f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {state}; flatten it "
+            "first"
+        )
+
+
+def n_mask_entries(action_space: spaces.Space[Any]) -> int | None:
+    """
+    Return A, the number of entries of action masks, as in sb3-contrib; None for actions that cannot be masked.
+
+    :param action_space: Discrete(A); MultiDiscrete, whose masks follow one another; MultiBinary(n), A = 2 n, whether 0
+        and whether 1 is legal for each entry in turn
+    """
+    if isinstance(action_space, spaces.Discrete):
+        return int(action_space.n)
+    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) == 1:
+        return int(action_space.nvec.sum())
+    if isinstance(action_space, spaces.MultiBinary) and len(action_space.shape) == 1:
+        return 2 * action_space.shape[0]
+    return None
 
 
 def check_masks(action_mask: spaces.Space[Any] | None, action_space: spaces.Space[Any]) -> None:
     """Raise ValueError unless the space of action masks, if there is one, fits the actions."""
-    if action_mask is None:
-        return
-    if not isinstance(action_space, spaces.Discrete) or action_mask != spaces.MultiBinary(int(action_space.n)):
+    n_entries = n_mask_entries(action_space)
+    if action_mask is not None and (n_entries is None or action_mask != spaces.MultiBinary(n_entries)):
         raise ValueError(
-            f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A) where actions are Discrete(A), got {action_mask} for "
-            f"{action_space}"
+            f"expected {ACTION_MASK_KEY!r} to be MultiBinary(A), one entry per choice of "
+            f"Discrete, MultiDiscrete or MultiBinary actions, got {action_mask} for {action_space}"
         )
 
 
@@ -227,93 +310,6 @@ def _not_a_team_space(found: str) -> str:
         "environment with sb3_saf.make_team_env(...), or wrap a VecEnv of flattened teams: "
         "sb3_saf.CentralizedValueWrapper(venv, n_agents=N)"
     )
-
-
-_ROW_KEYS: Final = (OBS_KEY, *OPTIONAL_KEYS)
-
-
-class RowSpaces(NamedTuple):
-    """
-    The parts of a row's observation.
-
-    Rows of a VecEnv of flattened teams are own observations, or Dicts with the key ``"obs"`` and any of
-
-    - ``"active"``, Discrete(2): 1 while the row's agent takes part;
-    - ``"action_mask"``, MultiBinary(A): 1 for legal actions, where actions are Discrete(A);
-    - ``"state"``: the state of the row's game, equal in all its rows.
-
-    :param own: space of the row's own observation
-    :param active: whether rows have ``"active"``
-    :param n_masked_actions: A if rows have masks, else None
-    :param state: space of the game's state if rows have it
-    :param is_dict: whether rows are Dicts
-    """
-
-    own: spaces.Space[Any]
-    active: bool = False
-    n_masked_actions: int | None = None
-    state: spaces.Space[Any] | None = None
-    is_dict: bool = False
-
-    @classmethod
-    def of(cls, space: spaces.Space[Any], action_space: spaces.Space[Any]) -> RowSpaces:
-        """
-        Split the observation space of rows into its parts.
-
-        :param space: observation space of the VecEnv
-        :param action_space: its action space
-        :raises ValueError: if the space has rows of teams already, or an optional key has another form
-        """
-        if not isinstance(space, spaces.Dict):
-            return cls(space)
-        keys = set(space.spaces)
-        if set(TEAM_KEYS) <= keys <= ALL_KEYS:
-            raise ValueError(
-                "expected a VecEnv of own observations, got one that already has the Dict observation of "
-                "CentralizedValueWrapper; wrap it once (sb3_saf.make_team_env has done so)"
-            )
-        if OBS_KEY not in keys or not keys <= set(_ROW_KEYS):
-            return cls(space)  # an own observation of an unknown form, which TeamSpaces refuses
-        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
-        if active is not None and active != spaces.Discrete(2):
-            raise ValueError(f"expected {ACTIVE_KEY!r} of a row to be Discrete(2), got {active}")
-        check_masks(action_mask, action_space)
-        n_masked = None if action_mask is None else int((action_mask.shape or ())[0])
-        return cls(space.spaces[OBS_KEY], active is not None, n_masked, state, is_dict=True)
-
-    def to_space(self) -> spaces.Space[Any]:
-        """Return the observation space of a row."""
-        if not self.is_dict:
-            return self.own
-        row: dict[str, spaces.Space[Any]] = {OBS_KEY: self.own}
-        if self.active:
-            row[ACTIVE_KEY] = spaces.Discrete(2)
-        if self.n_masked_actions is not None:
-            row[ACTION_MASK_KEY] = spaces.MultiBinary(self.n_masked_actions)
-        if self.state is not None:
-            row[STATE_KEY] = self.state
-        return spaces.Dict(row)
-
-    def entries(self, obs: Any, what: str) -> Mapping[str, Any]:
-        """
-        Return the parts of rows.
-
-        :param obs: own observations, or Dicts where the space is a Dict
-        :param what: name of the rows, for the message
-        :raises ValueError: if keys are missing
-        """
-        if not self.is_dict:
-            return {OBS_KEY: obs}
-        keys = self._keys
-        if not isinstance(obs, Mapping) or any(key not in obs for key in keys):
-            got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__
-            raise ValueError(f"expected {what} to be a dict with the keys {keys}, got {got}")
-        return {key: obs[key] for key in keys}
-
-    @property
-    def _keys(self) -> list[str]:
-        told = (True, self.active, self.n_masked_actions is not None, self.state is not None)
-        return [key for key, is_told in zip(_ROW_KEYS, told, strict=True) if is_told]
 
 
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:

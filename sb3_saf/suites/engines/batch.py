@@ -16,7 +16,7 @@ from sb3_saf.checkpoints.checks import check_keys, check_like, check_list, check
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.space_reader import checked_actions
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.rows import IS_SUCCESS, Array, RowSpaces
+from sb3_saf.teams.rows import IS_SUCCESS, Array, TeamSpaces
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 
@@ -52,7 +52,7 @@ class Batch(ABC):
     """
 
     def __init__(
-        self, n_games: int, agents: Sequence[str], rows: RowSpaces, action_space: spaces.Space[Any], env: Any
+        self, n_games: int, agents: Sequence[str], rows: TeamSpaces, action_space: spaces.Space[Any], env: Any
     ) -> None:
         self.n_games = n_games
         self.agents = list(agents)
@@ -98,7 +98,7 @@ class BatchVecEnv(TeamVecEnv):
     """
     VecEnv of a batch of games: row ``e * N + i`` is agent ``i`` of game ``e``.
 
-    Observations of rows are Dicts, see :class:`sb3_saf.teams.rows.RowSpaces`. Infos of done rows hold
+    Observations of rows are Dicts, see :class:`sb3_saf.teams.rows.TeamSpaces`. Infos of done rows hold
     ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite reports
     wins. All other infos are one empty dict.
 
@@ -118,7 +118,7 @@ class BatchVecEnv(TeamVecEnv):
         self._actions: Array | None = None
         self._running = False
         n_games = check_count("n_envs", batch.n_games)
-        super().__init__(n_games, len(batch.agents), batch.rows.to_space(), batch.action_space, seed)
+        super().__init__(n_games, len(batch.agents), batch.rows.to_row_space(), batch.action_space, seed)
 
     def reset(self) -> dict[str, Array]:
         """

@@ -19,7 +19,7 @@ from gymnasium import spaces
 
 from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch
 from sb3_saf.suites.engines.jaxmarl_package import spaces as jax_spaces
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, RowSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 _ALL: Final = "__all__"
 _WORLD_STATE: Final = "world_state"
@@ -108,9 +108,10 @@ class JaxPrograms:
         self._shows_world = with_state
         self._has_world_entry = _WORLD_STATE in observations
         self._action_spaces = [env.action_space(agent) for agent in self.agents]
-        self.rows = RowSpaces(
+        self.rows = TeamSpaces(
             self._own_space(),
-            active=not rules.pays_the_dead,
+            len(self.agents),
+            has_active=not rules.pays_the_dead,
             n_masked_actions=self._n_masked_actions(),
             state=self._world_space(observations),
             is_dict=True,

@@ -19,7 +19,7 @@ with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
     from vmas.simulator.environment import Environment
 
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array, RowSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array, TeamSpaces
 
 #: Game steps after which BenchMARL stops an episode.
 _MAX_STEPS: Final = 100
@@ -50,7 +50,7 @@ class VmasGames(Batch):
         own = spaces.Box(-np.inf, np.inf, (self._width,), np.float32)
         action_space, self._masks = _row_actions(self._action_spaces)
         n_masked = None if self._masks is None else self._masks.shape[1]
-        super().__init__(env.num_envs, agents, RowSpaces(own, True, n_masked, is_dict=True), action_space, env)
+        super().__init__(env.num_envs, agents, TeamSpaces.of(own, len(agents), True, n_masked), action_space, env)
 
     @contextlib.contextmanager
     def _own_randomness(self) -> Iterator[None]:
