@@ -1,31 +1,32 @@
-"""Evaluation by team episodes: SB3's loop with one row per game instead of one row per agent."""
+"""Play and evaluation of team episodes. Letters: E games, N agents, B = E N rows."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, cast, overload
+from collections.abc import Callable, Iterator
+from inspect import signature
+from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
-from stable_baselines3.common.monitor import Monitor
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, STAGGERED, Array
-from sb3_saf.teams.vec_env import chosen_indices, find_n_agents, team_dones
+from sb3_saf.teams.vec_env import find_n_agents, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
 EvaluationCallback = Callable[[dict[str, Any], dict[str, Any]], None]
+#: Returns the actions (B, ...) of all rows, from their observations and whether an episode starts, (B,).
+Act = Callable[[Any, npt.NDArray[np.bool_]], Array]
 
 
 class Interval(NamedTuple):
@@ -107,7 +108,7 @@ def confidence_interval(values: npt.ArrayLike, confidence: float = 0.95) -> Inte
 
 class RandomPolicy:
     """
-    Baseline with uniformly random actions, legal ones only if observations have an ``action_mask``.
+    Baseline with uniformly random actions, legal ones only if observations have an ``action_mask`` or masks are given.
 
     :param action_space: one agent's action space, a Box must be bounded; or the environment that has it, for instance
         from ``make_team_env``
@@ -135,6 +136,7 @@ class RandomPolicy:
         state: State = None,
         episode_start: npt.NDArray[Any] | None = None,
         deterministic: bool = False,
+        action_masks: Array | None = None,
     ) -> tuple[Array, State]:
         """
         Draw an action for each row; see SB3's ``predict``.
@@ -143,18 +145,29 @@ class RandomPolicy:
         :param state: returned unchanged
         :param episode_start: unused
         :param deterministic: unused, a random policy has no most likely action
+        :param action_masks: (B, M) as for MaskablePPO: one flag per choice, those of each action dimension in turn
         :return: actions (B, ...), and ``state``
         """
+        masks = action_masks
         if isinstance(observation, dict) and ACTION_MASK_KEY in observation:
-            return self._draw_legal(observation[ACTION_MASK_KEY]), state
+            rows = observation[ACTION_MASK_KEY]
+            masks = rows if masks is None else np.logical_and(rows, masks)
+        if masks is not None:
+            return self._draw_legal(np.asarray(masks)), state
         rows = observation[AGENT_KEY] if isinstance(observation, dict) else observation
         return self._draw(len(rows)), state
 
     def _draw_legal(self, masks: Array) -> Array:
-        """Draw actions (B,) of a Discrete(A) space, each uniform over the ones in its row of masks (B, A)."""
-        assert isinstance(self.action_space, spaces.Discrete)
+        """Draw actions (B, ...), in each dimension uniform over the choices allowed by its part of masks (B, M)."""
+        space = self.action_space
+        assert not isinstance(space, spaces.Box), "Box actions have no masks"
         keys = np.where(masks, self._rng.random(masks.shape), -1.0)
-        return keys.argmax(axis=1) + self.action_space.start
+        if isinstance(space, spaces.Discrete):
+            return keys.argmax(axis=1) + space.start
+        sizes = space.nvec.reshape(-1) if isinstance(space, spaces.MultiDiscrete) else np.full(space.shape, 2)
+        choices = [part.argmax(axis=1) for part in np.split(keys, np.cumsum(sizes.reshape(-1))[:-1], axis=1)]
+        actions = np.stack(choices, axis=1).reshape(len(masks), *space.shape)
+        return (actions + getattr(space, "start", 0)).astype(space.dtype)
 
     def _draw(self, n_rows: int) -> Array:
         space, rng = self.action_space, self._rng
@@ -184,64 +197,77 @@ def _action_space_of(env: Any) -> spaces.Space[Any]:
     )
 
 
-class _GameRows(VecEnvWrapper):
+class PlayedStep(NamedTuple):
     """
-    Wrapper with unchanged rows of observations and actions, but rewards, dones and infos per game, so that code that
-    counts episodes by dones, such as SB3's ``evaluate_policy``, treats a game as an environment.
+    One step of all games.
 
-    :param venv: rows of flattened teams
-    :param n_agents: N
-    """
-
-    def __init__(self, venv: VecEnv, n_agents: int) -> None:
-        super().__init__(venv)
-        self._n_agents = n_agents
-        self.num_envs = venv.num_envs // n_agents
-        self._monitored = is_vecenv_wrapped(venv, TeamMonitor)
-
-    def reset(self) -> VecEnvObs:
-        return self.venv.reset()
-
-    def step_wait(self) -> VecEnvStepReturn:
-        obs, rewards, dones, infos = self.venv.step_wait()
-        returns = rewards.reshape(-1, self._n_agents).sum(axis=1, dtype=np.float64)
-        of_games = [_whole(info) for info in infos[:: self._n_agents]]
-        return obs, returns, team_dones(dones, self._n_agents), of_games
-
-    def env_is_wrapped(
-        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
-    ) -> list[bool]:
-        """Return True for SB3's Monitor if there is a TeamMonitor, so that SB3 uses its unmodified episodes."""
-        return [self._monitored and wrapper_class is Monitor for _ in chosen_indices(indices, self.num_envs)]
-
-
-def _whole(info: dict[str, Any]) -> dict[str, Any]:
-    """Return the info without its episode if that was cut short: only whole episodes count."""
-    return {key: value for key, value in info.items() if key != "episode"} if STAGGERED in info else info
-
-
-class _GamePredictor:
-    """
-    Model wrapper that expands episode starts from games to rows, as recurrent policies need.
-
-    :param model: any object with SB3's ``predict``
-    :param n_agents: N
+    :param observations: of the B rows, in which the agents acted
+    :param actions: (B, ...)
+    :param following: observations after the step
+    :param rewards: (B,) as the outermost wrapper gives them
+    :param dones: (B,) bool
+    :param infos: of the B rows
+    :param ended: (E,) bool, games whose episode ended with this step
+    :param counted: (E,) bool, games whose episode counts: each plays its share of the episodes
     """
 
-    def __init__(self, model: PolicyPredictor, n_agents: int) -> None:
-        self._model = model
-        self._n_agents = n_agents
+    observations: Any
+    actions: Array
+    following: Any
+    rewards: Array
+    dones: npt.NDArray[np.bool_]
+    infos: list[dict[str, Any]]
+    ended: npt.NDArray[np.bool_]
+    counted: npt.NDArray[np.bool_]
 
-    def predict(
-        self,
-        observation: Observation,
-        state: State = None,
-        episode_start: npt.NDArray[Any] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[Array, State]:
-        if episode_start is not None:
-            episode_start = np.repeat(episode_start, self._n_agents)
-        return self._model.predict(observation, state, episode_start, deterministic)
+
+def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
+    """
+    Play team episodes step by step; everything that plays games of teams does it here.
+
+    Episodes are divided evenly over the games beforehand, as in SB3: taking the first to finish would favour short
+    ones. Episodes that were cut short (``make_team_env(..., stagger=True)``) are not counted.
+
+    :param env: vector environment of teams, which is reset
+    :param act: returns the actions (B, ...) of all rows, from their observations and whether an episode starts, (B,)
+    :param n_episodes: team episodes to play
+    """
+    n_agents = _team_size(env)
+    n_games = env.num_envs // n_agents
+    remaining = (n_episodes + np.arange(n_games)) // n_games
+    observations: Any = env.reset()
+    starts = np.ones(env.num_envs, dtype=np.bool_)
+    while remaining.any():
+        actions = act(observations, starts)
+        following, rewards, row_dones, infos = env.step(actions)
+        dones = np.asarray(row_dones, dtype=np.bool_)
+        ended = team_dones(dones, n_agents)
+        yield PlayedStep(observations, actions, following, rewards, dones, infos, ended, remaining > 0)
+        whole = [ended[game] and STAGGERED not in infos[game * n_agents] for game in range(n_games)]
+        remaining = np.maximum(remaining - whole, 0)
+        observations, starts = following, dones
+
+
+def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False) -> Act:
+    """
+    Return the function for :func:`play` by which a model acts, with memory, and with the games' action masks.
+
+    :param model: any object with SB3's ``predict``; masks are passed if ``predict`` has ``action_masks``
+    :param env: the games
+    :param deterministic: whether the model takes its most likely actions
+    """
+    policy = getattr(model, "policy", model)
+    takes_masks = isinstance(policy, MaskableActorCriticPolicy) or "action_masks" in signature(model.predict).parameters
+    asks_for_masks = takes_masks and is_masking_supported(env)
+    state: State = None
+
+    def act(observations: Any, starts: npt.NDArray[np.bool_]) -> Array:
+        nonlocal state
+        masks = {"action_masks": get_action_masks(env)} if asks_for_masks else {}
+        actions, state = model.predict(observations, state, starts, deterministic, **masks)
+        return actions
+
+    return act
 
 
 def evaluate_team(
@@ -254,50 +280,54 @@ def evaluate_team(
     warn: bool = True,
 ) -> EvaluationResult:
     """
-    Play team episodes.
+    Play team episodes (see :func:`play`), with the action masks of the games.
 
-    Episodes are divided evenly over the games beforehand, as in SB3; taking the first to finish would favour short
-    ones.
-
-    :param model: any object with SB3's ``predict``, for instance an algorithm, a policy or a ``RandomPolicy``
+    :param model: any object with SB3's ``predict``, for instance an algorithm, a policy or a ``RandomPolicy``. If the
+        games have masks outside their observations (``action_masks()``), they go to ``predict(...,
+        action_masks=...)`` of models that take them, such as those of MaskablePPO
     :param env: vector environment of teams, for instance from ``make_team_env``
     :param n_eval_episodes: team episodes to play
     :param deterministic: whether the model takes its most likely actions
     :param render: whether to render after each step
-    :param callback: called with ``locals(), globals()`` for each game after each step, as in SB3; ``info`` is agent
-        0's, ``reward`` the team's
+    :param callback: called with ``locals(), globals()`` for each game after each step, as in SB3; ``i`` is the game,
+        ``info`` agent 0's, ``reward`` the team's, ``done`` whether the episode ended
     :param warn: warn if there is no TeamMonitor, so that returns are those of the outermost wrapper
     :return: team returns and lengths in game steps, in the order in which the episodes ended
     :raises ValueError: if ``env`` has no teams
     """
     check_count("n_eval_episodes", n_eval_episodes)
     n_agents = _team_size(env)
-    if warn and not is_vecenv_wrapped(env, TeamMonitor):
+    monitored = is_vecenv_wrapped(env, TeamMonitor)
+    if warn and not monitored:
         warnings.warn(
             "The environment has no TeamMonitor: returns and lengths are counted as the outermost wrapper gives them. "
             "Build it with sb3_saf.make_team_env, or put sb3_saf.TeamMonitor around the flattened teams.",
             UserWarning,
             stacklevel=2,
         )
+    n_games = env.num_envs // n_agents
+    returns: list[float] = []
+    lengths: list[int] = []
     successes: list[bool] = []
-
-    def note_success(local: dict[str, Any], of_module: dict[str, Any]) -> None:
-        if local["done"] and (won := local["info"].get(IS_SUCCESS)) is not None:
-            successes.append(bool(won))
-        if callback is not None:
-            callback(local, of_module)
-
-    returns, lengths = evaluate_rows(
-        cast(PolicyPredictor, _GamePredictor(model, n_agents)),
-        _GameRows(env, n_agents),
-        n_eval_episodes,
-        deterministic=deterministic,
-        render=render,
-        callback=note_success,
-        return_episode_rewards=True,
-        warn=False,
-    )
-    return EvaluationResult([float(value) for value in returns], [int(value) for value in lengths], tuple(successes))  # type: ignore[union-attr]
+    returns_now, lengths_now = np.zeros(n_games), np.zeros(n_games, dtype=np.int64)
+    for step in play(env, actions_of(model, env, deterministic), n_eval_episodes):
+        rewards = step.rewards.reshape(n_games, n_agents).sum(axis=1, dtype=np.float64)
+        returns_now += rewards
+        lengths_now += 1
+        for i in np.flatnonzero(step.counted).tolist():
+            info, reward, done = step.infos[i * n_agents], float(rewards[i]), bool(step.ended[i])
+            if callback is not None:
+                callback(locals(), globals())
+            if not done or STAGGERED in info:
+                continue
+            returns.append(float(info["episode"]["r"] if monitored else returns_now[i]))
+            lengths.append(int(info["episode"]["l"] if monitored else lengths_now[i]))
+            if (won := info.get(IS_SUCCESS)) is not None:
+                successes.append(bool(won))
+        returns_now[step.ended], lengths_now[step.ended] = 0, 0
+        if render:
+            env.render()
+    return EvaluationResult(returns, lengths, tuple(successes))
 
 
 def _team_size(env: VecEnv) -> int:
@@ -308,35 +338,6 @@ def _team_size(env: VecEnv) -> int:
             "sb3_saf.make_team_env(...), or use stable_baselines3.common.evaluation.evaluate_policy for single agents"
         )
     return n_agents
-
-
-@overload
-def evaluate_policy(
-    model: PolicyPredictor,
-    env: VecEnv,
-    n_eval_episodes: int = ...,
-    deterministic: bool = ...,
-    render: bool = ...,
-    callback: EvaluationCallback | None = ...,
-    reward_threshold: float | None = ...,
-    return_episode_rewards: Literal[False] = ...,
-    warn: bool = ...,
-) -> tuple[float, float]: ...
-
-
-@overload
-def evaluate_policy(
-    model: PolicyPredictor,
-    env: VecEnv,
-    n_eval_episodes: int = ...,
-    deterministic: bool = ...,
-    render: bool = ...,
-    callback: EvaluationCallback | None = ...,
-    reward_threshold: float | None = ...,
-    *,
-    return_episode_rewards: Literal[True],
-    warn: bool = ...,
-) -> tuple[list[float], list[int]]: ...
 
 
 def evaluate_policy(
@@ -351,17 +352,10 @@ def evaluate_policy(
     warn: bool = True,
 ) -> tuple[float, float] | tuple[list[float], list[int]]:
     """
-    Evaluate a policy as SB3's ``evaluate_policy``, but by team episodes and team returns.
+    Evaluate as SB3's ``evaluate_policy``, but by team episodes and team returns; see :func:`evaluate_team`.
 
-    :param model: see :func:`evaluate_team`
-    :param env: see :func:`evaluate_team`
-    :param n_eval_episodes: team episodes to play
-    :param deterministic: see :func:`evaluate_team`
-    :param render: see :func:`evaluate_team`
-    :param callback: see :func:`evaluate_team`
     :param reward_threshold: lower limit of the mean team return
     :param return_episode_rewards: return the lists instead of their mean and standard deviation
-    :param warn: see :func:`evaluate_team`
     :return: mean and standard deviation of the team return, or the list of team returns and that of lengths
     :raises ValueError: if ``env`` has no teams or the mean is not above ``reward_threshold``
     """

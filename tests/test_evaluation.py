@@ -1,19 +1,23 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_saf import inspect_team, make_team_env, ppo_settings, replay
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
@@ -24,6 +28,7 @@ from sb3_saf.evaluation import (
     evaluate_policy,
     evaluate_team,
 )
+from tests.contrib_teams import choices_of, is_allowed
 from tests.team_venv import Array, TeamVenv
 
 
@@ -75,9 +80,9 @@ class TestEvaluatePolicy:
     def test_short_episodes_are_not_favoured(self) -> None:
         # The first four episodes to end would include three or four of the short game, with a mean of 3 x (1 to 3.25).
         env = teams(lengths=(10, 1), reward=constant(1, 1))
-        returns, lengths = evaluate_policy(StillPolicy(), env, 4, return_episode_rewards=True)
-        assert sorted(returns) == [3, 3, 30, 30]
-        assert sorted(lengths) == [1, 1, 10, 10]
+        result = evaluate_team(StillPolicy(), env, 4)
+        assert sorted(result.returns) == [3, 3, 30, 30]
+        assert sorted(result.lengths) == [1, 1, 10, 10]
 
     @pytest.mark.parametrize(
         ("n_episodes", "per_game"), [(1, [0, 0, 1]), (2, [0, 1, 1]), (3, [1, 1, 1]), (7, [2, 2, 3])]
@@ -151,7 +156,7 @@ class TestEvaluatePolicy:
         with pytest.raises(ValueError, match=message):
             evaluate_policy(StillPolicy(), env, 2)
         with pytest.raises(ValueError, match="got str; build it"):
-            evaluate_policy(StillPolicy(), "TeamTogether", 2)  # type: ignore[call-overload]
+            evaluate_policy(StillPolicy(), "TeamTogether", 2)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("n_episodes", [0, -1, 2.5, True])
     def test_number_of_episodes(self, n_episodes: Any) -> None:
@@ -232,6 +237,108 @@ def _ends(space: Any) -> list[tuple[float, float]]:
     if isinstance(space, spaces.MultiBinary):
         return [(0, 1)] * 3
     return list(zip(space.low.reshape(-1), space.high.reshape(-1), strict=True))
+
+
+class MaskedGame(ParallelEnv[str, Any, Any]):
+    """Two agents, six steps; the only legal action changes at every step, and another one ends the game by an error."""
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "masked"}
+    possible_agents: ClassVar[list[str]] = ["a", "b"]
+    render_mode = "rgb_array"
+
+    def __init__(self, action_space: spaces.Space[Any], masks: str) -> None:
+        self.legal, self.masks = action_space, masks
+        if masks == "method":
+            self.action_masks = self._masks
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        own = spaces.Box(-1, 1, (2,), np.float32)
+        n_choices = sum(choices_of(self.legal))
+        if self.masks != "observation":
+            return own
+        return spaces.Dict({"observation": own, "action_mask": spaces.MultiBinary(n_choices)})
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return self.legal
+
+    def _mask(self) -> Array:
+        return np.concatenate([np.arange(n) == self.steps % n for n in choices_of(self.legal)]).astype(np.int8)
+
+    def _masks(self) -> dict[str, Array]:
+        return {agent: self._mask().astype(bool) for agent in self.agents}
+
+    def _seen(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        own: Any = np.zeros(2, np.float32)
+        if self.masks == "observation":
+            own = {"observation": own, "action_mask": self._mask()}
+        info = {"action_mask": self._mask()} if self.masks == "info" else {}
+        return dict.fromkeys(self.agents, own), {agent: dict(info) for agent in self.agents}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.agents, self.steps = ["a", "b"], 0
+        return self._seen()
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        for action in actions.values():
+            assert is_allowed(self.legal, np.asarray(action)[None], self._mask()[None] != 0).all(), (self.steps, action)
+        self.steps += 1
+        observations, infos = self._seen()
+        over, team = self.steps == 6, list(self.agents)
+        self.agents = [] if over else team
+        return observations, dict.fromkeys(team, 1.0), dict.fromkeys(team, over), dict.fromkeys(team, False), infos
+
+    def render(self) -> Array:
+        return np.zeros((4, 4, 3), np.uint8)
+
+
+class Script:
+    """A scripted team that takes the first legal action."""
+
+    def predict(
+        self, observation: Any, state: Any, episode_start: Any, deterministic: bool, action_masks: Any = None
+    ) -> Any:
+        masks = observation.get("action_mask") if action_masks is None else action_masks
+        return np.asarray(masks).argmax(axis=1), state
+
+
+SPACES = {"discrete": spaces.Discrete(3), "multi": spaces.MultiDiscrete([2, 3]), "binary": spaces.MultiBinary(2)}
+
+
+class TestMasks:
+    """Whatever plays a model whose game has masks plays legally: an illegal action fails in the game."""
+
+    def model(self, space: spaces.Space[Any], masks: str) -> Any:
+        env = make_team_env(partial(MaskedGame, space, masks), 2, seed=0)
+        if masks == "method":
+            return MaskablePPO("MAPPOMaskablePolicy", env, n_steps=8, batch_size=32, n_epochs=1, seed=0).learn(32)
+        return PPO("MAPPOPolicy", env, **ppo_settings(env, n_steps=8, n_epochs=1), seed=0).learn(32)
+
+    @pytest.mark.parametrize("space", SPACES)
+    def test_masks_of_the_method(self, space: str, tmp_path: Path) -> None:
+        model = self.model(SPACES[space], "method")
+        self.play_all(model, tmp_path)
+
+    @pytest.mark.parametrize("masks", ["info", "observation"])
+    def test_masks_in_rows(self, masks: str, tmp_path: Path) -> None:
+        self.play_all(self.model(SPACES["discrete"], masks), tmp_path)
+
+    def play_all(self, model: Any, folder: Path) -> None:
+        env = model.get_env()
+        env.render_mode = "rgb_array"
+        players = [model, model.policy, RandomPolicy(env, seed=0)]
+        if isinstance(env.action_space, spaces.Discrete):
+            players.append(Script())
+        for player in players:
+            for deterministic in (True, False):
+                assert evaluate_team(player, env, 3, deterministic).returns == [12, 12, 12]
+        inspect_team(model, env, 2)
+        replay(model, env, folder / "replay.html")
+
+    def test_best_models_are_chosen_by_legal_play(self) -> None:
+        env = make_team_env(partial(MaskedGame, SPACES["multi"], "method"), 2, seed=9)
+        callback = TeamEvalCallback(env, n_eval_episodes=3, eval_freq=8, verbose=0)
+        self.model(SPACES["multi"], "method").learn(64, callback)
+        assert callback.best_mean_reward == 12
 
 
 class TestTeamEvalCallback:

@@ -17,6 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.evaluation import PlayedStep, play
 from sb3_saf.inspection.calibration import lambda_returns
 from sb3_saf.inspection.games import Picture, ZoneFunction, Zones, draws_pictures, picture, zone_function, zones_now
 from sb3_saf.inspection.reading import (
@@ -32,7 +33,7 @@ from sb3_saf.policies.base import TeamMaskablePolicy
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY
-from sb3_saf.teams.vec_env import require_n_agents, team_dones
+from sb3_saf.teams.vec_env import require_n_agents
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -123,80 +124,80 @@ def record_episodes(
     :param pictures: whether to draw the first game, if its render mode allows it
     :raises ValueError: if the policy is not of this package or ``env`` has no teams
     """
-    ours, n_agents = require_our_policy(policy), require_n_agents(env)
+    ours = require_our_policy(policy)
     check_count("n_eval_episodes", n_eval_episodes)
-    n_games = env.num_envs // n_agents
-    shares = (n_eval_episodes + np.arange(n_games)) // n_games
     reader = reader_of(ours, env.num_envs, deterministic)
-    recorder = _Recorder(env, reader, shares, zone_function(env, zones), normalizer, observations)
+    recorder = _Recorder(env, reader, zone_function(env, zones), normalizer, observations)
     was_training = ours.training
     ours.set_training_mode(False)
     try:
         with own_randomness(seed, ours.device):
-            recorder.play(seed, pictures and draws_pictures(env))
+            recorder.play(n_eval_episodes, seed, pictures and draws_pictures(env))
     finally:
         ours.set_training_mode(was_training)
     return recorder.recording(gamma)
 
 
 class _Recorder:
-    """Recorder that plays ``shares`` (E,) episodes of each game and collects the results of every step."""
+    """Recorder that plays episodes and collects the results of every step."""
 
     def __init__(
         self,
         env: VecEnv,
         reader: PolicyReader | QReader,
-        shares: Ints,
         zones: ZoneFunction | None,
         normalizer: VecNormalize | None,
         observations: bool,
     ) -> None:
-        self.env, self.reader, self.shares, self.zones, self.normalizer = env, reader, shares, zones, normalizer
+        self.env, self.reader, self.zones, self.normalizer = env, reader, zones, normalizer
         self.keeps_observations = observations
-        self.n_agents = env.num_envs // len(shares)
-        self.episodes = np.zeros(len(shares), dtype=np.int64)
-        self.returns_now, self.lengths_now = np.zeros(len(shares)), np.zeros(len(shares), dtype=np.int64)
+        self.n_agents = require_n_agents(env)
+        n_games = env.num_envs // self.n_agents
+        self.returns_now, self.lengths_now = np.zeros(n_games), np.zeros(n_games, dtype=np.int64)
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self.pictures: list[Picture] = []
         self.readings: list[StepReading] = []
         self.columns: dict[str, list[npt.NDArray[Any]]] = {}
 
-    def play(self, seed: int, draw: bool) -> None:
-        """Play until every game has played its share."""
+    def play(self, n_episodes: int, seed: int, draw: bool) -> None:
+        """Play episodes, and collect the results of every step."""
         self.env.seed(seed)
-        obs = self.env.reset()
-        starts = np.ones(self.env.num_envs, dtype=bool)
-        first = int(np.flatnonzero(self.shares)[0])
-        while (self.episodes < self.shares).any():
-            if draw and first == 0 and self.episodes[0] == 0:
-                frame = picture(self.env)
-                self.pictures += [] if frame is None else [frame]
-            obs, starts = self._step(obs, starts)
+        is_first = draw and n_episodes >= len(self.lengths_now)
 
-    def _step(self, obs: Any, starts: Bools) -> tuple[Any, Bools]:
-        policy = self.reader.policy
-        counted = np.repeat(self.episodes < self.shares, self.n_agents) & _active(obs, self.n_agents)
-        zones = None if self.zones is None else zones_now(self.zones, self.env)
-        asks = isinstance(policy, TeamMaskablePolicy) and is_masking_supported(self.env)
-        masks = get_action_masks(self.env) if asks else None
-        reading = self.reader.step(_tensors(policy, obs), starts, masks)
-        following, rewards, dones, infos = self.env.step(reading.actions)
-        dones = np.asarray(dones, dtype=bool)
-        raw = self.env.get_original_reward() if isinstance(self.env, VecNormalize) else np.array(rewards)
+        def act(obs: Any, starts: Bools) -> npt.NDArray[Any]:
+            if is_first and (frame := picture(self.env)) is not None:
+                self.pictures.append(frame)
+            if self.zones is not None:
+                self._keep("zones", zones_now(self.zones, self.env))
+            policy = self.reader.policy
+            masks = get_action_masks(self.env) if asks_for_masks else None
+            self.readings.append(self.reader.step(_tensors(policy, obs), starts, masks))
+            return self.readings[-1].actions
+
+        asks_for_masks = isinstance(self.reader.policy, TeamMaskablePolicy) and is_masking_supported(self.env)
+        for step in play(self.env, act, n_episodes):
+            self._collect(step)
+            is_first = is_first and bool(step.counted[0]) and not step.ended[0]
+
+    def _collect(self, step: PlayedStep) -> None:
+        counted = np.repeat(step.counted, self.n_agents) & _active(step.observations, self.n_agents)
+        raw = self.env.get_original_reward() if isinstance(self.env, VecNormalize) else np.array(step.rewards)
         learned = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
-        self.readings.append(reading)
+        of_team, dones = self.reader.of_team, step.dones
         self._keep("counted", counted)
-        self._keep("rewards", self._team_sums(learned) if self.reader.of_team else learned)
+        self._keep("rewards", self._team_sums(learned) if of_team else learned)
         # An agent's return ends with its own end, as in TeamRolloutBuffer.
-        self._keep("ends", dones if self.reader.of_team else dones | ~_active(following, self.n_agents))
-        self._keep("last_values", _last_values(self.reader, dones, infos))
-        if zones is not None:
-            self._keep("zones", zones)
+        self._keep("ends", dones if of_team else dones | ~_active(step.following, self.n_agents))
+        self._keep("last_values", _last_values(self.reader, dones, step.infos))
         if self.keeps_observations:
-            self._keep("observations", np.array(obs[OBS_KEY]))
-        self._count(raw, dones, counted)
-        return following, dones
+            self._keep("observations", np.array(step.observations[OBS_KEY]))
+        playing = counted.reshape(-1, self.n_agents).any(axis=1)
+        self.returns_now += raw.reshape(-1, self.n_agents).sum(axis=1, dtype=np.float64)
+        self.lengths_now += 1
+        self.returns += self.returns_now[step.ended & playing].tolist()
+        self.lengths += self.lengths_now[step.ended & playing].tolist()
+        self.returns_now[step.ended], self.lengths_now[step.ended] = 0, 0
 
     def _keep(self, name: str, column: npt.NDArray[Any]) -> None:
         self.columns.setdefault(name, []).append(column)
@@ -205,17 +206,6 @@ class _Recorder:
         """Return the team's reward in each of its rows, (B,)."""
         teams: Floats = rewards.reshape(-1, self.n_agents).sum(axis=1, keepdims=True)
         return np.repeat(teams, self.n_agents, axis=1).reshape(-1)
-
-    def _count(self, rewards: Floats, dones: Bools, counted: Bools) -> None:
-        """Update the returns and lengths of episodes."""
-        playing = counted.reshape(-1, self.n_agents).any(axis=1)
-        self.returns_now += rewards.reshape(-1, self.n_agents).sum(axis=1, dtype=np.float64)
-        self.lengths_now += 1
-        ended = team_dones(dones, self.n_agents)
-        self.returns += self.returns_now[ended & playing].tolist()
-        self.lengths += self.lengths_now[ended & playing].tolist()
-        self.returns_now[ended], self.lengths_now[ended] = 0, 0
-        self.episodes += ended
 
     def recording(self, gamma: float) -> EpisodeRecording:
         """Return the recording of all steps so far."""

@@ -22,13 +22,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_saf.evaluation import PlayedStep, play
 from sb3_saf.export.actor import Actor
 from sb3_saf.inspection.film import png
-from sb3_saf.inspection.games import draws_pictures, picture
+from sb3_saf.inspection.games import Picture, draws_pictures, picture
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import OBS_KEY, TeamSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, OBS_KEY, TeamSpaces
 from sb3_saf.teams.vec_env import require_n_agents
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
@@ -135,7 +136,7 @@ def _play(
 ) -> list[_Episode]:
     """Return one episode of each of the first games."""
     if isinstance(player, Actor):
-        return [_play_actor(player, env, game, seed, deterministic) for game in range(episodes)]
+        return _play_actor(player, env, episodes, seed, deterministic)
     policy = player.policy if isinstance(player, BaseAlgorithm) else player
     discount = float(getattr(player, "gamma", 1.0)) if gamma is None else gamma
     n_games = env.num_envs // require_n_agents(env)
@@ -172,36 +173,39 @@ def _share(shares: npt.NDArray[Any] | None, steps: slice, rows: slice | int) -> 
     return None if shares is None else _packed(shares[steps, rows] * _SHARE, "u2", 1 / _SHARE)
 
 
-def _play_actor(actor: Actor, env: VecEnv, game: int, seed: int, deterministic: bool) -> _Episode:
-    """Play one episode with an exported actor on own observations and agent indices."""
-    n = require_n_agents(env)
-    rows = slice(game * n, (game + 1) * n)
+def _play_actor(actor: Actor, env: VecEnv, episodes: int, seed: int, deterministic: bool) -> list[_Episode]:
+    """Play one episode of each game with an exported actor, on own observations and masks."""
     if actor.has_memory or actor.manifest.reads_agent:
         raise ValueError(
             "expected an exported actor without memory and heads per agent to replay; replay the model that it "
             "was exported from"
         )
-    actions: list[npt.NDArray[Any]] = []
-    rewards: list[float] = []
-    views: list[npt.NDArray[Any]] = []
-    frames: list[str] = []
-    done = False
+    n_agents, frames = require_n_agents(env), []
+
+    def act(obs: Any, starts: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        if draws_pictures(env) and (frame := picture(env)) is not None:
+            frames.append(frame)
+        return np.asarray(actor.act(obs[OBS_KEY], deterministic, action_mask=obs.get(ACTION_MASK_KEY)))
+
     with own_randomness(seed, th.device("cpu")):
         env.seed(seed)
-        obs: Any = env.reset()
-        while not done and len(actions) < MAX_STEPS:
-            frame = picture(env) if draws_pictures(env) and game == 0 else None
-            frames += [] if frame is None else [_data_url(frame)]
-            views.append(np.array(obs[OBS_KEY][rows]))
-            taken = np.asarray(actor.act(obs[OBS_KEY], deterministic=deterministic))
-            obs, reward, dones, _ = env.step(taken)
-            actions.append(taken[rows])
-            rewards.append(float(reward[rows].sum()))
-            done = bool(dones[rows].all())
-    arrays: dict[str, Packed | None] = {"actions": _packed(np.stack(actions), "u1")}
-    if _atlas(env) is not None:
-        arrays["views"] = _packed(np.stack(views), "u1")
-    return _Episode(np.stack(actions), np.array(rewards), arrays, frames)
+        steps = list(play(env, act, env.num_envs // n_agents))
+    return [_episode_of_actor(steps, game, n_agents, frames, _atlas(env) is not None) for game in range(episodes)]
+
+
+def _episode_of_actor(
+    steps: list[PlayedStep], game: int, n_agents: int, frames: list[Picture], has_codes: bool
+) -> _Episode:
+    rows = slice(game * n_agents, (game + 1) * n_agents)
+    length = next(number for number, step in enumerate(steps, 1) if step.ended[game])
+    played = steps[: min(length, MAX_STEPS)]
+    actions = np.stack([step.actions[rows] for step in played])
+    arrays: dict[str, Packed | None] = {"actions": _packed(actions, "u1")}
+    if has_codes:
+        arrays["views"] = _packed(np.stack([step.observations[OBS_KEY][rows] for step in played]), "u1")
+    rewards = np.array([float(step.rewards[rows].sum()) for step in played])
+    pictures = [_data_url(frame) for frame in frames[: len(played)]] if game == 0 else []
+    return _Episode(actions, rewards, arrays, pictures)
 
 
 # --- the data of the page ---------------------------------------------------------------------------------------------
