@@ -1,0 +1,102 @@
+"""Files that appear at once or not at all, JSON, and comparison of descriptions by name."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+#: Begin of the names of temporary files; one that a killed process leaves may be removed.
+TEMPORARY_PREFIX: Final = ".writing-"
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """
+    Open a temporary file that replaces a file when it is complete and on disk; after an error the old one is kept.
+
+    :raises OSError: with the path, for instance if the disk is full
+    """
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OSError(error.errno, f"cannot write {path}: {error.strerror or error}") from error
+        raise
+    with contextlib.suppress(OSError):  # Windows cannot open folders
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # the new name is on disk
+        finally:
+            os.close(folder)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file atomically."""
+    with atomic_file(path) as file:
+        file.write(text.encode("utf-8"))
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write a value atomically as indented JSON; see :func:`plain`."""
+    write_text(path, json.dumps(value, indent=2, default=str) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file; the ValueError for any other content, or none, names the file."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds no JSON object")
+    return content
+
+
+def plain(value: Any) -> Any:
+    """Convert a value to what JSON gives back: tuples become lists, paths text."""
+    return json.loads(json.dumps(value, default=str))
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file; it is computed again when size or time of the file have changed."""
+    status = path.stat()
+    return _digest(path, status.st_size, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=100_000)
+def _digest(path: Path, size: int, changed: int) -> str:
+    with path.open("rb") as file:
+        result = hashlib.sha256()
+        while block := file.read(1 << 20):
+            result.update(block)
+    return result.hexdigest()
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], most: int = 3) -> str:
+    """Describe the differences between two mappings with dotted names, at most ``most`` of them; empty if equal."""
+    before, after = dict(_flat(old)), dict(_flat(new))
+    changed = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+    named = [f"{key} was {before.get(key)!r}, now {after.get(key)!r}" for key in changed[:most]]
+    more = len(changed) - len(named)
+    return ", ".join(named) + (f", and {more} more" if more else "")
+
+
+def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in nested.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
