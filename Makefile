@@ -11,7 +11,7 @@ RUN = $(VENV)/bin/python -m
 # What training needs, and everything: linters, Sphinx, Ray, notebooks, ...
 TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
-BASELINES = $(VENV)/.baselines
+GRIDWORLDS = $(VENV)/.gridworlds
 
 .PHONY: help install train test bench docs notebooks check format-check lint types format clean distclean
 
@@ -33,7 +33,7 @@ check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, noteboo
 	@$(MAKE) --no-print-directory notebooks
 	@$(MAKE) --no-print-directory test
 
-bench: $(INSTALLED) $(BASELINES) ## measure speed beside other gridworlds; writes benchmarks/results.md
+bench: $(GRIDWORLDS) ## measure speed beside other gridworlds; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
 
 docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors, and check their links
@@ -82,11 +82,10 @@ $(INSTALLED): $(TRAINING)
 	@touch $@
 
 # What cannot be installed is left out of the benchmarks, which say so.
-$(BASELINES): $(INSTALLED) benchmarks/install_baselines.py
+$(GRIDWORLDS): $(INSTALLED)
 	@echo "== install other gridworlds into $(VENV)"
 	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[bench]' || \
 	    echo "The extra [bench] could not be installed." >&2
-	@$(RUN) benchmarks.install_baselines
 	@touch $@
 
 clean: ## remove caches and what was built

@@ -1,11 +1,10 @@
 """
-Measure the speed of the HECOGrid environments on one core, compared with a memory copy and installed third-party
-gridworlds; seconds to the first step; memory of a rollout.
+Measure the speed of HECOGrid on one core, beside a memory copy and the third-party gridworlds that are installed.
 
-``python -m benchmarks.environments`` prints tables and writes them to ``benchmarks/results.md``. Medians and spread
-over rounds in which all rows take turns, so that changes of the machine's speed affect all of them. 128 games of 10
-agents on a 30 x 30 grid, 100 treasures, random actions, resets included, unless a row says otherwise;
-:mod:`benchmarks.baselines` has the settings of the others.
+``python -m benchmarks.environments`` (``make bench``) prints a table and writes it to ``benchmarks/results.md``.
+Medians and spread over rounds in which all rows take turns, so that changes of the machine's speed affect all of them.
+128 games of 10 agents on a 30 x 30 grid, 100 treasures, random actions, resets included, unless a row says otherwise.
+The others have settings as close to these as they allow: views of 7 x 7 cells, episodes of 50 steps.
 """
 
 from __future__ import annotations
@@ -14,41 +13,67 @@ import argparse
 import contextlib
 import os
 import platform
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 import sb3_saf
-from benchmarks.baselines import BASELINES
-from benchmarks.batches import N_GAMES, batch_work
-from benchmarks.first_call import first_call_table
-from benchmarks.rates import Rate, Work, one_line, random_actions, rate, table, take_turns
-from benchmarks.rollout_memory import memory_table
-from benchmarks.two_threads import threads_table
-from benchmarks.workers import Worker
-from hecogrid_envs import TASK_NAMES, parallel_env
-from sb3_saf import make_vec_env
+from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, parallel_env
 
-ROUNDS = 7
-SECONDS = 0.3
-RESULTS = Path(__file__).parent / "results.md"
-COPY = "copy"
-SECOND_PROCESSOR = """128 games on two threads, beside two processes with 64 games each, which share nothing: what the
-machine's second processor was worth while this ran. Medians and quartiles of ratios within a round."""
+#: Does some work and returns the number of agent-steps.
+Work = Callable[[], int]
+
+N_GAMES: Final = 128
+N_AGENTS: Final = 10
+GRID_SIZE: Final = 30
+MAX_CYCLES: Final = 50
+#: Cells that an agent sees in every direction: views of 7 x 7.
+SIGHT: Final = 3
+COPY: Final = "copy of the bytes of rgb views"
+RESULTS: Final = Path(__file__).parent / "results.md"
 
 
-def vec_env_work(venv: Any) -> Work:
-    """Step an SB3 VecEnv."""
-    venv.reset()
-    actions = random_actions((64, venv.num_envs))
+def random_actions(shape: tuple[int, ...], n_actions: int = 7) -> Iterator[Any]:
+    """
+    Yield actions drawn beforehand, endlessly.
+
+    :param shape: number of actions, then the shape of one
+    :param n_actions: exclusive upper bound of the actions
+    """
+    actions = np.random.default_rng(0).integers(0, n_actions, size=shape)
+    while True:
+        yield from actions
+
+
+def batch_work(task: str, observation: str, n_games: int = N_GAMES, **params: Any) -> Work:
+    """Step and observe a batch, whose games reset at their time limit."""
+    all_params = HECOGridParams.from_kwargs({"observation": observation, **params})
+    batch = GameBatch(task, all_params, n_games)
+    batch.reset(seeds=sb3_saf.game_seeds(0, n_games))
+    out = batch.observe()
+    actions = random_actions((64, n_games, all_params.n_agents))
 
     def work() -> int:
-        venv.step(next(actions))
-        return int(venv.num_envs)
+        batch.advance(next(actions), out)
+        return n_games * all_params.n_agents
+
+    return work
+
+
+def vec_env_work(make: Callable[[], Any]) -> Work:
+    """Step an SB3 VecEnv."""
+    env = make()
+    env.reset()
+    actions = random_actions((64, env.num_envs))
+
+    def work() -> int:
+        env.step(next(actions))
+        return int(env.num_envs)
 
     return work
 
@@ -57,20 +82,12 @@ def parallel_env_work() -> Work:
     """Step one PettingZoo game with its dicts."""
     env = parallel_env("TeamSupport")
     env.reset(seed=0)
-    actions = iter(random_actions((64, 10)))
-
-    def work() -> int:
-        if not env.agents:
-            env.reset()
-        env.step(dict(zip(env.agents, next(actions).tolist(), strict=True)))
-        return 10
-
-    return work
+    return _parallel_work(env, n_actions=7)
 
 
 def copy_work() -> Work:
     """Copy as many bytes as 1,280 rgb views take, a lower bound."""
-    source = np.ones((N_GAMES * 10, 2352), dtype=np.uint8)
+    source = np.ones((N_GAMES * N_AGENTS, 2352), dtype=np.uint8)
     target = np.empty_like(source)
 
     def work() -> int:
@@ -80,99 +97,200 @@ def copy_work() -> Work:
     return work
 
 
+def pursuit() -> Work:
+    """Step Pursuit of PettingZoo's SISL with 10 pursuers on its own map of 16 x 16."""
+    import pettingzoo
+
+    env: Any = pettingzoo.make("parallel", "sisl/pursuit_v5", n_pursuers=N_AGENTS, max_cycles=MAX_CYCLES)
+    env.reset(seed=0)
+    return _parallel_work(env, n_actions=5)
+
+
+def _parallel_work(env: Any, n_actions: int) -> Work:
+    actions = random_actions((64, N_AGENTS), n_actions)
+
+    def work() -> int:
+        if not env.agents:
+            env.reset()
+        agents = list(env.agents)
+        env.step(dict(zip(agents, next(actions).tolist()[: len(agents)], strict=True)))
+        return len(agents)
+
+    return work
+
+
+def minigrid() -> Work:
+    """Step MiniGrid: one agent, rgb partial view with tiles of 4 pixels, the size of HECOGrid's."""
+    import gymnasium
+    from minigrid.wrappers import RGBImgPartialObsWrapper
+
+    env = RGBImgPartialObsWrapper(gymnasium.make("MiniGrid-FourRooms-v0", max_steps=MAX_CYCLES), tile_size=4)
+    return _gymnasium_work(env, random_actions((4096,)), n_agents=1)
+
+
+def foraging() -> Work:
+    """
+    Step level-based foraging on 30 x 30, with 10 foods.
+
+    Vectors (a position and a level for each food and player) instead of grids, which fail with Gymnasium 1; fewer foods
+    and vectors are both faster.
+    """
+    from lbforaging.foraging import ForagingEnv
+
+    env = ForagingEnv(
+        players=N_AGENTS,
+        min_player_level=1,
+        max_player_level=2,
+        min_food_level=1,
+        max_food_level=None,
+        field_size=(GRID_SIZE, GRID_SIZE),
+        max_num_food=10,
+        sight=SIGHT,
+        max_episode_steps=MAX_CYCLES,
+        force_coop=False,
+    )
+    return _gymnasium_work(env, random_actions((64, N_AGENTS), n_actions=6), N_AGENTS)
+
+
+def _gymnasium_work(env: Any, actions: Iterator[Any], n_agents: int) -> Work:
+    env.reset(seed=0)
+
+    def work() -> int:
+        _, _, terminated, truncated, _ = env.step(next(actions).tolist())
+        if terminated or truncated:
+            env.reset()
+        return n_agents
+
+    return work
+
+
+def jaxmarl_work(task: str, **params: Any) -> Work:
+    """Step 128 games of JaxMARL (``vmap`` in ``jit``), with automatic resets."""
+    import jax
+    import jaxmarl
+
+    env = jaxmarl.make(task, max_steps=MAX_CYCLES, **params)
+    split = jax.random.split
+    _, state = jax.jit(jax.vmap(env.reset))(split(jax.random.key(0), N_GAMES))
+
+    @jax.jit
+    def step(key: Any, state: Any, actions: Any) -> Any:
+        key, now = split(key)
+        by_agent = {agent: actions[i] for i, agent in enumerate(env.agents)}
+        return key, *jax.vmap(env.step)(split(now, N_GAMES), state, by_agent)
+
+    actions = random_actions((64, env.num_agents, N_GAMES), int(env.action_space(env.agents[0]).n))
+    key = jax.random.key(1)
+
+    def work() -> int:
+        nonlocal key, state
+        key, _, state, *_ = jax.block_until_ready(step(key, state, next(actions)))
+        return N_GAMES * int(env.num_agents)
+
+    return work
+
+
+#: Third-party gridworlds by the title of their row.
+BASELINES: Final[dict[str, Callable[[], Work]]] = {
+    "PettingZoo SISL pursuit, 10 pursuers, 16 x 16": pursuit,
+    "MiniGrid, 1 agent, rgb partial, 4 px": minigrid,
+    "LBF, 10 players, 30 x 30": foraging,
+    "JaxMARL overcooked, 128 games of 2 agents, 4 x 5": partial(jaxmarl_work, "overcooked"),
+    "JaxMARL overcooked_v2, 128 games of 2 agents, 7 x 7 views": partial(
+        jaxmarl_work, "overcooked_v2", agent_view_size=SIGHT
+    ),
+}
+
+
 def programs() -> dict[str, Callable[[], Work]]:
-    """Return the programs of this package, and the copy."""
-
-    def team_env() -> Any:
-        return sb3_saf.make_team_env("TeamSupport", n_envs=N_GAMES, seed=0)
-
+    """Return what is measured, by title."""
     large: dict[str, Any] = {"n_agents": 1000, "grid_size": 300, "n_treasures": 10_000}
-    rows: dict[str, Callable[[], Work]] = {}
-    for observation in ("tiles", "rgb"):
-        for task in TASK_NAMES:
-            rows[f"batch, {observation}, {task}"] = partial(batch_work, task, observation)
-    return rows | {
-        "batch, tiles, TeamSupport, two threads": lambda: batch_work("TeamSupport", "tiles", n_threads=2),
-        "batch, rgb, TeamSupport, two threads": lambda: batch_work("TeamSupport", "rgb", n_threads=2),
-        "batch, tiles, TeamSupport, 1 game, N = 1000, 300 x 300": lambda: batch_work(
-            "TeamSupport", "tiles", n_games=1, **large
+    make_vec_env = partial(sb3_saf.make_vec_env, "TeamSupport", seed=0)
+    return {
+        **{
+            f"batch, {observation}, {task}": partial(batch_work, task, observation)
+            for observation in ("tiles", "rgb")
+            for task in TASK_NAMES
+        },
+        "batch, tiles, TeamSupport, 1 game, N = 1000, 300 x 300": partial(
+            batch_work, "TeamSupport", "tiles", n_games=1, **large
         ),
-        "VecEnv.step, tiles": lambda: vec_env_work(make_vec_env("TeamSupport", N_GAMES, seed=0, observation="tiles")),
-        "VecEnv.step, tiles, joint view and monitor": lambda: vec_env_work(team_env()),
+        "VecEnv.step, tiles": lambda: vec_env_work(partial(make_vec_env, n_envs=N_GAMES, observation="tiles")),
+        "VecEnv.step, tiles, joint view and monitor": lambda: vec_env_work(
+            lambda: sb3_saf.make_team_env("TeamSupport", n_envs=N_GAMES, seed=0)
+        ),
         "parallel_env, rgb": parallel_env_work,
-        "SuperSuit, 8 games, rgb": lambda: vec_env_work(make_vec_env("TeamSupport", 8, seed=0, backend="supersuit")),
-        f"{COPY} of the bytes of rgb views": copy_work,
+        "SuperSuit, 8 games, rgb": lambda: vec_env_work(partial(make_vec_env, n_envs=8, backend="supersuit")),
+        COPY: copy_work,
+        **BASELINES,
     }
 
 
-def start_workers(stack: contextlib.ExitStack) -> dict[str, Worker]:
+def rate(work: Work, seconds: float) -> float:
     """
-    Start the installed baselines, and print which are missing.
+    Work for a while.
 
-    :param stack: ends them
-    :return: workers by the title of their row
+    :param seconds: minimum
+    :return: agent-steps per second
     """
-    workers: dict[str, Worker] = {}
-    for name, baseline in BASELINES.items():
+    start, n_done = time.perf_counter(), 0
+    while time.perf_counter() - start < seconds:
+        n_done += work()
+    return n_done / (time.perf_counter() - start)
+
+
+def measure(titles: dict[str, Callable[[], Work]], seconds: float, rounds: int) -> dict[str, list[float]]:
+    """
+    Measure every program once per round, after a round of warm-up; a message names programs that cannot run.
+
+    :param titles: programs by title
+    :param seconds: per program and round
+    :param rounds: that count
+    :return: agent-steps per second of every round, by title
+    """
+    works = {}
+    for title, make in titles.items():
         try:
-            worker = stack.enter_context(Worker(name))
-        except (ImportError, RuntimeError) as error:
-            print(f"left out: {baseline.title} ({one_line(error)})", flush=True)
-            continue
-        workers[baseline.title] = worker
-    return workers
+            works[title] = make()
+        except Exception as error:  # raised by third-party libraries
+            print(f"left out: {title} ({type(error).__name__}: {str(error).splitlines()[0][:200]})", flush=True)
+    measured = [{title: rate(work, seconds) for title, work in works.items()} for _ in range(rounds + 1)]
+    return {title: [rates[title] for rates in measured[1:]] for title in works}
 
 
-def speed_table(seconds: float, rounds: int) -> str:
-    """
-    Measure all rows in turns.
-
-    :param seconds: per row and round
-    :return: Markdown
-    """
-    with contextlib.ExitStack() as stack:
-        rates: dict[str, Rate] = {name: partial(rate, make()) for name, make in programs().items()}
-        workers = start_workers(stack)
-        rates |= {title: worker.rate for title, worker in workers.items()}
-        found = table(take_turns(rates, seconds, rounds), COPY)
-    versions = {BASELINES[worker.name].distribution: worker.version for worker in workers.values()}
-    return f"{found}\n\nOthers: {', '.join(f'{name} {number}' for name, number in versions.items()) or 'none'}."
+def table(rates: dict[str, list[float]]) -> str:
+    """Format rates as Markdown: median, spread, and the ratio to the copy."""
+    copy = float(np.median(rates[COPY]))
+    lines = ["| what | agent-steps/s | lowest - highest | ratio to the copy |", "| --- | --- | --- | --- |"]
+    for title, values in rates.items():
+        median = float(np.median(values))
+        lines.append(f"| {title} | {median:,.0f} | {min(values):,.0f} - {max(values):,.0f} | {median / copy:.3g} |")
+    return "\n".join(lines)
 
 
 def machine() -> str:
     """Describe processor and versions."""
-    versions = ", ".join(f"{name} {version(name)}" for name in ("numba", "numpy", "torch", "stable-baselines3"))
-    hardware = f"{processor()}, {os.cpu_count()} cores, {platform.machine()}, {platform.system()}"
-    return f"Python {platform.python_version()}, {versions}; {hardware}"
-
-
-def processor() -> str:
-    """Return the processor's name, if Linux provides it."""
+    processor = platform.processor() or "unknown processor"
     with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or "unknown processor"
+        models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+        processor = models[0].partition(":")[2].strip() if models else processor
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numba", "numpy", "torch", "stable-baselines3"))
+    return f"Python {platform.python_version()}, {versions}; {processor}, {platform.system()}"
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="per row and round")
-    parser.add_argument("--rounds", type=int, default=ROUNDS)
-    parser.add_argument("--starts", type=int, default=3, help="cold starts, each compiles the kernels")
+    parser.add_argument("--seconds", type=float, default=0.3, help="per row and round")
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--output", type=Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    sections = {
-        "Environments": speed_table(options.seconds, options.rounds),
-        "A second processor": SECOND_PROCESSOR + "\n\n" + threads_table(),
-        "First step": first_call_table(options.starts),
-        "Memory of a rollout, bytes per agent-step": memory_table(),
-    }
-    text = "\n\n".join(f"## {title}\n\n{section}" for title, section in sections.items())
-    head = f"`python -m benchmarks.environments`: medians of {options.rounds} rounds, of {options.starts} starts."
+    options = parser.parse_args()
+    if hasattr(os, "sched_setaffinity"):  # one core, before JAX starts its threads
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    text = table(measure(programs(), options.seconds, options.rounds))
     print(text)
-    options.output.write_text(f"# Results\n\n{head} {machine()}.\n\n{text}\n")
+    head = f"`python -m benchmarks.environments`: medians of {options.rounds} rounds on one core. {machine()}."
+    options.output.write_text(f"# Speed of the games\n\n{head}\n\n{text}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

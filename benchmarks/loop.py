@@ -5,8 +5,7 @@ Measure the training loop with few games and small networks: SB3's own PPO compa
 ``free``: games that take no time (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of 2 x
 64 without an encoder, for all, and SAF's pool, slots and widths of the zoo's size ``small``; 4 epochs, 4 minibatches.
 SB3 plays the same rows with its ``MlpPolicy``. ``small``: HECOGrid in the zoo's size ``small``, with the zoo's
-settings. ``growth``: cost by the number of agents, ``small`` with N agents and the same number of rows. ``import``:
-seconds of ``import sb3_saf``, compared with torch and SB3.
+settings. ``growth``: cost by the number of agents, ``small`` with N agents and the same number of rows.
 
 Processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of the rollout in
 milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole loop, and the
@@ -16,8 +15,6 @@ time of the whole loop as a multiple of the first program's.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -50,7 +47,6 @@ NARROW: Final[dict[str, Any]] = {"net_arch": [64, 64], "features_extractor_class
 POLICIES: Final = ("IPPO", "MAPPO", "SAF")
 GROWTH: Final = (2, 5, 10, 20, 50, 100)
 GROWTH_ROWS: Final = 100
-_SET_UP = "import time; start = time.perf_counter(); import {}; print(time.perf_counter() - start)"
 
 
 class FreeGames(VecEnv):
@@ -251,25 +247,14 @@ def print_growth(rounds: int) -> None:
         print(f"| {n_agents} | " + " | ".join(f"{1e6 * cost.whole:.0f}" for cost in found.values()) + " |", flush=True)
 
 
-def print_imports(rounds: int) -> None:
-    """Print wall-clock seconds of imports, the best of several, in separate processes."""
-    print("\n| import | seconds, best |\n| --- | --- |")
-    for modules in ("torch, stable_baselines3", "sb3_saf"):
-        command = [sys.executable, "-c", _SET_UP.format(modules)]
-        spent = [
-            float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) for _ in range(rounds)
-        ]
-        print(f"| {modules} | {min(spent):.2f} |", flush=True)
-
-
 def main() -> None:
     """Print the selected tables, by default all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=("free", "small", "growth", "import"))
+    parser.add_argument("--only", nargs="+", choices=("free", "small", "growth"))
     parser.add_argument("--games", nargs="+", type=int, default=list(N_STEPS), choices=list(N_STEPS), help="of free")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
-    wanted = options.only or ("free", "small", "growth", "import")
+    wanted = options.only or ("free", "small", "growth")
     th.set_num_threads(1)
     if "free" in wanted:
         for n_games in options.games:
@@ -279,8 +264,6 @@ def main() -> None:
         print_table("HECOGrid TeamSupport, size small", costs(models, options.rounds))
     if "growth" in wanted:
         print_growth(options.rounds)
-    if "import" in wanted:
-        print_imports(options.rounds)
 
 
 if __name__ == "__main__":

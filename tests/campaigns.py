@@ -173,7 +173,7 @@ def table(found: dict[str, Outcome], minutes: float) -> str:
         f"Commit {commit()}, {day}, Python {sys.version.split()[0]}, {total:.1f} minutes of processor time: "
         f"`python -m tests.campaigns --minutes {minutes:g}`",
         "",
-        "| number | of what | outcome | processor seconds |",
+        "| repetitions | campaign | outcome | processor seconds |",
         "| ---: | --- | --- | ---: |",
         *(f"| {o.tried} | {name} | {o.found} | {o.seconds:.0f} |" for name, o in found.items()),
     ]

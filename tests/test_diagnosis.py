@@ -65,19 +65,3 @@ def test_useless_commands_are_counted_by_zone() -> None:
     assert counted == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(2 / 3)}
     with_keys = diagnosis.useless_commands("KeyForTreasure", commands, zones)
     assert with_keys == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(1 / 3)}
-
-
-def test_a_folder_without_trained_teams_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["diagnosis", str(tmp_path / "nowhere")])
-    with pytest.raises(SystemExit, match="1"):
-        diagnosis.main()
-    assert "expected the folder of an experiment" in capsys.readouterr().err
-
-
-def test_a_folder_without_settings_is_an_error(tmp_path: Path) -> None:
-    save_team(tmp_path, "ippo", 0)
-    results = Results(tmp_path)
-    with pytest.raises(ValueError, match=r"settings\.json is missing"):
-        diagnosis.look(next(diagnosis.cells(results)), results, 1)

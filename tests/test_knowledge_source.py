@@ -146,7 +146,7 @@ def test_a_team_without_active_agents_gives_numbers(source: KnowledgeSource) -> 
 
 
 def test_cost_is_linear_in_the_number_of_agents() -> None:
-    """Multiply-adds, exactly; benchmarks.knowledge_source also measures seconds."""
+    """Multiply-adds, exactly."""
 
     def cost(n_agents: int) -> int:
         module = KnowledgeSource(n_agents, SIZE)

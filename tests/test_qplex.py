@@ -95,7 +95,7 @@ def learn_matrix(mixer: MixerName, seed: int, n_updates: int) -> float:
 
 
 def test_qplex_learns_the_joint_action_worth_8() -> None:
-    """20 of 20 seeds with ``python -m benchmarks.matrix_games`` (QMIX: 1, VDN: none; otherwise the payoff is 0)."""
+    """20 of 20 seeds (QMIX: 1, VDN: none; otherwise the payoff is 0), see docs/qplex.md."""
     assert learn_matrix("qplex", seed=0, n_updates=400) == 8.0
 
 
