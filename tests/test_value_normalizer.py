@@ -229,8 +229,9 @@ def test_old_values_are_what_the_unchanged_critic_says(name: str) -> None:
     for samples in model.rollout_buffer.get(30):
         values = model.policy.predict_values(samples.observations).flatten()
         th.testing.assert_close(samples.old_values, values, rtol=0, atol=1e-4)
-    # Error of the stored values: the statistics changed from those of arbitrary returns to the rollout's.
-    assert abs(model.rollout_buffer.values.mean() - values.detach().mean().item()) > 1.0
+    # Error of the stored values, far above the tolerance: the statistics changed from those of arbitrary returns to the
+    # rollout's.
+    assert abs(model.rollout_buffer.values.mean() - values.detach().mean().item()) > 100 * 1e-4
 
 
 @pytest.mark.parametrize("load", [False, True])
