@@ -6,11 +6,11 @@ Without Stable-Baselines3, only :class:`Actor` for exported actors is available.
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from typing import NoReturn
 
 from sb3_saf.export.actor import Actor
+from sb3_saf.teams import package_version
 from sb3_saf.teams.errors import ExportError
 
 
@@ -76,10 +76,7 @@ else:
         raise AttributeError(f"sb3_saf.{name} {needs}")
 
 
-try:
-    __version__ = version("sb3-saf")
-except PackageNotFoundError:  # run from a checkout without installation
-    __version__ = "0+unknown"
+__version__ = package_version()
 
 __all__ = [
     "QPLEX",

@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_saf.callbacks.entropy import EntropySchedule
 from sb3_saf.checkpoints.checks import check_keys, check_list, check_text, refused
 from sb3_saf.checkpoints.data import Tree
+from sb3_saf.teams import package_version
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.vec_env import game_seeds_of
 
@@ -161,10 +162,8 @@ def _plain(value: object) -> Tree:
 
 def software() -> dict[str, str]:
     """Return versions and the number of threads."""
-    from sb3_saf import __version__  # the package imports this module
-
     return {
-        "sb3_saf": __version__,
+        "sb3_saf": package_version(),
         "stable_baselines3": stable_baselines3.__version__,
         "torch": th.__version__,
         "numpy": np.__version__,

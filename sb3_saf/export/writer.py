@@ -41,6 +41,7 @@ from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.teams import package_version
 from sb3_saf.teams.errors import ExportError
 
 
@@ -186,11 +187,9 @@ class _Described(NamedTuple):
 
     def manifest(self, policy: ExportablePolicy, data: dict[str, DataFile]) -> Manifest:
         """Make the manifest of some files."""
-        from sb3_saf import __version__
-
         complete = WEIGHTS_FILE in data
         return Manifest(
-            sb3_saf_version=__version__,
+            sb3_saf_version=package_version(),
             policy=type(policy).__name__,
             n_agents=policy.team_spaces.n_agents,
             reads_agent=self.actor.reads_agent,
