@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from sb3_saf.checkpoints.checks import check_array, check_range, check_whole
 from sb3_saf.teams.checks import check_choice
+from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -82,7 +83,11 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         names = names if names is not None and len(names) == n_agents else None
         raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
         state = None if raw.state is None else channels_first(raw.state)
-        team = TeamSpaces.of(channels_first(raw.own), n_agents, raw.has_active, raw.n_masked_actions, state, names)
+        own = channels_first(raw.own)
+        conversions: tuple[AgentConversion, ...] | None = getattr(venv, "conversions", None)
+        if conversions is not None and own is not raw.own:
+            conversions = tuple(one.with_channels_first() for one in conversions)
+        team = TeamSpaces.of(own, n_agents, raw.has_active, raw.n_masked_actions, state, names, conversions)
         if _sb3_would_transpose(team):
             venv = _protected_from_transposition(venv, n_agents)
             raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)

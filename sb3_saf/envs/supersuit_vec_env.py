@@ -22,6 +22,7 @@ from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_
 from sb3_saf.envs.supersuit_games import GameSource, Question, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.conversion import AgentConversion, conversions_of
 from sb3_saf.teams.rows import Array
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
@@ -83,7 +84,7 @@ class SuperSuitVecEnv(TeamVecEnv):
     ) -> None:
         n_games = check_count("n_games", n_games)
         n_cpus = min(check_count("n_cpus", n_cpus), n_games)
-        source, form = _source_and_form(make_env, n_cpus, Signals(active, action_masks, state))
+        source, form, self.conversions = _source_and_form(make_env, n_cpus, Signals(active, action_masks, state))
         self.possible_agents = list(form.agents)
         self._game_action_space = form.action_space
         self._closed = self._begun = self._has_warned = False
@@ -252,20 +253,24 @@ class SuperSuitVecEnv(TeamVecEnv):
         return self._ask_rows(indices, game_layers.is_wrapped, *names)
 
 
-def _source_and_form(make_env: MakeEnv, n_cpus: int, signals: Signals) -> tuple[GameSource, GameForm]:
-    """Determine the form of the game from an example, and return it with the source of the games."""
+def _source_and_form(
+    make_env: MakeEnv, n_cpus: int, signals: Signals
+) -> tuple[GameSource, GameForm, tuple[AgentConversion, ...]]:
+    """Determine form and conversions of the game from an example, and return them with the source of the games."""
     is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
     example: Any = make_env() if is_factory else make_env
     check_is_parallel(example, is_factory)
     try:
         source = GameSource(make_env, is_factory, n_cpus)
         form = game_form(example, partial(first_infos_of, source.build), signals)
+        game, row_actions = getattr(example, "unequal", example), counted_from_zero(form.action_space)
+        conversions = conversions_of(game, form.rows.own, row_actions, form.masks == "info" and game is example)
     finally:
         if is_factory:
             # Games may require a reset before they are closed; the example has none.
             with suppress(Exception):
                 example.close()
-    return source, form
+    return source, form, conversions
 
 
 def _in_games_form(space: spaces.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:

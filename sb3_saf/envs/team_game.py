@@ -59,6 +59,8 @@ class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
 
     def __init__(self, env: ParallelEnv[Any, Any, Any]) -> None:
         super().__init__(env)
+        #: The game, whose agents have different spaces.
+        self.unequal = env
         agents = env.possible_agents
         observed = {agent: env.observation_space(agent) for agent in agents}
         #: Agents whose observations have PettingZoo's form for masks.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Final, Literal, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -18,6 +19,7 @@ from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.networks.spaces import pixels_to_codes
 from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -35,6 +37,29 @@ _CLASSIC: Final = {"observation", ACTION_MASK_KEY}
 Observation = np.ndarray | Mapping[str, Any]
 ChunkSize: TypeAlias = int | Literal["auto"] | None
 _CHUNK_OF_CONVOLUTIONS: Final = 512
+
+
+class Given(NamedTuple):
+    """
+    What a game gives some agents, as rows.
+
+    :param rows: entries of the rows
+    :param action_masks: (B, M), masks of policies of MaskablePPO whose rows have none
+    :param conversions: of the rows' agents; None if rows are the game's
+    :param agents: their names; None for one agent without name
+    """
+
+    rows: dict[str, np.ndarray]
+    action_masks: np.ndarray | None
+    conversions: Sequence[AgentConversion] | None
+    agents: list[Any] | None
+
+    def actions_of_game(self, actions: np.ndarray) -> Any:
+        """Convert actions of the rows to those of the game: by agent, or the one agent's."""
+        of_game = list(actions)
+        if self.conversions is not None:
+            of_game = [one.game_action(action) for one, action in zip(self.conversions, actions, strict=True)]
+        return of_game[0] if self.agents is None else dict(zip(self.agents, of_game, strict=True))
 
 
 class TeamRowsPolicy(BasePolicy):
@@ -107,71 +132,145 @@ class TeamRowsPolicy(BasePolicy):
 
     # --- inputs of predict ------------------------------------------------------------------------------------------
 
-    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        **kwargs: Any,
+    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
         """
-        Act as SB3's ``predict``; also on the observations of a PettingZoo environment.
+        Act as SB3's ``predict``: on rows, or on what the game itself gives.
 
-        :param observation: rows, some of their entries, only own observations, or ``{agent: observation}`` of a
-            ParallelEnv, of some or all of its agents in any order. Agents are found by their names; if the training
-            environment had no names, an actor that reads the index needs all agents in index order. Observations have
-            the space of the rows' own (``make_team_env`` flattens Dicts and pads agents with other spaces). A model
-            trained on tile codes also takes the pixels of the same game
-        :param args: state, episode_start, deterministic as in SB3
-        :param kwargs: the same, and ``action_masks`` of MaskablePPO
-        :return: actions and the next state; ``{agent: action}`` for ``{agent: observation}``
+        :param observation: rows, some of their entries, or only own observations; or the game's own
+
+            - ``{agent: observation}`` of some or all agents in any order, as ``reset`` and ``step`` of a ParallelEnv
+              give them. Without names (some engines have none), an actor that reads the index needs all agents in index
+              order
+            - ``(observations, infos)``, both by agent, where action masks are in infos
+            - one agent's observation, if its form tells which kind of agent it is; an actor that depends on the agent
+              needs ``{agent: observation}``
+
+            The game's Dicts, Tuples, unequal spaces and channel-last pictures become rows as in ``make_team_env``, and
+            actions are those of the game. A model trained on tile codes also takes the pixels of the same game
+        :param state: as in SB3
+        :param episode_start: as in SB3
+        :param deterministic: as in SB3
+        :param kwargs: ``action_masks`` of MaskablePPO, for rows or in the form of the observation
+        :return: actions and the next state; ``{agent: action}`` for observations by agent
         """
-        if not self.is_by_agent(observation):
-            return super().predict(observation, *args, **kwargs)
-        actions, state = self.predict(self.rows_of(observation), *args, **kwargs)
-        return dict(zip(observation, actions, strict=True)), state
+        given = self.given_by_game(observation, kwargs.get("action_masks"))
+        if given is None:
+            return super().predict(observation, state, episode_start, deterministic, **kwargs)
+        masks = {} if given.action_masks is None else {"action_masks": given.action_masks}
+        actions, state = self.predict(given.rows, state, episode_start, deterministic, **masks)
+        return given.actions_of_game(actions), state
 
-    def is_by_agent(self, observation: object) -> bool:
-        """Return whether an observation is ``{agent: observation}`` of a ParallelEnv."""
-        return isinstance(observation, Mapping) and bool(observation) and not (set(observation) & (ALL_KEYS | _CLASSIC))
-
-    def rows_of(self, observations: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
         """
-        Stack observations by agent to rows.
+        Convert what a game gives to rows (see :meth:`predict`).
 
-        :param observations: ``{agent: observation}``
-        :raises ValueError: for unknown agents, and observations in another form than the rows' own
+        :param observation: rows, or observations of the game
+        :param action_masks: masks in the form of the observation; None for those in observations and infos
+        :return: None for rows
+        :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
         """
-        first = next(iter(observations.values()))
-        if isinstance(first, Mapping):
-            entries = [self._renamed(one) for one in observations.values()]
-            if unknown := [key for key in entries[0] if key not in self.team_spaces.keys]:
-                raise _not_as_rows(f"the keys {', '.join(map(repr, self.team_spaces.keys))}", repr(unknown[0]))
-            rows = {key: self._stacked([entry[key] for entry in entries]) for key in entries[0]}
-        else:
-            rows = {OBS_KEY: self._stacked(list(observations.values()))}
-        indices = self._indices_of(list(observations))
-        return rows if indices is None else {AGENT_KEY: indices, **rows}
-
-    def _stacked(self, values: list[Any]) -> np.ndarray:
-        arrays = [np.asarray(value) for value in values]
-        if len(shapes := {array.shape for array in arrays}) > 1:
-            raise _not_as_rows(f"one shape, that of rows, {self.team_spaces.own_shape}", str(sorted(shapes)))
-        return np.stack(arrays)
-
-    def _indices_of(self, agents: list[Any]) -> np.ndarray | None:
-        """Return the indices of agents by their names; without names, those of a whole team are in order."""
-        n_agents, names = self.team_spaces.n_agents, self.team_spaces.names
-        if len(agents) > n_agents:
-            raise ValueError(f"expected observations of at most {n_agents} agents, got {len(agents)}")
-        if names is None:
-            return np.arange(n_agents) if len(agents) == n_agents else None
-        if unknown := [agent for agent in agents if agent not in names]:
+        infos: Mapping[Any, Any] = {}
+        if (
+            isinstance(observation, tuple)
+            and len(observation) == 2
+            and all(isinstance(x, Mapping) for x in observation)
+        ):
+            observation, infos = observation
+        names, conversions = self.team_spaces.names, self.team_spaces.conversions
+        agents = self._agents_in(observation)
+        if agents is not None:
+            entries = [observation[agent] for agent in agents]
+            given = [(infos.get(agent) or {}).get(ACTION_MASK_KEY) for agent in agents]
+            if isinstance(action_masks, Mapping):
+                given = [action_masks[agent] for agent in agents]
+            indices = list(range(len(agents))) if names is None else [names.index(agent) for agent in agents]
+            known = indices if names is not None or len(agents) == self.team_spaces.n_agents else None
+            kinds = None if conversions is None else [conversions[index] for index in indices]
+            return self._given(entries, given, kinds, known, agents)
+        fitting = [] if conversions is None else [i for i, one in enumerate(conversions) if one.fits(observation)]
+        if conversions is None or not fitting:
+            return None
+        kind = conversions[fitting[0]]
+        if any(conversions[index] != kind for index in fitting):
+            if isinstance(observation, np.ndarray) and observation.shape == self.team_spaces.own_shape:
+                return None
+            agent = 0 if names is None else names[fitting[0]]
             raise ValueError(
-                f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, got "
-                f"{unknown[0]!r}"
+                f"expected to know whose observation this is, which several kinds of agents have; name the agent: "
+                f"predict({{{agent!r}: observation}})"
             )
-        return np.array([names.index(agent) for agent in agents])
+        return self._given([observation], [action_masks], [kind], fitting if len(fitting) == 1 else None, None)
 
-    def _renamed(self, entries: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Rename PettingZoo's keys to those of rows."""
-        if set(entries) != _CLASSIC or self.team_spaces.action_mask is None:
-            return entries
-        return {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
+    def _agents_in(self, observation: object) -> list[Any] | None:
+        """Return the agents of ``{agent: observation}``; None for any other observation."""
+        if not isinstance(observation, Mapping) or not observation:
+            return None
+        agents, names, n_agents = list(observation), self.team_spaces.names, self.team_spaces.n_agents
+        if names is None:
+            if set(agents) & (ALL_KEYS | _CLASSIC):
+                return None
+            if len(agents) > n_agents:
+                raise ValueError(f"expected observations of at most {n_agents} agents, got {len(agents)}")
+            return agents
+        unknown = [agent for agent in agents if agent not in names]
+        if not unknown:
+            return agents
+        conversions = self.team_spaces.conversions or ()
+        if set(agents) & (ALL_KEYS | _CLASSIC) or any(one.fits(observation) for one in conversions):
+            return None
+        raise ValueError(
+            f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, got "
+            f"{unknown[0]!r}"
+        )
+
+    def _given(
+        self,
+        entries: list[Any],
+        masks: list[Any],
+        conversions: Sequence[AgentConversion] | None,
+        indices: list[int] | None,
+        agents: list[Any] | None,
+    ) -> Given:
+        """Convert observations and masks of some agents; without ``conversions`` they have the form of rows."""
+        takes_masks = self.team_spaces.action_mask is not None or isinstance(self, MaskableActorCriticPolicy)
+        own: list[np.ndarray] = []
+        legal: list[Any] = []
+        for number, (entry, mask) in enumerate(zip(entries, masks, strict=True)):
+            try:
+                if conversions is None:
+                    inside = isinstance(entry, Mapping) and set(entry) == _CLASSIC
+                    own.append(np.asarray(entry["observation"] if inside else entry))
+                    legal.append(entry[ACTION_MASK_KEY] if inside and mask is None else mask)
+                    continue
+                conversion = conversions[number]
+                observation, inside_mask = conversion.split(entry)
+                own.append(conversion.own(observation))
+                if inside_mask is not None and conversion.mask_key is None and not takes_masks:
+                    raise ValueError(f"expected no {ACTION_MASK_KEY!r}, because this policy was trained without masks")
+                legal.append(inside_mask if mask is None else mask)
+                if self.team_spaces.action_mask is not None or (takes_masks and legal[-1] is not None):
+                    legal[-1] = conversion.mask(legal[-1])
+            except ValueError as error:
+                raise ValueError(
+                    f"observation of {'the agent' if agents is None else agents[number]}: {error}"
+                ) from None
+        if len(shapes := {array.shape for array in own}) > 1:
+            raise ValueError(
+                f"expected observations of one shape, that of rows, {self.team_spaces.own_shape}, got {sorted(shapes)}"
+            )
+        rows = {OBS_KEY: np.stack(own)} | ({} if indices is None else {AGENT_KEY: np.array(indices)})
+        has_masks = takes_masks and all(mask is not None for mask in legal)
+        given = np.stack([np.asarray(mask) for mask in legal]) if has_masks else None
+        if given is None or self.team_spaces.action_mask is None:
+            return Given(rows, given, conversions, agents)
+        return Given({**rows, ACTION_MASK_KEY: given}, None, conversions, agents)
 
     def obs_to_tensor(self, observation: Observation) -> tuple[PyTorchObs, bool]:
         """
@@ -181,8 +280,10 @@ class TeamRowsPolicy(BasePolicy):
             also in PettingZoo's form {"observation", "action_mask"}
         :return: dict of tensors with a batch axis, and whether the observation was a batch
         """
-        entries = self._renamed(observation if isinstance(observation, Mapping) else {OBS_KEY: observation})
+        entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
         keys = self.team_spaces.keys
+        if set(entries) == _CLASSIC and ACTION_MASK_KEY in keys:
+            entries = {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
         unknown = [key for key in entries if key not in keys]
         if unknown:
             raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
@@ -316,13 +417,6 @@ class TeamRowsPolicy(BasePolicy):
             return None
         has_convolutions = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
         return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
-
-
-def _not_as_rows(expected: str, got: str) -> ValueError:
-    return ValueError(
-        f"expected observations by agent with {expected}, got {got}; where make_team_env converts observations (Dicts, "
-        "agents with other spaces), act on its rows: env = make_team_env(...), model.predict(env.reset())"
-    )
 
 
 def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:

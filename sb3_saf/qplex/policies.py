@@ -215,22 +215,24 @@ class QPLEXPolicy(TeamRowsPolicy):
 
     def predict(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
+        observation: Any,
         state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
-    ) -> tuple[np.ndarray, State | None]:
+        **kwargs: Any,
+    ) -> tuple[Any, State | None]:
         """
-        Act greedily, as SB3's ``predict``.
+        Act greedily; see the base class.
 
         :param observation: rows, only own observations (and ``"agent"`` for memory or one head per agent), one or a
-            batch; or ``{agent: observation}``
+            batch; or what the game gives
         :param state: recurrent state after the last step: hidden state, cell state, last action. None at the start
         :param episode_start: (B,) where an episode starts, which resets the state
         :param deterministic: unused
+        :param kwargs: unused
         :return: actions (B,) and the next state
         """
-        if self.memory is None or self.is_by_agent(observation):
+        if self.memory is None or self.given_by_game(observation) is not None:
             return super().predict(observation, state, episode_start, deterministic)
         self.set_training_mode(False)
         obs, is_batch = self.obs_to_tensor(observation)

@@ -255,16 +255,16 @@ class QPLEX(OffPolicyAlgorithm):
         """
         Act from own observations.
 
-        :param observation: rows, only own observations, or ``{agent: observation}``; see :meth:`QPLEXPolicy.predict`
+        :param observation: rows, or observations of the game; see :meth:`TeamRowsPolicy.predict`
         :param state: state of policies with memory
         :param episode_start: (B,) where an episode starts
         :param deterministic: False explores with the current exploration rate, each agent independently
         :return: actions and the next state
         """
-        if self.policy.is_by_agent(observation):
-            rows = self.policy.rows_of(observation)
-            actions, state = self.predict(rows, state, episode_start, deterministic)
-            return dict(zip(observation, actions, strict=True)), state
+        given = self.policy.given_by_game(observation)
+        if given is not None:
+            actions, state = self.predict(given.rows, state, episode_start, deterministic)
+            return given.actions_of_game(actions), state
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
         if deterministic or not self.exploration_rate:
             return actions, state

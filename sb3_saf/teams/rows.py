@@ -17,6 +17,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 
+from sb3_saf.teams.conversion import AgentConversion
+
 TeamKey = Literal["obs", "team", "agent"]
 
 #: The row's own observation.
@@ -52,15 +54,22 @@ FIXED_SHAPE: Final = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary,
 
 class AgentSpace(spaces.Discrete):
     """
-    Discrete(N), the index of an agent in its team, with the agents' names.
+    Discrete(N), the index of an agent in its team, with the agents' names and conversions.
 
     :param n_agents: N
     :param names: PettingZoo's names of the agents in index order; None if they are unknown
+    :param conversions: of the agents' observations and actions in the game, in index order; None if rows are the game's
     """
 
-    def __init__(self, n_agents: int, names: Sequence[Any] | None = None) -> None:
+    def __init__(
+        self,
+        n_agents: int,
+        names: Sequence[Any] | None = None,
+        conversions: Sequence[AgentConversion] | None = None,
+    ) -> None:
         super().__init__(n_agents)
         self.names = None if names is None else tuple(names)
+        self.conversions = None if conversions is None else tuple(conversions)
 
 
 @dataclass(frozen=True)
@@ -83,6 +92,7 @@ class TeamSpaces:
     :param state: space of the game's state if rows have it
     :param names: the agents' names in index order, if they are known
     :param is_dict: whether rows below ``CentralizedValueWrapper`` are Dicts
+    :param conversions: of the agents' observations and actions in the game, in index order; None if rows are the game's
     """
 
     own: spaces.Space[Any]
@@ -92,6 +102,7 @@ class TeamSpaces:
     state: spaces.Space[Any] | None = None
     names: tuple[Any, ...] | None = None
     is_dict: bool = False
+    conversions: tuple[AgentConversion, ...] | None = None
 
     @classmethod
     def of(
@@ -102,6 +113,7 @@ class TeamSpaces:
         n_masked_actions: int | None = None,
         state: spaces.Space[Any] | None = None,
         names: Sequence[Any] | None = None,
+        conversions: Sequence[AgentConversion] | None = None,
     ) -> TeamSpaces:
         """
         Return the form of rows of a team whose agents share one observation space, which is checked.
@@ -112,13 +124,15 @@ class TeamSpaces:
         :param n_masked_actions: A if rows have action masks
         :param state: space of the game's state if rows have it
         :param names: the agents' names in index order, if they are known
+        :param conversions: of the agents' observations and actions in the game, in index order
         :raises ValueError: if ``own`` or ``state`` is another kind of space
         """
         bounds_of(own)
         if state is not None:
             _check_state(state)
         is_dict = active or n_masked_actions is not None or state is not None
-        return cls(own, n_agents, active, n_masked_actions, state, None if names is None else tuple(names), is_dict)
+        known, forms = (None if values is None else tuple(values) for values in (names, conversions))
+        return cls(own, n_agents, active, n_masked_actions, state, known, is_dict, forms)
 
     @classmethod
     def of_rows(
@@ -182,7 +196,8 @@ class TeamSpaces:
         ):
             raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
         n_masked = None if action_mask is None else action_mask.shape[0]
-        return cls.of(own, n_agents, active is not None, n_masked, state, getattr(agent, "names", None))
+        names, conversions = (getattr(agent, name, None) for name in ("names", "conversions"))
+        return cls.of(own, n_agents, active is not None, n_masked, state, names, conversions)
 
     @cached_property
     def team(self) -> spaces.Box:
@@ -193,7 +208,7 @@ class TeamSpaces:
     @cached_property
     def agent(self) -> AgentSpace:
         """Discrete(N), the agent's index (key ``"agent"``)."""
-        return AgentSpace(self.n_agents, self.names)
+        return AgentSpace(self.n_agents, self.names, self.conversions)
 
     @property
     def active(self) -> spaces.MultiBinary | None:
