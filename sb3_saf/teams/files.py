@@ -1,16 +1,20 @@
-"""Files that appear at once or not at all, JSON, and comparison of descriptions by name."""
+"""Files that appear at once or not at all, locks, JSON, and comparison of descriptions by name."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, Final
+
+import filelock
 
 #: Begin of the names of temporary files; one that a killed process leaves may be removed.
 TEMPORARY_PREFIX: Final = ".writing-"
@@ -21,19 +25,22 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """
     Open a temporary file that replaces a file when it is complete and on disk; after an error the old one is kept.
 
+    :param path: the file, of any writer that takes an open file, such as SB3's ``model.save``
     :raises OSError: with the path, for instance if the disk is full
     """
-    temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}-{path.name}")
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OSError(error.errno, f"cannot write {path}: {error.strerror or error}") from error
+        reason = error.__context__ if isinstance(error, RuntimeError) else error  # torch hides a full disk
+        if isinstance(reason, OSError):
+            number = reason.errno or errno.EIO
+            raise OSError(number, f"cannot write {path}: {reason.strerror or reason}") from error
         raise
     with contextlib.suppress(OSError):  # Windows cannot open folders
         folder = os.open(path.parent, os.O_RDONLY)
@@ -41,6 +48,29 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
             os.fsync(folder)  # the new name is on disk
         finally:
             os.close(folder)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files that killed processes left in a folder, while no other process writes there."""
+    for path in folder.glob(f"{TEMPORARY_PREFIX}*"):
+        path.unlink(missing_ok=True)
+
+
+def try_lock(path: Path) -> filelock.BaseFileLock | None:
+    """
+    Lock a file against other processes, and against other locks of this one.
+
+    :param path: the file of the lock; missing folders are created
+    :return: the lock, held until ``release()``, the end of this object, or that of the process; None if it is taken
+    :raises OSError: if the file cannot be written
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        return None
+    return lock
 
 
 def write_text(path: Path, text: str) -> None:
