@@ -28,7 +28,7 @@ from hecogrid_envs.task import TaskName, check_task
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.grid import Cell
 from sb3_saf.experiments.results import Results
-from sb3_saf.inspection.games import zones_by_attribute
+from sb3_saf.inspection.recording import zones_by_attribute
 
 _SETTING: Final = re.compile(r"(?P<task>\w+)-c(?P<c>\d+)-h(?P<h>\d+)(-n(?P<n>\d+))?")
 

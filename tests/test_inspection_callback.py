@@ -31,11 +31,9 @@ from sb3_saf import (
     inspect_team,
     make_team_env,
 )
-from sb3_saf.inspection import film
-from sb3_saf.inspection.calibration import calibrate, lambda_returns
-from sb3_saf.inspection.games import zone_function
-from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
-from sb3_saf.inspection.scalars import critic_scalars, message_scalars, pool_scalars
+from sb3_saf.inspection import figures
+from sb3_saf.inspection.recording import EpisodeRecording, lambda_returns, record_episodes, zones_by_attribute
+from sb3_saf.inspection.scalars import calibrate, critic_scalars, message_scalars, pool_scalars
 from sb3_saf.inspection.tensorboard import Line, line_of
 from sb3_saf.networks.actor import PolicyPool, PoolOutput
 from sb3_saf.policies.base import TeamPolicy
@@ -170,6 +168,10 @@ class TestPage:
             *("time/game_steps", "time/game_steps_per_second", "time/inspection_seconds", "time/inspection_share"),
         }
         assert expected <= set(page.Tags()["scalars"])
+        assert [event.histogram_value.num for event in page.Histograms("team/return_of_each_episode")] == [3] * 3
+        # Before, during and after training, on an axis of game steps as for what SB3 logs: a rollout has 20 game steps.
+        assert [event.step for event in page.Scalars("team/return")] == [0, 20, 40]
+        assert [event.step for event in page.Scalars("time/fps")] == [20, 40]
 
     def test_pictures(self, page: EventAccumulator) -> None:
         assert set(page.Tags()["images"]) == {
@@ -183,10 +185,6 @@ class TestPage:
         movie = Image.open(io.BytesIO(page.Images("episode/film")[-1].encoded_image_string))
         assert (movie.format, movie.n_frames) == ("GIF", LEVEL["max_cycles"])  # type: ignore[attr-defined]
 
-    def test_returns_of_episodes(self, page: EventAccumulator) -> None:
-        assert [event.histogram_value.num for event in page.Histograms("team/return_of_each_episode")] == [3] * 3
-        assert "rollout/team_return_of_each_episode" in page.Tags()["histograms"]
-
     def test_layout_and_hyperparameters(self, page: EventAccumulator) -> None:
         layout = page.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0].decode(errors="replace")
         for name in ("Team", "Policy pool", "Policy pool by zone", "Knowledge source", "Critic", "zone 1", "share of"):
@@ -199,11 +197,6 @@ class TestPage:
         text = page.Tensors("about/text_summary")[0].tensor_proto.string_val[0].decode()
         explained = set(re.findall(r"`([a-z_]+)/", text))
         assert groups(page.Tags()["scalars"]) <= explained
-
-    def test_before_during_and_after_training(self, page: EventAccumulator) -> None:
-        # A rollout has 20 game steps; what SB3 logs is on the same axis.
-        assert [event.step for event in page.Scalars("team/return")] == [0, 20, 40]
-        assert [event.step for event in page.Scalars("time/fps")] == [20, 40]
 
     def test_the_same_episodes_every_time(self, tmp_path: Path) -> None:
         still = InspectionCallback(ToyTeams(), every_game_steps=20, n_eval_episodes=6, pictures=False)
@@ -225,10 +218,8 @@ class _NoOptimizer(th.optim.SGD):
 @pytest.mark.parametrize(
     ("policy", "settings"),
     [
-        ("SAFPolicy", {}),
         ("SAFPolicy", {"selection": "gumbel"}),
-        ("SAFPolicy", {"normalize_values": True}),
-        ("MAPPOPolicy", {}),
+        ("MAPPOPolicy", {"normalize_values": True}),
     ],
 )
 def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settings: dict[str, Any]) -> None:
@@ -248,9 +239,8 @@ def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settin
         (A2C, "SAFPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
         (PPO, "SAFPolicy", {"n_policies": 1}, {"knowledge_source", "message"}),
         (PPO, "SAFPolicy", {"knowledge_source": False}, {"pool"}),
-        (PPO, "MAPPOPolicy", {}, set()),
         (RecurrentPPO, "SAFLstmPolicy", {"enable_critic_lstm": False}, {"pool", "knowledge_source", "message"}),
-        (RecurrentPPO, "IPPOLstmPolicy", {}, set()),
+        (PPO, "IPPOPolicy", {}, set()),
         (MaskablePPO, "SAFMaskablePolicy", {}, {"pool", "knowledge_source", "message"}),
     ],
 )
@@ -340,16 +330,6 @@ class TestCritic:
         policy.value_net = Always(2.0)
         assert critic_scalars(play(env, policy), 1.0)["critic/bias"] == pytest.approx(bias)
 
-    def test_values_are_the_policys(self) -> None:
-        env = ToyTeams()
-        policy = hand_made(SAFPolicy, env)
-        game = play(env, policy, n_episodes=4)
-        env.seed(3)
-        obs = env.reset()
-        with th.no_grad():
-            values = policy.predict_values({key: th.as_tensor(value) for key, value in obs.items()})  # type: ignore
-        np.testing.assert_allclose(game.values[0], values.flatten().numpy(), rtol=1e-6)
-
 
 class TestWhatCounts:
     def test_each_game_plays_its_share_of_episodes(self) -> None:
@@ -398,44 +378,28 @@ class PoolByZone(PolicyPool):
 
 
 class TestZones:
-    EXPECTED = {
-        "pool_by_zone/zone_0/policy_0": 0.2,
-        "pool_by_zone/zone_0/policy_1": 0.8,
-        "pool_by_zone/zone_1/policy_0": 0.9,
-        "pool_by_zone/zone_1/policy_1": 0.1,
-    }
-
-    @pytest.mark.parametrize("how", ["attribute", "function", "none"])
-    def test_a_pool_with_known_choices_gives_the_known_table(self, how: str) -> None:
+    @pytest.mark.parametrize("zones", [None, False])
+    def test_a_pool_with_known_choices_gives_the_known_table(self, zones: Any) -> None:
         env = make_team_env(ZonedProbe(length=2), n_envs=16)
         policy = hand_made(SAFPolicy, env, n_policies=2)
         policy.actor.__class__ = PoolByZone
-
-        def other_way_round(env: Any) -> Any:
-            return 1 - np.concatenate(env.get_attr("agent_zones", indices=range(0, env.num_envs, 2)))
-
-        zones = {"attribute": None, "function": other_way_round, "none": False}[how]
         scalars = pool_scalars(play(env, policy, 32, zones), env.action_space)
-        found = {tag: value for tag, value in scalars.items() if tag.startswith("pool_by_zone")}
-        expected = self.EXPECTED
-        if how == "function":
-            expected = {
-                tag.translate(
-                    str.maketrans("01", "10"),
-                ): 1 - value
-                for tag, value in expected.items()
-            }
-        assert found == pytest.approx({} if how == "none" else expected)
+        by_zone = {tag: value for tag, value in scalars.items() if tag.startswith("pool_by_zone")}
+        table = {
+            "pool_by_zone/zone_0/policy_0": 0.2,
+            "pool_by_zone/zone_0/policy_1": 0.8,
+            "pool_by_zone/zone_1/policy_0": 0.9,
+            "pool_by_zone/zone_1/policy_1": 0.1,
+        }
+        assert by_zone == pytest.approx({} if zones is False else table)
 
     def test_hecogrids_zones_are_those_of_the_agents_columns(self) -> None:
         env = make_team_env("TeamTogether", n_envs=5, seed=0, n_agents=4, grid_size=12, heterogeneity=3, n_treasures=4)
         env.reset()
-        function = zone_function(env, None)
-        assert function is not None
         columns = np.concatenate(
             [state["agent_pos"][:, 0] for state in env.env_method("get_state", indices=range(0, 20, 4))]
         )
-        np.testing.assert_array_equal(function(env), columns // 4)
+        np.testing.assert_array_equal(zones_by_attribute(env), columns // 4)
         assert len(env.get_attr("zone_colours", indices=[0])[0]) == 3
 
     def test_zones_that_are_no_zones_are_refused(self) -> None:
@@ -466,10 +430,6 @@ class TestMessages:
         scalars = message_scalars(play(env, policy, gamma=0.9))
         assert scalars["message/value_error_zeroed"] == pytest.approx(scalars["message/value_error"], rel=1e-5)
         assert scalars["message/value_error_shuffled"] == pytest.approx(scalars["message/value_error"], rel=1e-5)
-
-    def test_a_critic_without_messages_reports_none(self) -> None:
-        env = make_team_env(Message(n_agents=3), n_envs=4)
-        assert message_scalars(play(env, hand_made(IPPOPolicy, env))) == {}
 
     def test_a_single_game_has_nobody_to_shuffle_with(self) -> None:
         env = make_team_env(Message(n_agents=3), n_envs=1)
@@ -510,8 +470,8 @@ def test_environments_that_do_not_fit() -> None:
 
 def test_a_strip_has_six_moments_in_two_rows() -> None:
     frames = [np.full((40, 30, 3), shade, dtype=np.uint8) for shade in range(50)]
-    strip = film.strip(frames)
+    strip = figures.strip(frames)
     assert strip.shape == (2 * 40 + 6, 3 * 30 + 2 * 6, 3)
     assert strip[0, ::36, 0].tolist() == [0, 10, 20]
     assert strip[46, ::36, 0].tolist() == [29, 39, 49]
-    assert film.strip(frames[:2]).shape == (40, 2 * 30 + 6, 3)
+    assert figures.strip(frames[:2]).shape == (40, 2 * 30 + 6, 3)

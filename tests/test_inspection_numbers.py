@@ -10,17 +10,16 @@ import numpy.typing as npt
 import pytest
 from gymnasium import spaces
 
-from sb3_saf.inspection.calibration import calibrate, lambda_returns, reliability
-from sb3_saf.inspection.games import ReturnScale
-from sb3_saf.inspection.pool import (
-    chosen_by,
-    differences,
-    mean_difference,
-    selection_entropy,
+from sb3_saf.inspection.recording import EpisodeRecording, ReturnScale
+from sb3_saf.inspection.scalars import (
+    attention_of,
+    calibrate,
+    policy_distances,
+    pool_scalars,
+    selection_by_group,
+    team_scalars,
     zone_dependence,
 )
-from sb3_saf.inspection.recording import EpisodeRecording
-from sb3_saf.inspection.scalars import attention_of, pool_scalars, targets, team_scalars
 
 Array = npt.NDArray[Any]
 
@@ -74,13 +73,13 @@ class TestReturns:
         ],
     )
     def test_targets_by_hand(self, changes: dict[str, Any], lam: float, expected: list[list[float]]) -> None:
-        assert targets(recorded(**changes), lam).tolist() == expected
+        assert recorded(**changes).targets(lam).tolist() == expected
 
     def test_targets_in_between_are_gae_plus_values(self) -> None:
         rng = np.random.default_rng(0)
         values = rng.normal(size=(3, 2)).astype(np.float32)
-        one = recorded()
-        found = lambda_returns(one.rewards, one.ends, one.last_values, values, gamma=0.9, lam=0.7)
+        one = recorded(values=values, gamma=0.9)
+        found = one.targets(0.7)
         advantage = np.zeros(2)
         for t in (2, 1, 0):
             following = values[t + 1] if t < 2 else np.zeros(2)
@@ -106,10 +105,6 @@ class TestCalibration:
         assert calibrate(np.ones(3), np.arange(3.0)).slope is None
         assert calibrate(np.arange(3.0), np.ones(3)).explained_variance is None
 
-    def test_bins_hold_equally_many_values(self) -> None:
-        bins = reliability(np.array([4.0, 1.0, 2.0, 3.0]), np.array([40.0, 10.0, 20.0, 30.0]), n_bins=2)
-        assert bins == [(1.5, 15.0, 5.0), (3.5, 35.0, 5.0)]
-
 
 class TestSelection:
     #: Zone 0 uses policy 0, zone 2 policies 0 and 1 equally; zone 1 is empty, one row is in no zone.
@@ -117,21 +112,24 @@ class TestSelection:
     ZONES = np.array([0, 0, 2, -1])
 
     def test_the_table_of_zones(self) -> None:
-        table = chosen_by(self.WEIGHTS, self.ZONES, 3)
+        table = selection_by_group(self.WEIGHTS, self.ZONES, 3)
         np.testing.assert_array_equal(table, [[1, 0], [np.nan, np.nan], [0.5, 0.5]])
 
     @pytest.mark.parametrize(
         ("weights", "each", "mean"),
         [
-            ([[1, 0], [1, 0]], 0, 0),  # collapsed
-            ([[1, 0], [0, 1]], 0, 1),  # confident, and different
-            ([[0.5, 0.5], [0.5, 0.5]], 1, 1),  # blended
+            ([[1, 0], [1, 0], [1, 0]], 0, 0),  # collapsed
+            ([[1, 0], [0, 1], [1, 0]], 0, 0.918296),  # confident, and different
+            ([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5]], 1, 1),  # blended
         ],
     )
     def test_entropies_tell_collapse_confidence_and_blending_apart(
         self, weights: list[list[float]], each: float, mean: float
     ) -> None:
-        assert selection_entropy(np.array(weights)) == pytest.approx((each, mean))
+        pool = np.repeat(np.array(weights)[:, np.newaxis], 2, axis=1)
+        game = recorded(pool_weights=pool, pool_actions=np.zeros((3, 2, 2, 3)))
+        scalars = pool_scalars(game, spaces.Discrete(3))
+        assert (scalars["pool/entropy"], scalars["pool/entropy_of_mean"]) == pytest.approx((each, mean))
 
     def test_dependence_on_zones(self) -> None:
         zones = np.array([0, 0, 1, 1])
@@ -168,9 +166,8 @@ class TestSelection:
 class TestDifferences:
     def test_discrete(self) -> None:
         logits = np.log(np.array([[[0.5, 0.5, 1e-30], [0.5, 0.5, 1e-30], [1e-30, 1e-30, 1]]]))
-        table = differences(spaces.Discrete(3), logits)
+        table = policy_distances(spaces.Discrete(3), logits)
         np.testing.assert_allclose(table, [[0, 0, 1], [0, 0, 1], [1, 1, 0]], atol=1e-6)
-        assert mean_difference(table) == pytest.approx(2 / 3)
 
     @pytest.mark.parametrize(
         ("space", "one", "other", "joint"),
@@ -182,7 +179,7 @@ class TestDifferences:
     def test_several_dimensions_are_those_of_joint_actions(
         self, space: spaces.Space[Any], one: list[float], other: list[float], joint: tuple[int, int]
     ) -> None:
-        table = differences(space, np.array([[one, other]], dtype=float))
+        table = policy_distances(space, np.array([[one, other]], dtype=float))
         # Both spaces: (1/2, 1/2) twice against (1/4, 3/4) and (3/4, 1/4): four joint actions of probability 1/4.
         p, q = np.full(4, 0.25), np.array([3, 1, 9, 3]) / 16
         assert table[0, 1] == pytest.approx(math.sqrt(1 - np.sqrt(p * q).sum()))
@@ -192,7 +189,7 @@ class TestDifferences:
         p = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
         q = np.exp(-((x - 1) ** 2) / 8) / math.sqrt(8 * math.pi)
         overlap = np.sqrt(p * q).sum() * (x[1] - x[0])
-        table = differences(spaces.Box(-1, 1, (1,)), np.array([[[0, 0], [1, math.log(2)]]]))
+        table = policy_distances(spaces.Box(-1, 1, (1,)), np.array([[[0, 0], [1, math.log(2)]]]))
         assert table[0, 1] == pytest.approx(math.sqrt(1 - overlap), rel=1e-6)
 
 

@@ -95,6 +95,8 @@ def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
     recording = record_episodes(team, env, 8, seed=3, gamma=0.5)
     env.seed(3)
     assert recording.episode_returns == evaluate_team(team, env, 8).returns
+    assert recording.of_team  # so an agent's end is not the team's
+    assert recording.ends.all(axis=1).tolist() == recording.ends.any(axis=1).tolist()
 
 
 @pytest.mark.parametrize(("time_limit", "mean_return"), [("terminal", 2 * (1.5 + 1) / 2), ("bootstrap", None)])
@@ -111,13 +113,6 @@ def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> No
         return
     assert (recording.last_values[1] != 0).all() and (recording.last_values[0] == 0).all()
     np.testing.assert_allclose(returns[1], 2 + 0.5 * recording.last_values[1])
-
-
-def test_an_agents_end_is_not_the_teams() -> None:
-    env = telling()
-    recording = record_episodes(policy_on(env), env, 4, seed=0, gamma=0.5)
-    assert recording.of_team
-    assert recording.ends.all(axis=1).tolist() == recording.ends.any(axis=1).tolist() == [False] * 4 + [True]
 
 
 @th.no_grad()

@@ -14,9 +14,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.inspection.games import Zones, check_zones
 from sb3_saf.inspection.inspection import Inspection, inspect_team
 from sb3_saf.inspection.reading import require_our_policy
+from sb3_saf.inspection.recording import Zones, zone_function
 from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.teams.checks import check_count
@@ -69,7 +69,7 @@ class InspectionCallback(BaseCallback):
         check_count("n_eval_episodes", n_eval_episodes)
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-        check_zones(zones)
+        zone_function(eval_env, zones)  # refuses what is no function
         if pictures:
             _require_matplotlib()
         self.eval_env = eval_env

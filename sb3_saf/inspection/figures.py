@@ -1,20 +1,21 @@
 """
-Figures of the TensorBoard page. Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones have
-the environment's colours.
+Figures of the TensorBoard page, and an episode as pictures: a few moments in two rows, and a GIF.
 
-Letters: U policies, K zones, N agents, L slots, T game steps, n values.
+Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones have the environment's colours. Letters:
+U policies, K zones, N agents, L slots, T game steps, n values.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_saf.inspection.calibration import Calibration, reliability
-from sb3_saf.inspection.scalars import Attention
+from sb3_saf.inspection.recording import Picture
+from sb3_saf.inspection.scalars import Attention, Calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -158,25 +159,28 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
     return figure
 
 
-def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Calibration, unit: str | None) -> Figure:
+def calibration(
+    values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration, unit: str | None, n_bins: int = 10
+) -> Figure:
     """
-    Draw values against returns.
+    Draw values against returns, and mean returns of bins of equal counts by value.
 
     :param values: (n,)
     :param returns: (n,)
-    :param found: their calibration
+    :param summary: their calibration
     :param unit: unit of returns
+    :param n_bins: at most
     """
     figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
     axes.scatter(values[few], returns[few], s=6, alpha=0.25, color=_GREY, linewidths=0, label="single steps")
     ends = [float(min(values.min(), returns.min())), float(max(values.max(), returns.max()))]
     axes.plot(ends, ends, color="black", linestyle="--", linewidth=1, label="value = return")
-    bins = reliability(values, returns)
+    bins = np.array_split(np.argsort(values, kind="stable"), min(n_bins, len(values)))
     axes.errorbar(
-        [each.value for each in bins],
-        [each.mean for each in bins],
-        yerr=[each.std for each in bins],
+        [float(values[rows].mean()) for rows in bins],
+        [float(returns[rows].mean()) for rows in bins],
+        yerr=[float(returns[rows].std()) for rows in bins],
         fmt="o",
         markersize=7,
         color=_BLUE,
@@ -187,15 +191,78 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], found: Cali
     )
     of_unit = f" ({unit})" if unit else ""
     axes.set(xlabel=f"value{of_unit}", ylabel=f"discounted return{of_unit}")
-    axes.set_title(_summary(found), fontsize=11, color=_ORANGE)
+    numbers = [
+        ("explained variance", summary.explained_variance, ".2f"),
+        ("slope", summary.slope, ".2f"),
+        ("bias", summary.bias, "+.2g"),
+    ]
+    title = ", ".join(f"{name} {value:{form}}" for name, value, form in numbers if value is not None)
+    axes.set_title(title, fontsize=11, color=_ORANGE)
     axes.legend(loc="upper left", fontsize=10, frameon=False)
     return figure
 
 
-def _summary(found: Calibration) -> str:
-    parts = [
-        ("explained variance", found.explained_variance, ".2f"),
-        ("slope", found.slope, ".2f"),
-        ("bias", found.bias, "+.2g"),
-    ]
-    return ", ".join(f"{name} {value:{form}}" for name, value, form in parts if value is not None)
+# --- pictures of an episode -------------------------------------------------------------------------------------------
+
+#: Height in pixels of a moment in the strip of six moments, three to a row, and of the GIF.
+_HEIGHT: Final = 320
+_GAP: Final = 6
+_N_MOMENTS: Final = 6
+_PER_ROW: Final = 3
+_SECONDS_PER_STEP: Final = 0.125
+_COLOURS: Final = 64
+
+
+def strip(pictures: Sequence[Picture]) -> Picture:
+    """Join six evenly spaced pictures (height, width, 3) in two rows, or all in one row if there are fewer."""
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, _N_MOMENTS).round().astype(int))
+    moments = [_scaled(pictures[index]) for index in chosen]
+    rows = [moments] if len(moments) < _N_MOMENTS else [moments[:_PER_ROW], moments[_PER_ROW:]]
+    return _joined([_joined(row, axis=1) for row in rows], axis=0)
+
+
+def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
+    """Join pictures with white gaps."""
+    height, width, _ = pictures[0].shape
+    gap = np.full((height, _GAP, 3) if axis == 1 else (_GAP, width, 3), 255, dtype=np.uint8)
+    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
+
+
+def gif(pictures: Sequence[Picture]) -> bytes:
+    """
+    Encode all pictures as a repeating GIF. TensorBoard shows a GIF like any image; SB3's ``Video`` would need moviepy.
+
+    :param pictures: (height, width, 3) each
+    """
+    from PIL import Image
+
+    frames = [Image.fromarray(_scaled(picture)) for picture in pictures]
+    # One palette for all, from the first, the middle and the last frame.
+    sample = np.concatenate([np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)])
+    palette = Image.fromarray(sample).quantize(_COLOURS)
+    indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    file = io.BytesIO()
+    indexed[0].save(
+        file, "GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * _SECONDS_PER_STEP), loop=0
+    )
+    return file.getvalue()
+
+
+def png(picture: Picture) -> bytes:
+    """Encode a picture, (height, width, 3), as PNG."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def _scaled(picture: Picture) -> Picture:
+    """Scale a picture down to ``_HEIGHT``."""
+    from PIL import Image
+
+    height, width, _ = picture.shape
+    if height <= _HEIGHT:
+        return picture
+    image = Image.fromarray(picture).resize((round(width * _HEIGHT / height), _HEIGHT), Image.Resampling.BILINEAR)
+    return np.asarray(image)

@@ -10,12 +10,17 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.inspection import figures, film
+from sb3_saf.inspection import figures
 from sb3_saf.inspection import scalars as numbers
-from sb3_saf.inspection.calibration import calibrate
-from sb3_saf.inspection.games import Picture, ReturnScale, Zones, return_scale, zone_colours
-from sb3_saf.inspection.pool import chosen_by, differences
-from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
+from sb3_saf.inspection.recording import (
+    EpisodeRecording,
+    Picture,
+    ReturnScale,
+    Zones,
+    record_episodes,
+    return_scale,
+    zone_colours,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,46 +57,50 @@ class Inspection(NamedTuple):
     @property
     def figures(self) -> dict[str, Figure]:
         """Figures by their names in TensorBoard. Needs matplotlib."""
-        return {"critic/calibration": self._calibration(), **self._of_the_pool(), **self._of_the_knowledge_source()}
+        recording, counted = self.recording, self.recording.counted
+        values, returns = recording.values[counted], recording.returns[counted]
+        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if recording.of_team else 'per agent'}"
+        calibration = figures.calibration(values, returns, numbers.calibrate(values, returns), unit)
+        return {"critic/calibration": calibration, **self._of_the_pool(), **self._of_the_knowledge_source()}
 
     @property
     def film(self) -> bytes | None:
         """The first episode as a GIF; None if the environment draws no pictures. Needs Pillow."""
-        return film.gif(self.recording.pictures) if self.recording.pictures else None
+        return figures.gif(self.recording.pictures) if self.recording.pictures else None
 
     @property
     def strip(self) -> Picture | None:
         """Six moments of the first episode, (height, width, 3); None if the environment draws no pictures."""
-        return film.strip(self.recording.pictures) if self.recording.pictures else None
-
-    def _calibration(self) -> Figure:
-        counted = self.recording.counted
-        values, returns = self.recording.values[counted], self.recording.returns[counted]
-        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if self.recording.of_team else 'per agent'}"
-        return figures.calibration(values, returns, calibrate(values, returns), unit)
+        return figures.strip(self.recording.pictures) if self.recording.pictures else None
 
     def _of_the_pool(self) -> dict[str, Figure]:
         recording, counted = self.recording, self.recording.counted
         if recording.pool_weights is None or recording.pool_actions is None:
             return {}
         weights = recording.pool_weights[counted]
-        by_agent = chosen_by(weights, numbers.counted_agents(recording), recording.n_agents)
-        apart = differences(self.action_space, recording.pool_actions[counted])
+        agents = np.broadcast_to(np.arange(counted.shape[1]) % recording.n_agents, counted.shape)[counted]
+        by_agent = numbers.selection_by_group(weights, agents, recording.n_agents)
+        distances = numbers.policy_distances(self.action_space, recording.pool_actions[counted])
         drawn = {
             "pool/by_agent": figures.chosen_by_agent(by_agent),
-            "pool/differences": figures.policy_differences(apart),
+            "pool/differences": figures.policy_differences(distances),
         }
         if recording.zones is not None:
             zones = recording.zones[counted]
             n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
-            drawn["pool/by_zone"] = figures.chosen_by_zone(chosen_by(weights, zones, n_zones), self.colours)
+            by_zone = numbers.selection_by_group(weights, zones, n_zones)
+            drawn["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
         return drawn
 
     def _of_the_knowledge_source(self) -> dict[str, Figure]:
-        write, read = numbers.write_attention(self.recording), numbers.read_attention(self.recording)
-        if write is None or read is None or self.recording.write_attention is None:
+        recording = self.recording
+        write, read = numbers.write_attention(recording), numbers.read_attention(recording)
+        if write is None or read is None or recording.write_attention is None:
             return {}
-        episode = _first_episode(self.recording, self.recording.write_attention)
+        # The first game up to the end of its first episode.
+        game = int(np.flatnonzero(recording.counted_games.any(axis=0))[0])
+        ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
+        episode = recording.write_attention[: int(np.flatnonzero(ends)[0]) + 1, game]
         return {
             "knowledge_source/attention": figures.attention(write, read),
             "knowledge_source/one_episode": figures.attention_over_time(episode),
@@ -140,10 +149,3 @@ def inspect_team(
     )
     gae_lambda = float(getattr(model, "gae_lambda", 1.0))
     return Inspection(recording, model.policy.action_space, return_scale(eval_env), zone_colours(eval_env), gae_lambda)
-
-
-def _first_episode(recording: EpisodeRecording, attention: np.ndarray) -> np.ndarray:
-    """Return the entries (T', ...) of the first game up to the end of its first episode."""
-    game = int(np.flatnonzero(numbers.counted_games(recording).any(axis=0))[0])
-    ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
-    return attention[: int(np.flatnonzero(ends)[0]) + 1, game]

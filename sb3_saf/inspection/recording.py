@@ -1,13 +1,32 @@
 """
 Recording of team episodes: observations, actions and network outputs of every step as plain arrays.
 
-Figures, films, TensorBoard and reports read recordings only. Letters: T game steps, E games, N agents, B = E N rows, A
-actions, U policies, L slots, P parameters of an action distribution.
+Figures, films, TensorBoard and reports read recordings only. Games may have these attributes, which are read through
+``get_attr`` and ``env_method``:
+
+================ ======================= ==============================================================================
+attribute        form                    meaning
+================ ======================= ==============================================================================
+``agent_zones``  (N,) integers           present zone of each agent, from 0; -1 for none
+``zone_colours`` Z times (r, g, b)       colour of each zone, 0 to 255
+``return_unit``  str                     unit of the team return, such as ``"treasures"``
+``best_return``  number                  the largest possible team return
+``action_names`` A times str             name of each action
+``render_mode``  ``"rgb_array"``         the method ``render`` then returns a picture, (height, width, 3) uint8
+================ ======================= ==============================================================================
+
+A game on a grid may have two methods for :func:`~sb3_saf.replay`: ``grid_scene()`` returns the data for a drawing (see
+``HECOGridEnv``), ``replica()`` another game that plays the same episode from the same seed.
+
+Letters: T game steps, E games, N agents, B = E N rows, A actions, U policies, L slots, P parameters of an action
+distribution.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +37,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.evaluation import PlayedStep, play
-from sb3_saf.inspection.calibration import lambda_returns
-from sb3_saf.inspection.games import Picture, ZoneFunction, Zones, draws_pictures, picture, zone_function, zones_now
 from sb3_saf.inspection.reading import (
     OurPolicy,
     PolicyReader,
@@ -39,6 +56,73 @@ Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
+Picture = npt.NDArray[np.uint8]
+#: Function from the environment to the zone of each row's agent, (B,) integers from 0, -1 for none.
+ZoneFunction = Callable[[VecEnv], npt.ArrayLike]
+#: None uses the environment's attribute; False disables zones.
+Zones = ZoneFunction | Literal[False] | None
+
+
+class ReturnScale(NamedTuple):
+    """The unit of team returns, such as ``"treasures"``, and the largest possible one; None if unknown."""
+
+    unit: str | None
+    best: float | None
+
+
+def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
+    """
+    Return the function for the zones of rows; None if there are none.
+
+    :raises ValueError: if ``zones`` is neither None, False nor a function
+    """
+    if zones is not None and zones is not False and not callable(zones):
+        raise ValueError(
+            "zones must be a function from the environment to the zone of each row, None to ask the environment for "
+            f"its attribute agent_zones, or False for no zones; got {zones!r}"
+        )
+    if zones is None:
+        return zones_by_attribute if env.has_attr("agent_zones") else None
+    return zones or None
+
+
+def zones_by_attribute(env: VecEnv) -> Ints:
+    """Return the games' attribute ``agent_zones``, (B,)."""
+    of_games = env.get_attr("agent_zones", indices=range(0, env.num_envs, require_n_agents(env)))
+    return np.concatenate([np.asarray(zones, dtype=np.int64) for zones in of_games])
+
+
+def zones_now(zones: ZoneFunction, env: VecEnv) -> Ints:
+    """Return the zone of each row, (B,); ValueError if they are not (B,) integers of at least -1."""
+    rows = np.asarray(zones(env))
+    if rows.shape != (env.num_envs,) or rows.dtype.kind not in "iu" or (rows < -1).any():
+        raise ValueError(
+            f"expected zones to give whole numbers from 0 (or -1 for no zone) of shape ({env.num_envs},), one for each "
+            f"row, got shape {rows.shape} and dtype {rows.dtype}"
+            + (f" with {rows.min()}" if rows.dtype.kind == "i" and rows.size else "")
+        )
+    return rows.astype(np.int64)
+
+
+def zone_colours(env: VecEnv) -> list[tuple[float, float, float]] | None:
+    """Return the colours of the zones, 0 to 1; None if the environment has none."""
+    if not env.has_attr("zone_colours"):
+        return None
+    return [(red / 255, green / 255, blue / 255) for red, green, blue in env.get_attr("zone_colours", indices=[0])[0]]
+
+
+def return_scale(env: VecEnv) -> ReturnScale:
+    """Return the unit of team returns."""
+    unit, best = (
+        env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None for name in ("return_unit", "best_return")
+    )
+    return ReturnScale(None if unit is None else str(unit), None if best is None else float(best))
+
+
+def picture(env: VecEnv) -> Picture | None:
+    """Return a picture of the first game, (height, width, 3); None if ``render`` gives none."""
+    frame = np.asarray(env.env_method("render", indices=[0])[0])
+    return frame if frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3 else None
 
 
 class EpisodeRecording(NamedTuple):
@@ -92,6 +176,15 @@ class EpisodeRecording(NamedTuple):
     episode_lengths: list[int]
     pictures: list[Picture]
 
+    @property
+    def counted_games(self) -> Bools:
+        """Whether a game was in a recorded episode, (T, E)."""
+        return np.any(self.counted.reshape(len(self.counted), -1, self.n_agents), axis=2)
+
+    def targets(self, lam: float) -> Doubles:
+        """Compute the TD(lambda) targets of the critic, (T, B)."""
+        return lambda_returns(self.rewards, self.ends, self.last_values, self.values, self.gamma, lam)
+
 
 @th.no_grad()
 def record_episodes(
@@ -126,13 +219,14 @@ def record_episodes(
     """
     ours = require_our_policy(policy)
     check_count("n_eval_episodes", n_eval_episodes)
-    reader = reader_of(ours, env.num_envs, deterministic)
-    recorder = _Recorder(env, reader, zone_function(env, zones), normalizer, observations)
+    recorder = _Recorder(env, reader_of(ours, env.num_envs, deterministic), normalizer, observations)
+    draws = pictures and env.render_mode == "rgb_array"
     was_training = ours.training
     ours.set_training_mode(False)
     try:
         with own_randomness(seed, ours.device):
-            recorder.play(n_eval_episodes, seed, pictures and draws_pictures(env))
+            env.seed(seed)
+            recorder.play(n_eval_episodes, zone_function(env, zones), draws)
     finally:
         ours.set_training_mode(was_training)
     return recorder.recording(gamma)
@@ -142,15 +236,9 @@ class _Recorder:
     """Recorder that plays episodes and collects the results of every step."""
 
     def __init__(
-        self,
-        env: VecEnv,
-        reader: PolicyReader | QReader,
-        zones: ZoneFunction | None,
-        normalizer: VecNormalize | None,
-        observations: bool,
+        self, env: VecEnv, reader: PolicyReader | QReader, normalizer: VecNormalize | None, observations: bool
     ) -> None:
-        self.env, self.reader, self.zones, self.normalizer = env, reader, zones, normalizer
-        self.keeps_observations = observations
+        self.env, self.reader, self.normalizer, self.keeps_observations = env, reader, normalizer, observations
         self.n_agents = require_n_agents(env)
         n_games = env.num_envs // self.n_agents
         self.returns_now, self.lengths_now = np.zeros(n_games), np.zeros(n_games, dtype=np.int64)
@@ -158,69 +246,62 @@ class _Recorder:
         self.lengths: list[int] = []
         self.pictures: list[Picture] = []
         self.readings: list[StepReading] = []
-        self.columns: dict[str, list[npt.NDArray[Any]]] = {}
+        self.columns: dict[str, list[npt.NDArray[Any]]] = defaultdict(list)
 
-    def play(self, n_episodes: int, seed: int, draw: bool) -> None:
+    def play(self, n_episodes: int, zones: ZoneFunction | None, draws: bool) -> None:
         """Play episodes, and collect the results of every step."""
-        self.env.seed(seed)
-        is_first = draw and n_episodes >= len(self.lengths_now)
+        policy = self.reader.policy
+        asks_for_masks = isinstance(policy, TeamMaskablePolicy) and is_masking_supported(self.env)
+        is_first = draws and n_episodes >= len(self.lengths_now)  # else the first game may count no episode
 
         def act(obs: Any, starts: Bools) -> npt.NDArray[Any]:
             if is_first and (frame := picture(self.env)) is not None:
                 self.pictures.append(frame)
-            if self.zones is not None:
-                self._keep("zones", zones_now(self.zones, self.env))
-            policy = self.reader.policy
+            if zones is not None:
+                self.columns["zones"].append(zones_now(zones, self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None
             self.readings.append(self.reader.step(_tensors(policy, obs), starts, masks))
             return self.readings[-1].actions
 
-        asks_for_masks = isinstance(self.reader.policy, TeamMaskablePolicy) and is_masking_supported(self.env)
         for step in play(self.env, act, n_episodes):
             self._collect(step)
             is_first = is_first and bool(step.counted[0]) and not step.ended[0]
 
     def _collect(self, step: PlayedStep) -> None:
-        counted = np.repeat(step.counted, self.n_agents) & _active(step.observations, self.n_agents)
+        n_agents, of_team, columns = self.n_agents, self.reader.of_team, self.columns
+        counted = np.repeat(step.counted, n_agents) & _active(step.observations, n_agents)
         raw = self.env.get_original_reward() if isinstance(self.env, VecNormalize) else np.array(step.rewards)
-        learned = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
-        of_team, dones = self.reader.of_team, step.dones
-        self._keep("counted", counted)
-        self._keep("rewards", self._team_sums(learned) if of_team else learned)
+        rewards = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
+        if of_team:  # the team's reward, in each of its rows
+            rewards = np.repeat(rewards.reshape(-1, n_agents).sum(axis=1), n_agents)
+        columns["counted"].append(counted)
+        columns["rewards"].append(rewards)
         # An agent's return ends with its own end, as in TeamRolloutBuffer.
-        self._keep("ends", dones if of_team else dones | ~_active(step.following, self.n_agents))
-        self._keep("last_values", _last_values(self.reader, dones, step.infos))
+        columns["ends"].append(step.dones if of_team else step.dones | ~_active(step.following, n_agents))
+        columns["last_values"].append(_last_values(self.reader, step.dones, step.infos))
         if self.keeps_observations:
-            self._keep("observations", np.array(step.observations[OBS_KEY]))
-        playing = counted.reshape(-1, self.n_agents).any(axis=1)
-        self.returns_now += raw.reshape(-1, self.n_agents).sum(axis=1, dtype=np.float64)
+            columns["observations"].append(np.array(step.observations[OBS_KEY]))
+        finished = step.ended & counted.reshape(-1, n_agents).any(axis=1)
+        self.returns_now += raw.reshape(-1, n_agents).sum(axis=1, dtype=np.float64)
         self.lengths_now += 1
-        self.returns += self.returns_now[step.ended & playing].tolist()
-        self.lengths += self.lengths_now[step.ended & playing].tolist()
+        self.returns += self.returns_now[finished].tolist()
+        self.lengths += self.lengths_now[finished].tolist()
         self.returns_now[step.ended], self.lengths_now[step.ended] = 0, 0
-
-    def _keep(self, name: str, column: npt.NDArray[Any]) -> None:
-        self.columns.setdefault(name, []).append(column)
-
-    def _team_sums(self, rewards: Floats) -> Floats:
-        """Return the team's reward in each of its rows, (B,)."""
-        teams: Floats = rewards.reshape(-1, self.n_agents).sum(axis=1, keepdims=True)
-        return np.repeat(teams, self.n_agents, axis=1).reshape(-1)
 
     def recording(self, gamma: float) -> EpisodeRecording:
         """Return the recording of all steps so far."""
         columns = {name: np.stack(column) for name, column in self.columns.items()}
         pools = [reading.pool for reading in self.readings if reading.pool]
         sources = [reading.source for reading in self.readings if reading.source]
-        probabilities = [r.probabilities for r in self.readings if r.probabilities is not None]
         values = _stack([reading.values for reading in self.readings])
+        assert values is not None
         return EpisodeRecording(
             n_agents=self.n_agents,
             of_team=self.reader.of_team,
             gamma=gamma,
             observations=columns.get("observations"),
             actions=np.stack([reading.actions for reading in self.readings]),
-            action_probabilities=_stack(probabilities) if probabilities else None,
+            action_probabilities=_stack([r.probabilities for r in self.readings if r.probabilities is not None]),
             counted=columns["counted"],
             rewards=columns["rewards"],
             ends=columns["ends"],
@@ -228,13 +309,13 @@ class _Recorder:
             values=values,
             returns=lambda_returns(columns["rewards"], columns["ends"], columns["last_values"], values, gamma),
             zones=columns.get("zones"),
-            pool_weights=_stack([pool.weights for pool in pools]) if pools else None,
-            pool_actions=_stack([pool.actions for pool in pools]) if pools else None,
-            write_attention=_stack([source.write for source in sources]) if sources else None,
-            read_attention=_stack([source.read for source in sources]) if sources else None,
-            message_strengths=_stack([source.strengths for source in sources]) if sources else None,
+            pool_weights=_stack([pool.weights for pool in pools]),
+            pool_actions=_stack([pool.actions for pool in pools]),
+            write_attention=_stack([source.write for source in sources]),
+            read_attention=_stack([source.read for source in sources]),
+            message_strengths=_stack([source.strengths for source in sources]),
             values_without={
-                name: _stack([source.values[name] for source in sources])
+                name: th.stack([source.values[name] for source in sources]).cpu().numpy()
                 for name in (sources[0].values if sources else ())
             },
             episode_returns=self.returns,
@@ -243,8 +324,8 @@ class _Recorder:
         )
 
 
-def _stack(tensors: list[th.Tensor]) -> Floats:
-    return th.stack(tensors).cpu().numpy()
+def _stack(tensors: list[th.Tensor]) -> Floats | None:
+    return th.stack(tensors).cpu().numpy() if tensors else None
 
 
 def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:
@@ -269,3 +350,35 @@ def _last_values(reader: PolicyReader | QReader, dones: Bools, infos: list[dict[
         obs = {key: np.stack([observation[key] for observation in last]) for key in last[0]}
         values[rows] = reader.last_values(_tensors(reader.policy, obs), rows).cpu().numpy()
     return values
+
+
+def lambda_returns(
+    rewards: Floats, ends: Bools, last_values: Floats, values: Floats, gamma: float, lam: float = 1.0
+) -> Doubles:
+    """
+    Compute TD(lambda) targets, the training targets of the critic; with ``lam=1`` they are the discounted returns.
+
+    ::
+
+        R_t = r_t + gamma last_t                                          if the episode ends with step t
+        R_t = r_t + gamma ((1 - lam) V_{t+1} + lam R_{t+1})               otherwise
+
+    ``last`` is the value of the last observation if the time limit is no true end (``time_limit="bootstrap"``), else 0.
+    These are SB3's advantages by GAE plus values. Rows of unfinished episodes must be excluded.
+
+    :param rewards: (T, B)
+    :param ends: (T, B)
+    :param last_values: (T, B)
+    :param values: (T, B)
+    :param gamma: discount factor
+    :param lam: lambda
+    :return: (T, B)
+    """
+    targets: Doubles = np.zeros(rewards.shape)
+    values = np.asarray(values, dtype=np.float64)
+    ahead = next_value = np.zeros_like(values[0])
+    for t in reversed(range(len(targets))):
+        going_on = (1 - lam) * next_value + lam * ahead
+        targets[t] = rewards[t] + gamma * np.where(ends[t], last_values[t], going_on)
+        ahead, next_value = targets[t], values[t]
+    return targets

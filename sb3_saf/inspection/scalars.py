@@ -1,7 +1,9 @@
 """
-Scalars of the TensorBoard page, from a recording.
+Scalars of a recording: team return, pool of policies, knowledge source, critic and its messages.
 
-Tags are ``group/name``; a group is one box of the page. Scalars that a policy or an environment lacks are omitted.
+Tags are ``group/name``; a group is one box of TensorBoard's page. Scalars that a policy or an environment lacks are
+omitted. Letters: n rows, T game steps, B rows of all games, U policies, P parameters of an action distribution, K
+groups (zones or agents), Q queries, S sources, L slots, N agents.
 """
 
 from __future__ import annotations
@@ -14,66 +16,20 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_saf.evaluation import confidence_interval
-from sb3_saf.inspection.calibration import calibrate, lambda_returns, rmse
-from sb3_saf.inspection.games import ReturnScale
-from sb3_saf.inspection.pool import (
-    chosen_by,
-    differences,
-    entropy,
-    mean_difference,
-    selection_entropy,
-    zone_dependence,
-)
 from sb3_saf.inspection.reading import Replacement
-from sb3_saf.inspection.recording import EpisodeRecording
+from sb3_saf.inspection.recording import EpisodeRecording, ReturnScale
 
 Scalars = dict[str, float]
+Floats = npt.NDArray[np.floating[Any]]
+Doubles = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.integer[Any]]
 
+#: Spread below which values or returns count as constant.
+_CONSTANT: Final = 1e-9
 _TAG_WITHOUT: Final[dict[Replacement, str]] = {
     "zero": "message/value_error_zeroed",
     "shuffled": "message/value_error_shuffled",
 }
-
-
-class Attention(NamedTuple):
-    """
-    Attention of queries over sources, over many teams.
-
-    :param mean: (Q, S) mean weights; rows sum to 1
-    :param entropy: mean entropy of one query's weights, divided by log S: 0 if one source has all weight, 1 for uniform
-        weights; None if there is only one source
-    :param entropy_of_mean: entropy of a query's mean weights, divided by log S, mean over queries; None for a single
-        source. Higher than ``entropy`` if the attended source changes
-    """
-
-    mean: npt.NDArray[np.float64]
-    entropy: float | None
-    entropy_of_mean: float | None
-
-
-def attention_of(weights: npt.NDArray[np.floating[Any]]) -> Attention:
-    """Summarise attention (n, Q, S); queries without any source (zeros) are excluded."""
-    shown = weights.sum(axis=2) > 0
-    n_sources = weights.shape[2]
-    with np.errstate(invalid="ignore"):
-        mean = weights.sum(axis=0, dtype=np.float64) / shown.sum(axis=0)[:, np.newaxis]
-    if n_sources == 1 or not shown.any():
-        return Attention(mean, None, None)
-    scale = math.log(n_sources)
-    seen = shown.any(axis=0)
-    return Attention(mean, float(entropy(weights)[shown].mean()) / scale, float(entropy(mean[seen]).mean()) / scale)
-
-
-def counted_agents(recording: EpisodeRecording) -> npt.NDArray[np.int64]:
-    """Return the agent of each counted row, (n,)."""
-    n_steps, n_rows = recording.counted.shape
-    agents = np.tile(np.arange(recording.n_agents), n_rows // recording.n_agents)
-    return np.broadcast_to(agents, (n_steps, n_rows))[recording.counted]
-
-
-def counted_games(recording: EpisodeRecording) -> npt.NDArray[np.bool_]:
-    """Return whether a game was in a recorded episode, (T, E)."""
-    return np.any(recording.counted.reshape(len(recording.counted), -1, recording.n_agents), axis=2)
 
 
 def team_scalars(recording: EpisodeRecording, scale: ReturnScale) -> Scalars:
@@ -87,38 +43,159 @@ def team_scalars(recording: EpisodeRecording, scale: ReturnScale) -> Scalars:
     return scalars
 
 
-def pool_scalars(recording: EpisodeRecording, action_space: spaces.Space[object]) -> Scalars:
-    """Compute how often each policy is selected, the entropy of selection, and the differences between policies."""
+# --- the pool of policies ---------------------------------------------------------------------------------------------
+
+
+def pool_scalars(recording: EpisodeRecording, action_space: spaces.Space[Any]) -> Scalars:
+    """
+    Compute how often each policy is selected, the entropy of selection, and the differences between policies.
+
+    Entropies are divided by log U, from 0 to 1. ``entropy`` is the mean entropy of one observation's weights,
+    ``entropy_of_mean`` that of the mean weights. Both low: the pool has collapsed to one policy. The first low, the
+    second high: confident selection that depends on the observation. Both high: all policies are blended.
+    """
     if recording.pool_weights is None or recording.pool_actions is None:
         return {}
     weights = recording.pool_weights[recording.counted]
-    chosen = weights.mean(axis=0, dtype=np.float64)
-    spread = selection_entropy(weights)
-    scalars = {f"pool/chosen/policy_{policy}": float(share) for policy, share in enumerate(chosen)}
-    scalars["pool/entropy"], scalars["pool/entropy_of_mean"] = spread.each, spread.mean
-    scalars["pool/difference"] = mean_difference(differences(action_space, recording.pool_actions[recording.counted]))
-    return scalars | _zone_scalars(recording, weights)
-
-
-def _zone_scalars(recording: EpisodeRecording, weights: npt.NDArray[np.float32]) -> Scalars:
-    if recording.zones is None:
-        return {}
-    zones = recording.zones[recording.counted]
+    shares = weights.mean(axis=0, dtype=np.float64)
+    distances = policy_distances(action_space, recording.pool_actions[recording.counted])
     scalars = {
-        f"pool_by_zone/zone_{zone}/policy_{policy}": float(share)
-        for zone, shares in enumerate(chosen_by(weights, zones, int(zones.max(initial=-1)) + 1))
-        for policy, share in enumerate(shares)
-        if np.isfinite(share)
+        **{f"pool/chosen/policy_{policy}": float(share) for policy, share in enumerate(shares)},
+        "pool/entropy": float(entropy(weights).mean()) / math.log(weights.shape[1]),
+        "pool/entropy_of_mean": float(entropy(shares)) / math.log(weights.shape[1]),
+        "pool/difference": float(distances[np.triu_indices(len(distances), k=1)].mean()),
     }
-    dependence = zone_dependence(weights, zones)
-    return scalars if dependence is None else scalars | {"pool/zone_dependence": dependence}
+    if recording.zones is None:
+        return scalars
+    zones = recording.zones[recording.counted]
+    for zone, of_zone in enumerate(selection_by_group(weights, zones, int(zones.max(initial=-1)) + 1)):
+        for policy, share in enumerate(of_zone):
+            if np.isfinite(share):
+                scalars[f"pool_by_zone/zone_{zone}/policy_{policy}"] = float(share)
+    if (dependence := zone_dependence(weights, zones)) is not None:
+        scalars["pool/zone_dependence"] = dependence
+    return scalars
+
+
+def entropy(probabilities: Floats) -> Doubles:
+    """Compute (...) entropies in nats of probabilities (..., U)."""
+    p = np.asarray(probabilities, dtype=np.float64)
+    return -(p * np.log(np.where(p > 0, p, 1.0))).sum(axis=-1)
+
+
+def selection_by_group(weights: Floats, groups: Integers, n_groups: int) -> Doubles:
+    """
+    Return how often each policy is selected in each group.
+
+    :param weights: (n, U)
+    :param groups: (n,) from 0; -1 for rows without a group
+    :param n_groups: K
+    :return: (K, U), rows sum to 1; NaN for groups without rows
+    """
+    inside = groups >= 0
+    counts = np.bincount(groups[inside], minlength=n_groups).astype(np.float64)
+    sums = [np.bincount(groups[inside], column[inside], n_groups) for column in weights.T.astype(np.float64)]
+    with np.errstate(invalid="ignore"):
+        return np.stack(sums, axis=1) / counts[:, np.newaxis]
+
+
+def zone_dependence(weights: Floats, zones: Integers) -> float | None:
+    """
+    Return the mutual information of zone and selected policy, divided by the smaller of log U and log K.
+
+    :param weights: (n, U)
+    :param zones: (n,) from 0, -1 for none
+    :return: from 0 (selection independent of the zone) to 1 (one policy per zone); None for fewer than two zones
+    """
+    counts = np.bincount(zones[zones >= 0])
+    present = np.flatnonzero(counts)
+    if len(present) < 2:
+        return None
+    table = selection_by_group(weights, zones, len(counts))[present]
+    shares = counts[present] / counts.sum()
+    information = float(entropy(shares @ table) - shares @ entropy(table))
+    return max(0.0, information / math.log(min(len(present), weights.shape[1])))
+
+
+def policy_distances(action_space: spaces.Space[Any], actions: Floats) -> Doubles:
+    """
+    Return the Hellinger distances between the action distributions of a pool's policies, mean over observations.
+
+    sqrt(1 - sum_a sqrt(p(a) q(a))): 0 for equal distributions, 1 for disjoint ones. It is exact for every kind of
+    action space, including joint actions of several dimensions.
+
+    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param actions: (n, U, P) parameters of each policy's distribution
+    :return: (U, U), symmetric
+    """
+    n_policies = actions.shape[1]
+    parameters = np.asarray(actions, dtype=np.float64)
+    table = np.zeros((n_policies, n_policies))
+    for i in range(n_policies):
+        for j in range(i):
+            overlap = _overlap(action_space, parameters[:, i], parameters[:, j])
+            table[i, j] = table[j, i] = np.sqrt(np.clip(1.0 - overlap, 0.0, 1.0)).mean()
+    return table
+
+
+def _overlap(action_space: spaces.Space[Any], p: Floats, q: Floats) -> Doubles:
+    """Return Bhattacharyya coefficients (n,), a product over action dimensions."""
+    if isinstance(action_space, spaces.Box):
+        (mean_p, log_p), (mean_q, log_q) = np.split(p, 2, axis=1), np.split(q, 2, axis=1)
+        total = np.exp(2 * log_p) + np.exp(2 * log_q)
+        scale = np.sqrt(2 * np.exp(log_p + log_q) / total)
+        return (scale * np.exp(-((mean_p - mean_q) ** 2) / (4 * total))).prod(axis=1)
+    if isinstance(action_space, spaces.MultiBinary):
+        on_p, on_q = 1 / (1 + np.exp(-p)), 1 / (1 + np.exp(-q))
+        return (np.sqrt(on_p * on_q) + np.sqrt((1 - on_p) * (1 - on_q))).prod(axis=1)
+
+    def softmax(logits: Floats) -> Doubles:
+        powers = np.exp(logits - logits.max(axis=1, keepdims=True))
+        return np.asarray(powers / powers.sum(axis=1, keepdims=True))
+
+    nvec = action_space.nvec.reshape(-1) if isinstance(action_space, spaces.MultiDiscrete) else [p.shape[1]]
+    edges = np.cumsum(nvec)[:-1]
+    pairs = zip(np.split(p, edges, axis=1), np.split(q, edges, axis=1), strict=True)
+    return np.prod([np.sqrt(softmax(one) * softmax(other)).sum(axis=1) for one, other in pairs], axis=0)
+
+
+# --- the knowledge source ---------------------------------------------------------------------------------------------
+
+
+class Attention(NamedTuple):
+    """
+    Attention of queries over sources, over many teams.
+
+    :param mean: (Q, S) mean weights; rows sum to 1
+    :param entropy: mean entropy of one query's weights, divided by log S: 0 if one source has all weight, 1 for uniform
+        weights; None if there is only one source
+    :param entropy_of_mean: entropy of a query's mean weights, divided by log S, mean over queries; None for a single
+        source. Higher than ``entropy`` if the attended source changes
+    """
+
+    mean: Doubles
+    entropy: float | None
+    entropy_of_mean: float | None
+
+
+def attention_of(weights: Floats) -> Attention:
+    """Summarise attention (n, Q, S); queries without any source (zeros) are excluded."""
+    has_source = weights.sum(axis=2) > 0
+    n_sources = weights.shape[2]
+    with np.errstate(invalid="ignore"):
+        mean = weights.sum(axis=0, dtype=np.float64) / has_source.sum(axis=0)[:, np.newaxis]
+    if n_sources == 1 or not has_source.any():
+        return Attention(mean, None, None)
+    scale = math.log(n_sources)
+    of_mean = float(entropy(mean[has_source.any(axis=0)]).mean()) / scale
+    return Attention(mean, float(entropy(weights)[has_source].mean()) / scale, of_mean)
 
 
 def write_attention(recording: EpisodeRecording) -> Attention | None:
     """Summarise the attention of slots over agents; None without a knowledge source."""
     if recording.write_attention is None:
         return None
-    return attention_of(recording.write_attention[counted_games(recording)])
+    return attention_of(recording.write_attention[recording.counted_games])
 
 
 def read_attention(recording: EpisodeRecording) -> Attention | None:
@@ -127,7 +204,7 @@ def read_attention(recording: EpisodeRecording) -> Attention | None:
         return None
     # Inactive readers are excluded, like queries without sources.
     takes_part = recording.counted.reshape(*recording.read_attention.shape[:3], 1)
-    return attention_of((recording.read_attention * takes_part)[counted_games(recording)])
+    return attention_of((recording.read_attention * takes_part)[recording.counted_games])
 
 
 def knowledge_scalars(recording: EpisodeRecording) -> Scalars:
@@ -144,30 +221,58 @@ def knowledge_scalars(recording: EpisodeRecording) -> Scalars:
     return scalars
 
 
+# --- the critic -------------------------------------------------------------------------------------------------------
+
+
+class Calibration(NamedTuple):
+    """
+    Agreement of values V with returns G.
+
+    :param explained_variance: 1 - Var(G - V) / Var(G): 1 for a perfect critic, 0 for a constant one; None for equal
+        returns
+    :param slope: slope of the regression line of G on V: 1 for a calibrated critic, below 1 if values vary too much;
+        None if all values are equal
+    :param bias: mean of V - G: positive if values are too high
+    :param rmse: root mean square of V - G
+    """
+
+    explained_variance: float | None
+    slope: float | None
+    bias: float
+    rmse: float
+
+
+def calibrate(values: Floats, returns: Floats) -> Calibration:
+    """Compare values (n,) with returns (n,)."""
+    v, g = np.asarray(values, dtype=np.float64), np.asarray(returns, dtype=np.float64)
+    error = v - g
+    var_v, var_g = v.var(), g.var()
+    return Calibration(
+        explained_variance=None if var_g < _CONSTANT**2 else float(1 - error.var() / var_g),
+        slope=None if var_v < _CONSTANT**2 else float(((v - v.mean()) * (g - g.mean())).mean() / var_v),
+        bias=float(error.mean()),
+        rmse=float(np.sqrt((error**2).mean())),
+    )
+
+
 def critic_scalars(recording: EpisodeRecording, gae_lambda: float) -> Scalars:
     """Compare values with discounted returns, and with the targets of training."""
     counted = recording.counted
     values, returns = recording.values[counted], recording.returns[counted]
-    found = calibrate(values, returns)
+    calibration = calibrate(values, returns)
     scalars: dict[str, float | None] = {
         "critic/mean_value": float(values.mean()),
         "critic/mean_return": float(returns.mean()),
-        "critic/bias": found.bias,
-        "critic/error": found.rmse,
-        "critic/slope": found.slope,
-        "critic/explained_variance": found.explained_variance,
-        "critic/td_error": rmse(values, targets(recording, 0.0)[counted]),
+        "critic/bias": calibration.bias,
+        "critic/error": calibration.rmse,
+        "critic/slope": calibration.slope,
+        "critic/explained_variance": calibration.explained_variance,
+        "critic/td_error": calibrate(values, recording.targets(0.0)[counted]).rmse,
     }
     if gae_lambda != 1:
-        target = targets(recording, gae_lambda)[counted]
+        target = recording.targets(gae_lambda)[counted]
         scalars["critic/explained_variance_of_target"] = calibrate(values, target).explained_variance
     return {tag: value for tag, value in scalars.items() if value is not None}
-
-
-def targets(recording: EpisodeRecording, lam: float) -> npt.NDArray[np.float64]:
-    """Compute TD(lambda) targets (T, B) of a recording."""
-    r = recording
-    return lambda_returns(r.rewards, r.ends, r.last_values, r.values, r.gamma, lam)
 
 
 def message_scalars(recording: EpisodeRecording) -> Scalars:
@@ -175,10 +280,11 @@ def message_scalars(recording: EpisodeRecording) -> Scalars:
     if recording.message_strengths is None:
         return {}
     counted, returns = recording.counted, recording.returns[recording.counted]
-    scalars = {
-        "message/value_error": rmse(recording.values[counted], returns),
+    return {
+        "message/value_error": calibrate(recording.values[counted], returns).rmse,
         "message/strength": float(recording.message_strengths[counted].mean()),
+        **{
+            _TAG_WITHOUT[name]: calibrate(values[counted], returns).rmse
+            for name, values in recording.values_without.items()
+        },
     }
-    for name, values in recording.values_without.items():
-        scalars[_TAG_WITHOUT[name]] = rmse(values[counted], returns)
-    return scalars
