@@ -121,10 +121,10 @@ def test_heads_of_a_pool_differ_where_their_best_actions_do() -> None:
     team = policy_on(env, "QPLEXPoolPolicy", n_policies=2)
     obs = rows_of(env)
     view = QReader(team).step(obs, np.ones(12, dtype=bool))
-    assert view.pool is not None
-    np.testing.assert_allclose(view.pool.weights.sum(dim=1), 1, rtol=1e-5)
+    assert view.pool_weights is not None and view.pool_actions is not None
+    np.testing.assert_allclose(view.pool_weights.sum(dim=1), 1, rtol=1e-5)
     assert isinstance(team.actor, PolicyPool)
     log_weights, of_heads = team.actor.evaluate(team.extract_features(obs))
-    np.testing.assert_allclose(view.pool.weights, log_weights.exp())
-    assert th.equal(view.pool.actions.argmax(dim=2), of_heads.argmax(dim=2))
-    assert (view.pool.actions == 0).sum(dim=2).eq(1).all()
+    np.testing.assert_allclose(view.pool_weights, log_weights.exp())
+    assert th.equal(view.pool_actions.argmax(dim=2), of_heads.argmax(dim=2))
+    assert (view.pool_actions == 0).sum(dim=2).eq(1).all()

@@ -140,7 +140,9 @@ class InspectionCallback(BaseCallback):
             self._draw(inspection)
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began
-        self._page.scalars(self._costs())
+        self._page.scalars({"time/inspection_seconds": self.seconds})
+        if now:  # before, there is no training time of which it could be a fraction
+            self._page.scalars({"time/inspection_share": self.seconds / (time.perf_counter() - self._started)})
         self._page.write(self.num_timesteps)
         if self.verbose:
             print(
@@ -148,12 +150,6 @@ class InspectionCallback(BaseCallback):
                 f"({time.perf_counter() - began:.1f} s)"
             )
         return scalars
-
-    def _costs(self) -> dict[str, float]:
-        # At the start there is no training time yet of which it could be a fraction.
-        elapsed = time.perf_counter() - self._started
-        costs = {"time/inspection_seconds": self.seconds}
-        return costs | {"time/inspection_share": self.seconds / elapsed} if team_steps(self.model) else costs
 
     def _draw(self, inspection: Inspection) -> None:
         self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))

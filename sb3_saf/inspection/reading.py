@@ -8,8 +8,9 @@ P parameters of an action distribution, A actions, d features.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -38,50 +39,30 @@ Replacement = Literal["zero", "shuffled"]
 REPLACEMENTS: Final[tuple[Replacement, ...]] = get_args(Replacement)
 
 
-class PoolReading(NamedTuple):
-    """
-    Pool of policies in one step.
-
-    :param weights: (B, U), selection probability of each policy; sums to 1
-    :param actions: (B, U, P), parameters of each policy's action distribution, illegal actions masked
-    """
-
-    weights: th.Tensor
-    actions: th.Tensor
-
-
-class SourceReading(NamedTuple):
-    """
-    Knowledge source in one step.
-
-    :param write: (E, L, N), attention of slots over agents
-    :param read: (E, N, L), attention of agents over slots
-    :param strengths: (B,), Euclidean norm of the message that each agent read
-    :param values: (B,) each, values with a replaced message
-    """
-
-    write: th.Tensor
-    read: th.Tensor
-    strengths: th.Tensor
-    values: dict[Replacement, th.Tensor]
-
-
 class StepReading(NamedTuple):
     """
-    One step of all games.
+    One step of all games. What a policy lacks is None.
 
     :param actions: (B, ...) actions for the environment
     :param values: (B,)
-    :param probabilities: (B, A) probability of each action; None unless actions are Discrete
-    :param pool: None for a policy without a pool
-    :param source: None for a policy without a knowledge source
+    :param action_probabilities: (B, A) probability of each action; None unless actions are Discrete
+    :param pool_weights: (B, U), selection probability of each policy of a pool; sums to 1
+    :param pool_actions: (B, U, P), parameters of each policy's action distribution, illegal actions masked
+    :param write_attention: (E, L, N), attention of slots over agents
+    :param read_attention: (E, N, L), attention of agents over slots
+    :param message_strengths: (B,), Euclidean norm of the message that each agent read
+    :param values_without: (B,) each, values with a replaced message
     """
 
     actions: npt.NDArray[Any]
     values: th.Tensor
-    probabilities: th.Tensor | None
-    pool: PoolReading | None
-    source: SourceReading | None
+    action_probabilities: th.Tensor | None
+    pool_weights: th.Tensor | None = None
+    pool_actions: th.Tensor | None = None
+    write_attention: th.Tensor | None = None
+    read_attention: th.Tensor | None = None
+    message_strengths: th.Tensor | None = None
+    values_without: Mapping[Replacement, th.Tensor] = MappingProxyType({})
 
 
 def require_our_policy(policy: BasePolicy) -> OurPolicy:
@@ -156,23 +137,27 @@ class PolicyReader:
         is_discrete = isinstance(space, spaces.Discrete)
         probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
         array = actions.cpu().numpy()
-        taken = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
-        pool = PoolReading(log_weights.exp(), parameters) if isinstance(policy.actor, PolicyPool) else None
-        source = None if self.source is None else self._source_reading(self.source, obs)
-        return StepReading(taken, values.flatten(), probabilities, pool, source)
-
-    def _source_reading(self, source: SAFStates, obs: Tensors) -> SourceReading:
-        _, teams = self.policy.encode_teams(obs)
-        _, exchanged = source.communicate(teams.features, teams.members, teams.active)
+        clipped = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
+        reading = StepReading(clipped, values.flatten(), probabilities)
+        if isinstance(policy.actor, PolicyPool):
+            reading = reading._replace(pool_weights=log_weights.exp(), pool_actions=parameters)
+        if self.source is None:
+            return reading
+        _, teams = policy.encode_teams(obs)
+        _, exchanged = self.source.communicate(teams.features, teams.members, teams.active)
         # In rows that are not whole teams in order, equal teams are computed once; expand them to games.
-        n_agents = self.policy.team_spaces.n_agents
+        n_agents = policy.team_spaces.n_agents
         team = th.arange(len(exchanged.read)) if teams.rows is None else teams.rows[::n_agents] // n_agents
-        values: dict[Replacement, th.Tensor] = {}
+        values_without: dict[Replacement, th.Tensor] = {}
         for name in REPLACEMENTS if len(team) > 1 else REPLACEMENTS[:1]:
-            with _other_messages(source, name):
-                values[name] = self._values_with(name, obs)
-        strengths = exchanged.read[team].norm(dim=2).flatten()
-        return SourceReading(exchanged.write_attention[team], exchanged.read_attention[team], strengths, values)
+            with _other_messages(self.source, name):
+                values_without[name] = self._values_with(name, obs)
+        return reading._replace(
+            write_attention=exchanged.write_attention[team],
+            read_attention=exchanged.read_attention[team],
+            message_strengths=exchanged.read[team].norm(dim=2).flatten(),
+            values_without=values_without,
+        )
 
     def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
         """Compute values (B,) with replaced messages."""
@@ -254,22 +239,20 @@ class QReader:
         values, latents, self._state = self.policy.evaluate(obs, self._state, starts)
         best = values.argmax(dim=1)
         probabilities = th.nn.functional.one_hot(best, values.shape[1]).to(values.dtype)
-        pool = self._pool(values, latents)
-        return StepReading(best.cpu().numpy(), greedy_q_tot(self.policy, obs, values), probabilities, pool, None)
+        reading = StepReading(best.cpu().numpy(), greedy_q_tot(self.policy, obs, values), probabilities)
+        if not isinstance(self.policy.actor, PolicyPool):
+            return reading
+        # The weights with which training samples heads, and each head's best action with probability 1.
+        log_weights, of_heads = self.policy.actor.evaluate(latents)
+        of_heads = of_heads.masked_fill(values.isneginf().unsqueeze(1), -th.inf)  # illegal actions
+        is_best = of_heads == of_heads.max(dim=2, keepdim=True).values
+        pool_actions = th.zeros_like(of_heads).masked_fill(~is_best, -th.inf)
+        return reading._replace(pool_weights=log_weights.exp(), pool_actions=pool_actions)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """See :class:`PolicyReader`."""
         state = None if self._state is None else tuple(part[rows] for part in self._state)
         return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state).values)
-
-    def _pool(self, values: th.Tensor, latents: th.Tensor) -> PoolReading | None:
-        """Return the weights with which training samples heads, and each head's best action with probability 1."""
-        if not isinstance(self.policy.actor, PolicyPool):
-            return None
-        log_weights, of_heads = self.policy.actor.evaluate(latents)
-        of_heads = of_heads.masked_fill(values.isneginf().unsqueeze(1), -th.inf)  # illegal actions
-        is_best = of_heads == of_heads.max(dim=2, keepdim=True).values
-        return PoolReading(log_weights.exp(), th.zeros_like(of_heads).masked_fill(~is_best, -th.inf))
 
 
 def _saf_states(policy: TeamPolicy) -> SAFStates | None:

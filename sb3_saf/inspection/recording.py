@@ -42,7 +42,6 @@ from sb3_saf.inspection.reading import (
     PolicyReader,
     QReader,
     Replacement,
-    StepReading,
     reader_of,
     require_our_policy,
 )
@@ -156,25 +155,25 @@ class EpisodeRecording(NamedTuple):
     n_agents: int
     of_team: bool
     gamma: float
-    observations: npt.NDArray[Any] | None
     actions: npt.NDArray[Any]
-    action_probabilities: Floats | None
     counted: Bools
     rewards: Floats
     ends: Bools
     last_values: Floats
     values: Floats
     returns: Doubles
-    zones: Ints | None
-    pool_weights: Floats | None
-    pool_actions: Floats | None
-    write_attention: Floats | None
-    read_attention: Floats | None
-    message_strengths: Floats | None
-    values_without: dict[Replacement, Floats]
     episode_returns: list[float]
     episode_lengths: list[int]
     pictures: list[Picture]
+    values_without: dict[Replacement, Floats]
+    observations: npt.NDArray[Any] | None = None
+    action_probabilities: Floats | None = None
+    zones: Ints | None = None
+    pool_weights: Floats | None = None
+    pool_actions: Floats | None = None
+    write_attention: Floats | None = None
+    read_attention: Floats | None = None
+    message_strengths: Floats | None = None
 
     @property
     def counted_games(self) -> Bools:
@@ -245,8 +244,8 @@ class _Recorder:
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self.pictures: list[Picture] = []
-        self.readings: list[StepReading] = []
         self.columns: dict[str, list[npt.NDArray[Any]]] = defaultdict(list)
+        self.without: dict[Replacement, list[Floats]] = defaultdict(list)
 
     def play(self, n_episodes: int, zones: ZoneFunction | None, draws: bool) -> None:
         """Play episodes, and collect the results of every step."""
@@ -260,8 +259,14 @@ class _Recorder:
             if zones is not None:
                 self.columns["zones"].append(zones_now(zones, self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None
-            self.readings.append(self.reader.step(_tensors(policy, obs), starts, masks))
-            return self.readings[-1].actions
+            reading = self.reader.step(_tensors(policy, obs), starts, masks)
+            self.columns["actions"].append(reading.actions)
+            for name, value in reading._asdict().items():
+                if isinstance(value, th.Tensor):
+                    self.columns[name].append(value.cpu().numpy())
+            for replacement, values in reading.values_without.items():
+                self.without[replacement].append(values.cpu().numpy())
+            return reading.actions
 
         for step in play(self.env, act, n_episodes):
             self._collect(step)
@@ -290,42 +295,19 @@ class _Recorder:
 
     def recording(self, gamma: float) -> EpisodeRecording:
         """Return the recording of all steps so far."""
-        columns = {name: np.stack(column) for name, column in self.columns.items()}
-        pools = [reading.pool for reading in self.readings if reading.pool]
-        sources = [reading.source for reading in self.readings if reading.source]
-        values = _stack([reading.values for reading in self.readings])
-        assert values is not None
+        columns: dict[str, Any] = {name: np.stack(column) for name, column in self.columns.items()}
+        of_critic: dict[str, Any] = {name: columns[name] for name in ("rewards", "ends", "last_values", "values")}
         return EpisodeRecording(
             n_agents=self.n_agents,
             of_team=self.reader.of_team,
             gamma=gamma,
-            observations=columns.get("observations"),
-            actions=np.stack([reading.actions for reading in self.readings]),
-            action_probabilities=_stack([r.probabilities for r in self.readings if r.probabilities is not None]),
-            counted=columns["counted"],
-            rewards=columns["rewards"],
-            ends=columns["ends"],
-            last_values=columns["last_values"],
-            values=values,
-            returns=lambda_returns(columns["rewards"], columns["ends"], columns["last_values"], values, gamma),
-            zones=columns.get("zones"),
-            pool_weights=_stack([pool.weights for pool in pools]),
-            pool_actions=_stack([pool.actions for pool in pools]),
-            write_attention=_stack([source.write for source in sources]),
-            read_attention=_stack([source.read for source in sources]),
-            message_strengths=_stack([source.strengths for source in sources]),
-            values_without={
-                name: th.stack([source.values[name] for source in sources]).cpu().numpy()
-                for name in (sources[0].values if sources else ())
-            },
+            returns=lambda_returns(**of_critic, gamma=gamma),
             episode_returns=self.returns,
             episode_lengths=self.lengths,
             pictures=self.pictures,
+            values_without={name: np.stack(values) for name, values in self.without.items()},
+            **columns,
         )
-
-
-def _stack(tensors: list[th.Tensor]) -> Floats | None:
-    return th.stack(tensors).cpu().numpy() if tensors else None
 
 
 def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:

@@ -208,7 +208,12 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
         # A separate group, because the page shows bands after all lines of their group.
         groups["Team return"] = {"evaluation, with 95 % interval": ["Margin", list(_BAND)]}
     for group, charts in (_CHARTS | (_VALUE_CHARTS if value_based else {})).items():
-        kept = {name: patterns for name, patterns in charts.items() if any(_is_coming(p, tags) for p in patterns)}
+        # Those for which the run has scalars, from inspection or from the algorithm's logs.
+        kept = {
+            name: patterns
+            for name, patterns in charts.items()
+            if any(p.startswith(_OF_ALGORITHMS) or any(re.fullmatch(p, tag) for tag in tags) for p in patterns)
+        }
         if kept:
             groups[group] = {name: ["Multiline", [f"^{p}$" for p in patterns]] for name, patterns in kept.items()}
     zones = sorted({tag.split("/")[1] for tag in tags if tag.startswith("pool_by_zone/")})
@@ -221,11 +226,6 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
             for zone in zones
         }
     return groups
-
-
-def _is_coming(pattern: str, tags: Iterable[str]) -> bool:
-    """Return whether a run has scalars for a pattern, from inspection or from the algorithm's logs."""
-    return pattern.startswith(_OF_ALGORITHMS) or any(re.fullmatch(pattern, tag) for tag in tags)
 
 
 def hyperparameters(
