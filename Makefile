@@ -13,7 +13,7 @@ TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
 GRIDWORLDS = $(VENV)/.gridworlds
 
-.PHONY: help install train test bench docs notebooks check format-check lint types format clean distclean
+.PHONY: help install train test coverage bench docs notebooks check format-check lint types format clean distclean
 
 help: ## this list (the default)
 	@echo "make TARGET, with TARGET one of"
@@ -32,6 +32,9 @@ check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, noteboo
 	@$(MAKE) --no-print-directory docs
 	@$(MAKE) --no-print-directory notebooks
 	@$(MAKE) --no-print-directory test
+
+coverage: $(INSTALLED) ## run the tests and print their branch coverage
+	@$(RUN) pytest -n $(JOBS) --dist loadscope --cov sb3_saf --cov hecogrid_envs --cov-branch --cov-report term:skip-covered $(PYTEST_ARGS)
 
 bench: $(GRIDWORLDS) ## measure speed beside other gridworlds; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
@@ -63,6 +66,7 @@ format: $(INSTALLED) ## format the code and repair what ruff can repair
 	@$(RUN) ruff format .
 
 install: $(INSTALLED) ## only set up .venv, with all that tests, documentation and notebooks need
+	@echo "to go on: source $(VENV)/bin/activate"
 
 # Repeated when one of these files changes; an interrupted installation leaves no stamp and is continued.
 $(TRAINING): setup.cfg pyproject.toml constraints.txt
