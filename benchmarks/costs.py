@@ -3,7 +3,7 @@ Compare the costs of encoders and methods: ``python -m benchmarks.costs``.
 
 Encoders: forward and backward passes over views of HECOGrid (7 x 7 tiles, 28 x 28 pixels) and over larger images.
 Methods: rollout and update of PPO on TeamSupport with 10 agents, with each encoder (``MLPEncoder`` reads the tile codes
-as numbers, so its cost is that of vector observations).
+as numbers, so it costs what vector observations cost).
 
 Processor time of one core; programs take turns, and the table shows medians.
 """

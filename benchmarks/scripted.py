@@ -11,7 +11,7 @@ Besides a random team there are two scripted ones, which know the rules, includi
   reaches soonest, by shortest path, and waits there for the rest. In KeyForTreasure one agent of each group fetches a
   key.
 
-Games are those of the zoo's size ``small``, the same with twice as many agents at the same density, and the paper's.
+Games: the zoo's size ``small``, twice as many agents at the same density, and the paper's.
 Means and 95 % intervals (Student's t) over games. The scripts know the actions of each zone, so heterogeneity affects
 only the random team.
 """

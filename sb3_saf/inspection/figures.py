@@ -82,7 +82,7 @@ def _numbers(count: int) -> list[str]:
 
 
 def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
-    """Draw how often each policy is chosen in each zone, (K, U); ``colours`` are those of the zones."""
+    """Draw how often each policy is chosen in each zone, (K, U); with the zones' ``colours``."""
     n_zones, n_policies = table.shape
     figure, (axes,) = _figure(5.6, 1.8 + 0.55 * max(3, n_zones), title="Which policy acts in which zone")
     _heat_map(axes, table, "chosen", vmax=1.0)

@@ -51,8 +51,8 @@ def pool_scalars(recording: EpisodeRecording, action_space: spaces.Space[Any]) -
     Compute how often each policy is selected, the entropy of selection, and the differences between policies.
 
     Entropies are divided by log U, from 0 to 1. ``entropy`` is the mean entropy of one observation's weights,
-    ``entropy_of_mean`` that of the mean weights. Both low: the pool has collapsed to one policy. The first low, the
-    second high: confident selection that depends on the observation. Both high: all policies are blended.
+    ``entropy_of_mean`` the entropy of the mean weights. Both low: the pool has collapsed to one policy. The first low,
+    the second high: confident selection that depends on the observation. Both high: all policies are blended.
     """
     if recording.pool_weights is None or recording.pool_actions is None:
         return {}
