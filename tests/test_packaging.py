@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -148,3 +149,13 @@ def test_ci_runs_the_check_target() -> None:
     script = ROOT / ".ci" / "run"
     assert script.stat().st_mode & 0o111
     assert script.read_text(encoding="utf-8").splitlines()[-1] == "exec make check"
+
+
+def test_workflows_call_make_targets_on_the_declared_versions_of_python() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8"))["jobs"]
+    commands = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    called = {target for command in commands if command.startswith("make ") for target in command.split()[1:]}
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {"test", "docs", "notebooks", "lint", "types"} <= called <= targets
+    classifiers = _setup_cfg()["metadata"]["classifiers"]
+    assert jobs["tests"]["strategy"]["matrix"]["python"] == re.findall(r":: (3\.\d+)", classifiers)
