@@ -18,9 +18,9 @@ from typing import Final, NamedTuple
 import pandas as pd
 
 from sb3_saf.experiments.cli import main as experiments
-from sb3_saf.experiments.files import read_json
 from sb3_saf.experiments.tables import read_results
 from sb3_saf.suites.registry import suites
+from sb3_saf.training.folders import Run
 from sb3_saf.training.statistics import mean_over_seeds
 
 METHODS: Final = ("saf", "mappo", "ippo", "qplex")
@@ -130,9 +130,9 @@ def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str], earlier: 
             yield kept[0]
         else:
             yield f"| {' | '.join(row(task, folder / task.name, methods, others))} |"
-    versions = [read_json(path) for path in folder.glob("*/cells/*/*/*/versions.json")]
+    runs = [Run(path.parent) for path in folder.glob("*/cells/*/*/*/run.json")]
     yield ""
-    yield f"Commits: {', '.join(sorted({one['commit'] for one in versions if one})) or 'none'}. Others:"
+    yield f"Commits: {', '.join(sorted({run.description['versions']['commit'] for run in runs})) or 'none'}. Others:"
     yield ""
     for (task, program), found in known.groupby(["task", "program"]):
         yield f"- {task}: {program}, {found['source'].iloc[0]}"

@@ -14,14 +14,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from hecogrid_envs import TASK_NAMES
 from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
 from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.training.callbacks import ProgressLines
 from sb3_saf.training.enjoy import TrainedTeam
-from sb3_saf.training.folders import write_run
+from sb3_saf.training.figures import draw_curves
+from sb3_saf.training.folders import python_command, read_curve, write_run
 from sb3_saf.training.run import RunOptions, train
 from sb3_saf.training.settings import Settings, load_settings
 from sb3_saf.training.watching import play, write_video
@@ -56,7 +57,13 @@ def parse(arguments: list[str] | None = None) -> Options:
     parser.add_argument("--game-steps", type=int, default=200_000, help="steps of the game, not of its agents")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"))
-    parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")
+    parser.add_argument(
+        "--no-progress-bar",
+        dest="progress_bar",
+        action="store_false",
+        default=sys.stdout.isatty(),
+        help="a line for every tenth of the training instead, as without a terminal",
+    )
     given = parser.parse_args(arguments)
     level = {"coordination": given.coordination, "heterogeneity": given.heterogeneity}
     try:
@@ -74,7 +81,8 @@ def train_team(options: Options) -> BaseAlgorithm:
         progress=options.progress_bar,
         num_threads=1,  # more threads do not help small networks, and slow down on a busy machine
     )
-    return train(options.settings, options.seed, options.output, run)
+    lines = ProgressLines(verbose=int(not options.progress_bar))
+    return train(options.settings, options.seed, options.output, run, [lines])
 
 
 def evaluate(options: Options, model: Any) -> EvaluationResult:
@@ -90,24 +98,9 @@ def describe(settings: Settings) -> str:
 
 
 def draw_curve(options: Options, random: EvaluationResult) -> Path:
-    """Plot the team return of the training episodes against game steps."""
-    from matplotlib.figure import Figure
-
-    episodes = np.genfromtxt(options.output / "monitor.csv", delimiter=",", skip_header=1, names=True)
-    game_steps, returns = np.cumsum(episodes["l"]), episodes["r"]
-    figure = Figure(figsize=(7, 4), dpi=120, layout="constrained")
-    axes = figure.subplots()
-    axes.plot(game_steps, returns, color="tab:blue", alpha=0.12, linewidth=0.5)
-    window = max(1, min(options.settings.n_envs, len(returns) // 10))
-    smooth = np.convolve(returns, np.ones(window) / window, mode="valid")
-    axes.plot(game_steps[window - 1 :], smooth, color="tab:blue", label=f"SAF (mean of {window} episodes)")
-    axes.axhline(random.mean, color="tab:grey", linestyle="--", label="random team")
-    axes.set(
-        xlabel="game steps",
-        ylabel="team return (treasures)",
-        title=describe(options.settings),
-    )
-    axes.legend(loc="upper left")
+    """Draw the team return of the training episodes against game steps."""
+    curve = read_curve(options.output).assign(method=options.settings.algo, seed=options.seed)
+    figure = draw_curves(curve, describe(options.settings), references={"random team": random.mean})
     path = options.output / "learning_curve.png"
     figure.savefig(path)
     return path
@@ -136,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     settings = options.settings
     given = sys.argv[1:] if arguments is None else arguments
     command = shlex.join(["python", "-m", "sb3_saf.quickstart", *given])
-    write_run(options.output, settings, options.seed, {}, command)
+    write_run(options.output, settings.as_dict(), options.seed, command)
     print(
         f"Training SAF on {describe(settings)}: {settings.game_steps:,} game steps with {settings.n_agents} agents in "
         f"{settings.n_envs} games, in a few minutes"
@@ -152,7 +145,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"learning curve  {curve}")
     print(f"episode         {gif}")
     print(f"replay          {page} (open it in a browser)")
-    print(f"TensorBoard     tensorboard --logdir {options.output / 'tb'}")
+    print(f"TensorBoard     {python_command('tensorboard.main')} --logdir {options.output / 'tb'}")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from pathlib import Path
 
@@ -12,14 +13,16 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, find_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, Level, View, find_experiment, own_experiment
 from sb3_saf.experiments.grid import RunConfig, Selection
-from sb3_saf.experiments.page import losses
+from sb3_saf.experiments.page import losses, means
 from sb3_saf.experiments.report import read_scale
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.experiments.tables import compare, complete, read_results
+from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training.figures import draw_curves
+from sb3_saf.training.folders import finish_run
 from sb3_saf.training.statistics import Estimate, learning_curve, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
 
@@ -89,7 +92,7 @@ def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> 
 
 
 def test_returns_while_learning_are_means_of_whole_curves(folder: Path, page: str) -> None:
-    curves = [pd.read_csv(folder / f"cells/{LEVELS[-1]}/saf/seed-{seed}/curve.csv")["mean_return"] for seed in (0, 1)]
+    curves = [pd.read_csv(folder / f"cells/{LEVELS[-1]}/saf/seed-{seed}/curve.csv")["score"] for seed in (0, 1)]
     low, high = stats.t.interval(
         0.95, 1, loc=np.mean([c.mean() for c in curves]), scale=stats.sem([c.mean() for c in curves])
     )
@@ -147,19 +150,37 @@ def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFix
     part = shutil.copytree(folder, tmp_path / "part")
     shutil.rmtree(part / "cells" / "TeamTogether-c1-h1" / "saf")
     damaged, failed = (part / folder / "TeamSupport-c1-h1" / "ippo" / "seed-0" for folder in ("cells", "unfinished"))
-    (damaged / "status.json").write_text("")
-    (damaged.parent / "seed-1" / "curve.csv").write_text("x,y\n1,2\n")
+    (damaged / "finished.json").write_text("")
+    other = damaged.parent / "seed-1"
+    (other / "curve.csv").write_text("x,y\n1,2\n")
     failed.mkdir(parents=True)
     (failed / "error.txt").write_text("out of luck")
     page = report(part, "--levels", "1", "2")
-    assert f"**3 of {2 * N_CELLS // 3} cells are missing**" in page
+    assert f"**4 of {2 * N_CELLS // 3} cells are missing**" in page
     assert "- saf TeamTogether c=1, h=1 seed 1: not run yet" in page
     assert f"- ippo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page
-    assert f"- damaged: {damaged / 'status.json'} cannot be read: " in page
-    assert "seed-1/curve.csv is no learning curve: " in page
+    assert f"- damaged: {damaged / 'finished.json'} cannot be read: " in page
+    assert f"- damaged: {other / 'curve.csv'} has changed since the run was finished" in page
     assert "| saf | – |" in page
-    assert "the seeds 1, which all methods have" in page
-    assert f"3 of {2 * N_CELLS // 3} cells are missing; the page names them" in capsys.readouterr().err
+    assert f"4 of {2 * N_CELLS // 3} cells are missing; the page names them" in capsys.readouterr().err
+
+
+def test_commits_that_differ_are_in_the_warning(folder: Path, tmp_path: Path) -> None:
+    part = shutil.copytree(folder, tmp_path / "part")
+    assert "**Cells differ" not in report(part)
+    cell = part / "cells" / "TeamSupport-c1-h1" / "saf" / "seed-0"
+    description = read_json(cell / "run.json")
+    description["versions"]["commit"] = "another"
+    write_json(cell / "run.json", description)
+    finish_run(cell)
+    assert "**Cells differ in commit.**" in report(part)
+
+
+def test_names_of_users_do_not_format_the_page(tmp_path: Path) -> None:
+    rows = [("sa|f", seed, "a|b <i>*x*") for seed in (0, 1)]
+    table = pd.DataFrame(rows, columns=["method", "seed", "task"]).assign(return_mean=1.0, level="default")
+    text = means(table.assign(train_level="default"), View("", (Level(),)))
+    assert r"| a\|b \<i\>\*x\* | default | seeds |" in text and r"| sa\|f | 1.00 " in text
 
 
 def test_a_killed_report_leaves_the_old_one(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,15 +272,14 @@ def test_aggregates_compare_like_with_like() -> None:
 
 def test_another_experiment_runs_and_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With one method and one seed there is no spread, so the page leaves intervals out."""
-    monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
     monkeypatch.chdir(tmp_path)
-    name = "ood-ablation"
-    words = ["--size", "smoke", "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "0"]
-    assert cli.main(["run", name, *words, "--hyperparams", "n_epochs:1", "--game-steps", "80"]) == 0
+    name, results = "ood-ablation", Path("runs", "experiments", "smoke")
+    selection = Selection((0,), ("ippo",), ("TeamSupport-v0",))
+    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80})
+    run(find_experiment(name), selection, config, Results(results), InlineEngine())
     assert cli.main(["report", name, "--size", "smoke"]) == 0
-    results = tmp_path / "runs" / "experiments" / "smoke" / name
-    page = (results / "report.md").read_text(encoding="utf-8")
-    charts = {path.name for path in results.glob("levels-*.png")}
+    page = (results / name / "report.md").read_text(encoding="utf-8")
+    charts = {path.name for path in (results / name).glob("levels-*.png")}
     assert charts == {f"levels-{view.axis.replace(' = ', '-')}.png" for view in EXPERIMENTS[name].views}
     for view in EXPERIMENTS[name].views:
         assert f"## Team return by {view.axis}{view.suffix}" in page
@@ -267,21 +287,28 @@ def test_another_experiment_runs_and_reports(tmp_path: Path, monkeypatch: pytest
     assert "--hyperparams n_epochs:1" in page and "--game-steps 80" in page
 
 
-def test_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Any environment of ``sb3_saf.train``, with a varied parameter."""
-    monkeypatch.setattr(cli, "_engine", lambda options: InlineEngine())
     monkeypatch.chdir(tmp_path)
-    words = ["--env", "tests.toy_envs:CounterEnv", "--vary", "max_cycles:[3,5]", "--size", "smoke", "-n", "24"]
-    words += ["--methods", "mappo", "ippo", "--seeds", "0", "--episodes", "2"]
-    words += ["--hyperparams", "n_envs:2", "n_steps:3", "n_minibatches:1"]
-    assert cli.main(["run", *words]) == 0
-    assert cli.main(["report", "tests.toy_envs-CounterEnv"]) == 0
-    folder = tmp_path / "runs" / "experiments" / "tests.toy_envs-CounterEnv"
-    page = (folder / folder.name / "report.md").read_text(encoding="utf-8")
+    env, name = "tests.toy_envs:CounterEnv", "tests.toy_envs-CounterEnv"
+    folder = Path("runs", "experiments", name)
+    config = RunConfig("smoke", {"game_steps": 24, "n_envs": 2, "n_steps": 3, "n_minibatches": 1}, 2)
+    experiment = own_experiment(name, [env], {"max_cycles": [3, 5]})
+    run(experiment, Selection((0,), ("mappo", "ippo")), config, Results(folder), InlineEngine())
+    assert cli.main(["report", env]) == 0
+    page = (folder / name / "report.md").read_text(encoding="utf-8")
     assert "2 agents, 24 game steps of training. mappo, ippo and a random team" in page
     assert "| tests.toy_envs:CounterEnv | max_cycles=3 | max_cycles=5 | seeds |" in page
-    assert "--env tests.toy_envs:CounterEnv --size smoke" in page and "--vary 'max_cycles:[3, 5]'" in page
-    table = pd.read_csv(folder / folder.name / "table.csv")
+    table = pd.read_csv(folder / name / "table.csv")
     assert table["score"].between(0, 1).all() and table["max_return"].isna().all()
+    # The printed command runs as printed, and finds everything finished.
+    (again,) = (line for line in page.splitlines() if line.startswith("python -m sb3_saf.experiments run"))
+    assert cli.main([*shlex.split(again)[3:], "--workers", "1"]) == 0
+    assert "6 finished, 0 to run" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):  # another experiment of that name
+        cli.main(["run", "--env", env, "--vary", "max_cycles:[4]", "--seeds", "0"])
     with pytest.raises(SystemExit, match="2"):
-        cli.main(["run", *words, "--vary", "max_cycles:[4]"])
+        cli.main(["report", "counter", "-f", str(folder)])
+    assert name in capsys.readouterr().err

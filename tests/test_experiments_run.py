@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -18,15 +20,16 @@ import torch as th
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_saf import EvaluationResult, TeamMonitor
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.cell import Job, curve, run_job
+from sb3_saf.experiments.cell import Job, run_job
 from sb3_saf.experiments.definitions import Level, find_experiment
-from sb3_saf.experiments.files import differences
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
-from sb3_saf.suites.hecogrid import NativeVecEnv
 from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.files import differences, read_json, write_json
+from sb3_saf.training.folders import finish_run
 from sb3_saf.training.train import main as train_main
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 
@@ -85,24 +88,23 @@ def test_the_table_has_a_row_for_each_cell_and_level(undisturbed: Path) -> None:
 def test_a_cell_has_everything_to_be_understood_and_trained_again(undisturbed: Path) -> None:
     folder = cell_of(undisturbed)
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    described = ("cell.json", "command.txt", "config.json", "status.json", "versions.json")
-    assert names == {*described, "curve.csv", "model.zip", "tests/c2-h2.json"}
-    config, versions, status = (
-        json.loads((folder / f"{n}.json").read_text()) for n in ("config", "versions", "status")
-    )
-    assert (config["algo"], config["game_steps"], config["env_kwargs"]["coordination"]) == ("mappo", 400, 2)
-    assert (config["seed"], config["test"]) == (1, {"episodes": 32, "deterministic": False})
-    assert versions["torch"] == th.__version__ and versions["commit"]
-    assert status["processor_seconds"] > 0 and status["wall_seconds"] > 0
+    assert names == {"run.json", "curve.csv", "model.zip", "tests/c2-h2.json", "finished.json"}
+    description, finished = read_json(folder / "run.json"), read_json(folder / "finished.json")
+    settings = description["settings"]
+    assert (settings["algo"], settings["game_steps"], settings["env_kwargs"]["coordination"]) == ("mappo", 400, 2)
+    assert (description["seed"], description["options"]["test"]) == (1, {"episodes": 32, "deterministic": False})
+    assert description["versions"]["torch"] == th.__version__ and description["versions"]["commit"]
+    assert finished["processor_seconds"] > 0 and finished["wall_seconds"] > 0
+    assert set(finished["files"]) == names - {"finished.json"}
     points = np.genfromtxt(folder / "curve.csv", delimiter=",", names=True)
-    assert points.dtype.names == ("game_steps", "processor_seconds", "mean_return", "episodes")
+    assert points.dtype.names == ("game_steps", "processor_seconds", "score", "episodes")
     assert points["game_steps"][-1] == 400
     assert (np.diff(points["processor_seconds"]) >= 0).all()
-    assert points["processor_seconds"][-1] == pytest.approx(status["processor_seconds"], abs=0.01)
+    assert points["processor_seconds"][-1] == pytest.approx(finished["processor_seconds"], abs=0.1)
 
 
 def test_the_command_trains_the_same_model(undisturbed: Path, tmp_path: Path) -> None:
-    command = (cell_of(undisturbed) / "command.txt").read_text().split()
+    command = read_json(cell_of(undisturbed) / "run.json")["command"].split()
     assert command[:3] == ["python", "-m", "sb3_saf.train"]
     extra = ["-f", str(tmp_path), "--num-threads", "1", "--no-progress"]
     train_main([*command[3:], *extra])
@@ -143,7 +145,7 @@ def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path
     process.kill()
     process.wait()
     wait_until(lambda: not is_running(worker), seconds=20)
-    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cells/*/*/*/status.json")}
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cells/*/*/*/finished.json")}
     assert 1 <= len(kept) < 4
     run_inline(tmp_path, replace(ONE, seeds=(0, 1)))
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -220,19 +222,15 @@ def test_a_failed_cell_says_why_and_is_tried_again(tmp_path: Path, capsys: pytes
     assert len(read_table(tmp_path / "joint" / "table.csv")) == 3
 
 
-def test_exit_codes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(folder: Path) -> None:
-        raise KeyboardInterrupt
-
-    words = ["run", "joint", "--size", "smoke", "--seeds", "0", "--levels", "2", "--retries", "0", "-f", str(tmp_path)]
-    for work, method, code, message in (
-        (work_badly, "mappo", 1, "1 cells failed; the same command tries them again"),
-        (interrupted, "mappo", 130, "finished cells and checkpoints are kept; the same command continues"),
-        (work_badly, "ippo", 0, ""),
-    ):
-        monkeypatch.setattr(cli, "_engine", lambda options, work=work: InlineEngine(work))
-        assert cli.main([*words, "--methods", method]) == code
-        assert message in capsys.readouterr().err
+def test_a_cell_that_diverges_is_one_line_and_the_exit_code_is_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", "joint", "--size", "smoke", "--seeds", "0", "--levels", "2", "--methods", "ippo", "-n", "80"]
+    words += ["--retries", "0", "--workers", "2", "-f", str(tmp_path), "-params", "learning_rate:1.0e30"]
+    assert cli.main(words) == 1
+    printed = capsys.readouterr()
+    assert "ippo TeamSupport c=2, h=2 seed 0: FAILED: " in printed.out
+    assert "1 cells failed; the same command tries them again" in printed.err
 
 
 def refused(folder: Path, config: RunConfig) -> str:
@@ -252,10 +250,10 @@ def test_other_settings_are_refused(undisturbed: Path) -> None:
 def test_changed_files_of_zoo_configs_are_refused(undisturbed: Path, tmp_path: Path) -> None:
     """The YAML differs from the one with which the cell was trained."""
     folder = shutil.copytree(undisturbed, tmp_path / "copy")
-    path = cell_of(folder) / "config.json"
-    config = json.loads(path.read_text())
-    config["hyperparams"]["n_epochs"] = 9
-    path.write_text(json.dumps(config))
+    description = read_json(cell_of(folder) / "run.json")
+    description["settings"]["hyperparams"]["n_epochs"] = 9
+    write_json(cell_of(folder) / "run.json", description)
+    finish_run(cell_of(folder))
     assert "hyperparams.n_epochs was 9, now 2; restore them, delete that cell" in refused(folder, SMOKE)
 
 
@@ -296,37 +294,69 @@ def test_runs_at_once_divide_the_cells(undisturbed: Path, tmp_path: Path, capsys
     assert ours == [row for row in theirs if row["method"] != "mappo" and row["coordination"] == "2"]
 
 
-DAMAGED = ["", "[]", "{}", '{"state": 1}', "[" * 100_000, "\x00", "not JSON"]
+def edited(**changes: Any) -> Callable[[Path], None]:
+    """Change entries of a JSON file."""
+    return lambda path: write_json(path, {**read_json(path), **changes})
 
 
-@pytest.mark.parametrize("content", DAMAGED)
-@pytest.mark.parametrize("name", ["status.json", "config.json", "tests/c2-h2.json"])
-def test_damaged_files_are_read_as_missing(name: str, content: str, undisturbed: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(undisturbed, tmp_path / "copy")
-    level = Level.of(coordination=2, heterogeneity=2)
-    cell, path = Cell("mappo", "TeamSupport-v0", level, 1, (level,)), cell_of(folder) / name
-    assert not Results(folder).missing_tests(cell)
-    path.write_text(content)
-    results = Results(folder)
-    assert results.missing_tests(cell) == (level,) and list(results.damaged) == [path]
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
 
 
-def test_damaged_files_are_named_and_their_cells_run_again(
-    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def write(content: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(content)
+
+
+def relisted(path: Path) -> None:
+    """Replace returns by NaN, also in the list of files: as if the games had paid it."""
+    edited(returns=[float("nan")] * 32)(path)
+    finish_run(path.parents[1])
+
+
+DAMAGE: dict[str, Any] = {
+    "model.zip cut": ("model.zip", cut),
+    "model.zip missing": ("model.zip", Path.unlink),
+    "curve.csv cut": ("curve.csv", cut),
+    "curve.csv missing": ("curve.csv", Path.unlink),
+    "run.json edited": ("run.json", edited(seed=5)),
+    "run.json missing": ("run.json", Path.unlink),
+    "finished.json empty": ("finished.json", write("")),
+    "finished.json a list": ("finished.json", write("[]")),
+    "finished.json nested": ("finished.json", write("[" * 100_000)),
+    "finished.json missing": ("finished.json", Path.unlink),
+    "mean edited": ("tests/c2-h2.json", edited(return_mean=99.0)),
+    "return edited": ("tests/c2-h2.json", edited(returns=[99.0] * 32)),
+    "returns missing": ("tests/c2-h2.json", edited(returns=[1.0] * 3)),
+    "returns not finite": ("tests/c2-h2.json", relisted),
+    "no JSON": ("tests/c2-h2.json", write("\x00")),
+    "test missing": ("tests/c2-h2.json", Path.unlink),
+}
+
+
+@pytest.mark.parametrize(("name", "damage"), DAMAGE.values(), ids=DAMAGE)
+def test_damaged_cells_are_named_and_run_again(
+    name: str, damage: Callable[[Path], None], undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = shutil.copytree(undisturbed, tmp_path / "copy")
-    names = ("status.json", "config.json", "tests/c2-h2.json")
-    damaged = [cell_of(folder, "ippo", 0) / names[0], cell_of(folder, "ippo", 1) / names[1], cell_of(folder) / names[2]]
-    for path in damaged:
-        path.write_text("not JSON")
-    capsys.readouterr()
+    folder, level = shutil.copytree(undisturbed, tmp_path / "copy"), Level.of(coordination=2, heterogeneity=2)
+    cell = Cell("mappo", "TeamSupport-v0", level, 1, (level,))
+    assert not Results(folder).missing_tests(cell)
+    damage(cell_of(folder) / name)
+    assert Results(folder).missing_tests(cell) == (level,)
     summary, engine = run_inline(folder)
-    assert summary == Summary(3, [], [])
-    printed = capsys.readouterr().out
-    assert all(str(path) in printed for path in damaged)
-    assert sorted(engine.with_model) == [False, False, True]
+    assert (summary, engine.with_model) == (Summary(1, [], []), [name.startswith("tests/")])
+    assert str(cell_of(folder)) in capsys.readouterr().out
     assert read_table(folder / "joint" / "table.csv") == read_table(undisturbed / "joint" / "table.csv")
-    assert_same_weights(cell_of(folder, "ippo", 0) / "model.zip", cell_of(undisturbed, "ippo", 0) / "model.zip")
+    assert_same_weights(cell_of(folder) / "model.zip", cell_of(undisturbed) / "model.zip")
+    # Nothing that was found is removed.
+    assert len(list(folder.glob("damaged/*/*/seed-1_*"))) == (not name.startswith("tests/"))
+
+
+def test_a_game_that_pays_nan_in_a_test_fails_the_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_saf.experiments.cell.evaluate_team", lambda *_: EvaluationResult([float("nan")], [1]))
+    summary, _ = run_inline(tmp_path, ONE)
+    assert summary.finished == 0 and len(summary.failed) == 2
+    monkeypatch.undo()
+    assert run_inline(tmp_path, ONE)[0] == Summary(2, [], [])
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[" * 100_000])
@@ -360,27 +390,17 @@ def test_a_cell_appears_at_once_or_not_at_all(tmp_path: Path, monkeypatch: pytes
     assert summary.finished == 2
 
 
-def test_curve(tmp_path: Path) -> None:
-    """Five episodes of 10 steps, two games: two points, of at least two episodes each."""
-    path = tmp_path / "monitor.csv"
-    path.write_text("#{}\nr,l,t\n1,10,0\n2,10,0\n6,10,0\n4,10,0\n8,10,0\n")
-    clock = np.array([[0, 0, 0], [20, 4, 9], [50, 7, 20]])
-    assert (
-        curve(path, clock, 2) == "game_steps,processor_seconds,mean_return,episodes\n30,5.000,3.0,3\n50,7.000,6.0,2\n"
-    )
-
-
 def struck_at(monkeypatch: pytest.MonkeyPatch, step: int | None) -> list[int]:
     """Count the steps of vector environments; simulate the death of the process at one of them."""
-    played, play = [0], NativeVecEnv.step_wait
+    played, play = [0], TeamMonitor.step_wait
 
-    def counted(self: NativeVecEnv) -> Any:
+    def counted(self: TeamMonitor) -> Any:
         played[0] += 1
         if played[0] == step:
             raise RuntimeError("struck")
         return play(self)
 
-    monkeypatch.setattr(NativeVecEnv, "step_wait", counted)
+    monkeypatch.setattr(TeamMonitor, "step_wait", counted)
     return played
 
 
@@ -405,7 +425,7 @@ def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(method: str, tmp_pat
     first = attempt(killed, (n_steps - n_tested) * 2 // 3)
     second = attempt(killed, (n_steps - n_tested) // 3 + 15)  # in a test: the trained model is kept
     rest = attempt(killed)
-    assert rest == n_tested
+    assert rest == n_tested // 2  # the first test is kept
     assert first + second < n_steps + (n_steps - n_tested) / 2
     assert what_counts(whole / "result") == what_counts(killed / "result")
 
@@ -416,11 +436,29 @@ def what_counts(cell_folder: Path) -> dict[str, Any]:
     files = sorted(str(path.relative_to(cell_folder)) for path in cell_folder.rglob("*") if path.is_file())
     with zipfile.ZipFile(cell_folder / "model.zip") as model:
         weights = model.read("policy.pth")
-    texts = [(cell_folder / name).read_text() for name in ("config.json", "command.txt")]
     points = np.genfromtxt(cell_folder / "curve.csv", delimiter=",", names=True)
     assert (np.diff(points["processor_seconds"]) >= 0).all()
-    curve = [points[name].tolist() for name in ("game_steps", "mean_return", "episodes")]
-    return {"tests": tests, "files": files, "weights": weights, "texts": texts, "curve": curve}
+    curve = [points[name].tolist() for name in ("game_steps", "score", "episodes")]
+    description = (cell_folder / "run.json").read_text()
+    return {"tests": tests, "files": files, "weights": weights, "run": description, "curve": curve}
+
+
+def test_a_cell_killed_after_its_model_was_saved_does_not_train_anew(tmp_path: Path) -> None:
+    """Checkpoints go last."""
+    short = replace(SMOKE, overrides={"game_steps": 200})
+    whole, killed = (job_in(tmp_path / name, config=short) for name in ("whole", "killed"))
+    n_steps = attempt(whole)
+
+    def killed_here(folder: Path, **cost: Any) -> None:
+        raise RuntimeError("struck")
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("sb3_saf.training.run.finish_run", killed_here)
+        with pytest.raises(RuntimeError, match="struck"):
+            run_job(killed)
+    assert (killed / "result" / "model.zip").exists()
+    assert attempt(killed) < n_steps / 2
+    assert what_counts(whole / "result") == what_counts(killed / "result")
 
 
 def test_checkpoints_of_other_settings_are_left_alone_and_finished_cells_keep_none(tmp_path: Path) -> None:
@@ -429,26 +467,58 @@ def test_checkpoints_of_other_settings_are_left_alone_and_finished_cells_keep_no
         struck_at(monkeypatch, 15)
         summary, _ = run_inline(tmp_path, ONE)
     (failed, *_) = summary.failed
-    folder = results.unfinished(failed)
-    assert list(folder.glob("training/checkpoints/*.ckpt"))
-    (folder / "config.json").write_text("{}")  # as if the settings had been different
+    result = results.unfinished(failed) / "result"
+    assert list(result.glob("checkpoints/*.ckpt"))
+    write_json(result / "run.json", {**read_json(result / "run.json"), "seed": 7})  # as if it were another's
     run_inline(tmp_path, ONE)
-    assert results.is_finished(failed) and not (tmp_path / "unfinished").exists()
+    assert results.run(failed) is not None and not (tmp_path / "unfinished").exists()
+    assert not list(tmp_path.glob("cells/*/*/*/checkpoints"))
 
 
-def test_a_cell_can_be_checked(undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = shutil.copytree(undisturbed, tmp_path / "copy")
-    cell, other = cell_of(folder), cell_of(folder, seed=0)
-    assert cli.main(["check", str(cell)]) == 0
-    assert capsys.readouterr().out == "equal, bit for bit: returns at c=2, h=2, learning curve, weights\n"
-    shutil.copy(other / "model.zip", cell)
-    test = json.loads((cell / "tests" / "c2-h2.json").read_text())
-    test["returns"][3] += 1
-    (cell / "tests" / "c2-h2.json").write_text(json.dumps(test))
-    assert cli.main(["check", str(cell)]) == 1
+def with_weights(path: Path, change: Callable[[th.Tensor], th.Tensor]) -> None:
+    """Change the last tensor of the policy in a model's file, and list the file anew."""
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    tensors = th.load(io.BytesIO(content["policy.pth"]), weights_only=True)
+    name = list(tensors)[-1]
+    tensors[name] = change(tensors[name])
+    buffer = io.BytesIO()
+    th.save(tensors, buffer)
+    with zipfile.ZipFile(path, "w") as archive:
+        for entry, data in {**content, "policy.pth": buffer.getvalue()}.items():
+            archive.writestr(entry, data)
+    finish_run(path.parent)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda tensor: tensor, ""),
+        (lambda tensor: tensor * float("nan"), "tensors differ"),
+        (lambda tensor: tensor.double(), "torch.float64"),
+        (lambda tensor: tensor.reshape(1, *tensor.shape), "of shape (1, "),
+    ],
+)
+def test_a_cell_can_be_checked(
+    change: Any, words: str, undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = cell_of(shutil.copytree(undisturbed, tmp_path / "copy"))
+    with_weights(cell / "model.zip", change)
+    assert cli.main(["check", str(cell)]) == bool(words)
     printed = capsys.readouterr().out
-    assert "equal, bit for bit: learning curve\n" in printed
-    assert "different: returns at c=2, h=2: mean" in printed and "different: weights: differ by up to" in printed
+    assert f"equal, bit for bit: returns at c=2, h=2, learning curve{'' if words else ', weights'}\n" in printed
+    assert words in printed.partition("different: weights: ")[2]
+
+
+def test_a_check_sees_edited_numbers(undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shutil.copytree(undisturbed, tmp_path / "copy")
+    cell = cell_of(folder)
+    test = cell / "tests" / "c2-h2.json"
+    edited(returns=[*read_json(test)["returns"][:-1], 99.0], return_mean=99.0)(test)
     with pytest.raises(SystemExit, match="2"):
         cli.main(["check", str(folder)])
-    assert "is no finished cell; expected RESULTS/cells/TASK-LEVEL/METHOD/seed-N" in capsys.readouterr().err
+    assert "expected RESULTS/cells/TASK-LEVEL/METHOD/seed-N" in capsys.readouterr().err
+    assert cli.main(["check", str(cell)]) == 1
+    printed = capsys.readouterr().out
+    assert "equal, bit for bit: learning curve, weights\n" in printed
+    assert "c2-h2.json has changed" in printed and "return_mean was 99.0, now None" in printed

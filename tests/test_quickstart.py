@@ -25,7 +25,7 @@ def test_it_leaves_a_model_that_can_be_replayed_a_curve_a_video_and_logs(
     assert all(f"  {name}" in printed for name in ("SAF", "random"))
     model = PPO.load(output / "model.zip")
     assert model.num_timesteps == 1600 * 5
-    assert imageio.imread(output / "learning_curve.png").shape == (480, 840, 4)
+    assert imageio.imread(output / "learning_curve.png").shape[0] > 400
     assert len(imageio.imread(output / "episode.gif")) == 51
     assert list((output / "tb" / "saf_1").glob("events.out.tfevents.*"))
     assert "</html>" in (output / "replay.html").read_text()

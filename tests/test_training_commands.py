@@ -16,7 +16,6 @@ import numpy as np
 import pettingzoo
 import pytest
 import torch as th
-import yaml
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -30,9 +29,10 @@ from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import folders
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.callbacks import GameStepsProgressBar, RemainingTime
+from sb3_saf.training.callbacks import GameStepsProgressBar, ProgressLines
 from sb3_saf.training.environments import find_environment
-from sb3_saf.training.run import CHECKPOINTS, RunOptions
+from sb3_saf.training.folders import Run
+from sb3_saf.training.run import RunOptions
 from sb3_saf.training.run import train as train_settings
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
 
@@ -103,7 +103,7 @@ def test_options_do_not_change_what_is_learned(
     assert {"model.zip", "best_model.zip", "evaluations.npz", "monitor.csv", "rl_model_400_steps.zip"} <= {
         path.name for path in folder.iterdir()
     }
-    assert not (folder / CHECKPOINTS).exists()
+    assert not (folder / "checkpoints").exists()
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
@@ -190,18 +190,13 @@ def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
     logs = ("-tb", str(tmp_path / "tb"), "--inspect-freq", "-1")
     run = train(tmp_path, *logs, "-params", "gamma:0.9", "policy_kwargs:{n_slots: 3}", algo="saf-no-pool")
     assert run == tmp_path / "saf-no-pool" / f"{ENV}_1"
-    config, given, versions = (
-        yaml.safe_load((run / ENV / f"{name}.yml").read_text()) for name in ("config", "args", "versions")
-    )
-    expected = load_settings(
-        "saf-no-pool", ENV, "smoke", overrides={"gamma": 0.9, "policy_kwargs": {"n_slots": 3}}
-    ).as_dict()
-    assert config == {**expected, "seed": 3}
-    assert given["hyperparams"] == {"gamma": 0.9, "policy_kwargs": {"n_slots": 3}}
-    assert versions["stable-baselines3"] and versions["sb3-saf"]
-    command = (run / ENV / "command.txt").read_text()
-    assert command.startswith("python -m sb3_saf.train --algo saf-no-pool --size smoke")
-    assert "'policy_kwargs:{n_slots: 3}'" in command
+    description = Run(run).description
+    overrides = {"gamma": 0.9, "policy_kwargs": {"n_slots": 3}}
+    assert description["settings"] == load_settings("saf-no-pool", ENV, "smoke", overrides=overrides).as_dict()
+    assert description["seed"] == 3 and description["options"]["eval_episodes"] == 4
+    assert {"stable-baselines3", "sb3-saf", "commit"} <= set(description["versions"])
+    assert description["command"].startswith("python -m sb3_saf.train --algo saf-no-pool --size smoke")
+    assert "'policy_kwargs:{n_slots: 3}'" in description["command"]
     assert list((tmp_path / "tb" / ENV / "saf-no-pool_1").glob("events.*"))
     policy = PPO.load(run / f"{ENV}.zip").policy
     assert isinstance(policy, SAFPolicy)
@@ -250,13 +245,12 @@ def test_the_progress_bar_counts_game_steps() -> None:
     GameStepsProgressBar().close()  # of a training that never started
 
 
-def test_the_remaining_time_is_told_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_for_every_tenth(capsys: pytest.CaptureFixture[str]) -> None:
     settings = load_settings("ippo", ENV, "smoke", overrides={"game_steps": 400})
-    clock = iter(range(0, 10_000, 10))
-    monkeypatch.setattr("sb3_saf.training.callbacks.time.perf_counter", lambda: float(next(clock)))
-    settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=RemainingTime())
-    # Rollouts of 40 game steps take 10 seconds each, measured from the end of the first to that of the third.
-    assert capsys.readouterr().out == "4 game steps per second: about 0:01:10 (h:mm:ss) to go\n"
+    settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=ProgressLines())
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(" of ")[0].strip() for line in lines] == [f"{tenth} %" for tenth in range(10, 101, 10)]
+    assert "team return" in lines[-1] and "about 0:00:00 (h:mm:ss) to go" in lines[-1]
 
 
 # --- any environment --------------------------------------------------------------------------------------------------
@@ -359,7 +353,7 @@ def test_weights_and_biases_follow_the_tensorboard_logs(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert "pip install wandb" in failed(["--size", "smoke", "-n", "40", "--track"], capsys)
-    assert not list(Path("logs").rglob("*.yml"))
+    assert not list(Path("logs").rglob("run.json"))
     given: dict[str, Any] = {}
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=given.update))
     short = ["--size", "smoke", "-n", "40", "--eval-freq", "-1", "--inspect-freq", "-1", "--env", ENV]
@@ -428,7 +422,7 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     line = failed(["--size", "smoke", *options], capsys)
     assert all(word in line for word in words), line
-    assert not list(Path("logs").rglob("*.yml"))  # it would be mistaken for the latest run
+    assert not list(Path("logs").rglob("run.json"))  # it would be mistaken for the latest run
 
 
 def test_help_tells_defaults_and_units() -> None:

@@ -14,7 +14,6 @@ import imageio_ffmpeg
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 
@@ -23,7 +22,8 @@ from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.enjoy import TrainedTeam
-from sb3_saf.training.runs import Run, describe, find_runs, setting_names, training_curve
+from sb3_saf.training.folders import Run, training_curve, write_run
+from sb3_saf.training.plot import describe, find_runs, setting_names
 from sb3_saf.training.settings import load_settings
 from sb3_saf.training.watching import play
 from tests.test_training_commands import failed
@@ -59,7 +59,7 @@ def enjoy(logs: Path, *options: str) -> EvaluationResult:
 def test_returns_are_those_of_the_saved_model_over_games_of_its_level(logs: Path, deterministic: bool) -> None:
     options = ["--deterministic"] if deterministic else []
     result = enjoy(logs, "--exp-id", "3", "--no-render", "--seed", "5", *options)
-    run = Run(logs / "saf" / f"{ENV}_3", ENV, 3)
+    run = Run(logs / "saf" / f"{ENV}_3")
     assert run.settings.env_kwargs["coordination"] == 2
     model = PPO.load(run.folder / f"{ENV}.zip", device="cpu")
     set_random_seed(5)
@@ -104,7 +104,7 @@ def test_gif_mp4_and_text_show_every_step(logs: Path, tmp_path: Path, capsys: py
 
 
 def test_the_shown_game_is_the_first_that_is_measured(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = Run(logs / "saf" / f"{ENV}_3", ENV, 3)
+    run = Run(logs / "saf" / f"{ENV}_3")
     measured = run.settings.make_env(9, evaluation=True, n_envs=1)
     measured.reset()
     (expected,) = measured.env_method("get_state", indices=0)
@@ -165,10 +165,10 @@ def test_a_reader_may_leave(logs: Path, monkeypatch: pytest.MonkeyPatch, capsys:
 
 def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "saf" / f"{ENV}_1"
-    (run / ENV).mkdir(parents=True)
+    run.mkdir(parents=True)
     (run / f"{ENV}.zip").write_bytes(b"no zip")
-    assert "is no run of sb3_saf.train" in failed(["-f", str(tmp_path), "--no-render"], capsys, zoo_enjoy.main)
-    (run / ENV / "config.yml").write_text((logs / "saf" / f"{ENV}_1" / ENV / "config.yml").read_text())
+    assert "run.json cannot be read" in failed(["-f", str(tmp_path), "--no-render"], capsys, zoo_enjoy.main)
+    shutil.copy(logs / "saf" / f"{ENV}_1" / "run.json", run)
     assert "is not a model saved by" in failed(["-f", str(tmp_path), "--no-render"], capsys, zoo_enjoy.main)
 
 
@@ -193,10 +193,13 @@ def test_results_of_a_run(logs: Path) -> None:
     assert curve["score"].tolist() == means.tolist()
     assert run.final_score("evaluation") == means[-1]
     training = run.curve("training")
-    pd.testing.assert_frame_equal(training_curve(run.folder), training)
     returns = np.genfromtxt(run.folder / "monitor.csv", delimiter=",", skip_header=2)[:, 0]
-    assert training["game_steps"].iloc[-1] == 160
-    assert run.final_score("training") == returns[-2:].mean()  # of 16 episodes, those that ended after 144 steps
+    assert training["game_steps"].tolist() == [40, 80, 120, 160]  # 16 episodes in 4 games
+    assert training["score"].tolist() == [part.mean() for part in np.split(returns, 4)]
+    columns = ["game_steps", "score", "episodes"]
+    of_monitor = training_curve(run.folder, 4)[columns].astype(float)
+    pd.testing.assert_frame_equal(of_monitor, training[columns])
+    assert run.final_score("training") == training["score"].iloc[-1]
 
 
 def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_once(
@@ -221,9 +224,7 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
 def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None:
     """Write a run's settings, as training does."""
     settings = load_settings("saf", ENV, "smoke", overrides=overrides)
-    config = folder / "saf" / f"{ENV}_{number}" / ENV / "config.yml"
-    config.parent.mkdir(parents=True)
-    config.write_text(yaml.safe_dump({**settings.as_dict(), "seed": seed}))
+    write_run(folder / "saf" / f"{ENV}_{number}", settings.as_dict(), seed, "")
 
 
 def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
@@ -261,16 +262,25 @@ def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Pat
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 50
 
 
-@pytest.mark.parametrize("name", ["monitor.csv", "evaluations.npz"])
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("monitor.csv", "is not what sb3_saf.train writes"),
+        ("curve.csv", "is no learning curve"),
+        ("evaluations.npz", "is not what sb3_saf.train writes"),
+    ],
+)
 def test_damaged_results_are_one_line(
-    name: str, logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, words: str, logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "saf" / f"{ENV}_1"
     shutil.copytree(logs / "saf" / f"{ENV}_1", run)
     (run / name).write_text("a,b\nsome,text\n")
-    source = "training" if name == "monitor.csv" else "evaluation"
+    if name == "monitor.csv":  # of a run that is not finished
+        (run / "curve.csv").unlink()
+    source = "evaluation" if name == "evaluations.npz" else "training"
     options = ["curves", "-f", str(tmp_path), "--source", source, "-o", str(tmp_path / "a.png")]
-    assert f"{name} is not what sb3_saf.train writes" in failed(options, capsys, zoo_plot.main)
+    assert f"{name} {words}" in failed(options, capsys, zoo_plot.main)
 
 
 #: Runs two modules, with their words.

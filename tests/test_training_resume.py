@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-import yaml
 
 from sb3_saf.export.weights import read_weights
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.commands import check_device
+from sb3_saf.training.folders import Run, python_command
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
@@ -28,7 +28,7 @@ def train(folder: Path, algo: str, *options: str) -> None:
     zoo_train.main(["--algo", algo, *OPTIONS, "-f", str(folder), "-tb", str(folder / "tb"), *options])
 
 
-def struck(monkeypatch: pytest.MonkeyPatch, error: type[BaseException], evaluation: int = 8) -> None:
+def struck(monkeypatch: pytest.MonkeyPatch, error: type[BaseException], evaluation: int = 2) -> None:
     """Let evaluations end the run in the middle of a rollout; undone by ``monkeypatch.undo()``."""
     evaluate = SeededEvalCallback._evaluate
 
@@ -50,7 +50,7 @@ def left(run: Path) -> dict[str, Any]:
         "weights": {name: tensor.numpy().tobytes() for name, tensor in weights.items()},
         "evaluations": evaluations,
         "episodes": episodes,
-        "settings": (run / ENV / "config.yml").read_text(),
+        "settings": Run(run).description["settings"],
     }
 
 
@@ -68,7 +68,7 @@ def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
     options = ("--resume", *more)
     train(tmp_path / "undisturbed", algo, "--seed", "3", *options)
     assert "unfinished: a new one begins" in capsys.readouterr().out
-    for evaluation in (8, 14):
+    for evaluation in (2, 3):
         struck(monkeypatch, RuntimeError, evaluation)
         with pytest.raises(RuntimeError):
             train(tmp_path / "run", algo, "--seed", "3", *options)
@@ -93,6 +93,7 @@ def test_ctrl_c_leaves_model_and_checkpoint_and_says_how_to_go_on(
     assert (run / f"{ENV}.zip").is_file()
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("Stopped."))
     command = line.partition("go on from there with: ")[2]
+    assert command.startswith(python_command("sb3_saf.train"))
     zoo_train.main(shlex.split(command)[3:])
     train(tmp_path / "undisturbed", "saf", "--seed", "3")
     assert left(run) == left(tmp_path / "undisturbed" / "saf" / f"{ENV}_1")
@@ -107,7 +108,7 @@ def test_other_settings_begin_another_run(tmp_path: Path, monkeypatch: pytest.Mo
         train(tmp_path, "saf", "--resume", "-n", "80", *options)
         run = tmp_path / "saf" / f"{ENV}_{number}"
         assert (run / f"{ENV}.zip").is_file()
-    assert yaml.safe_load((run / ENV / "args.yml").read_text())["seed"] is not None
+    assert Run(run).seed is not None
 
 
 def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import sys
 import threading
@@ -13,7 +14,7 @@ from typing import Final, NamedTuple
 
 from hecogrid_envs.task import check_task
 from sb3_saf.checkpoints.learning import handled
-from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, PROGRAM, Experiment, own_experiment
+from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, MODULE, PROGRAM, Experiment, own_experiment
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
 from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
@@ -27,6 +28,7 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
+from sb3_saf.training.folders import python_command
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
@@ -57,7 +59,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, parser_class=OneLineParser, metavar="COMMAND")
     commands.add_parser("list", help="the paper's experiments").set_defaults(function=_list)
     for name, function, groups, text in (
-        ("plan", _plan, (_add_config,), "cells, game steps and, once cells are finished, the time that is left"),
+        (
+            "plan",
+            _plan,
+            (_add_config, _add_machine),
+            "cells, game steps and, once cells are finished, the time that is left",
+        ),
         ("run", _run, (_add_config, _add_machine), "run what is missing"),
         ("report", _report, (_add_report,), "figures and a page of tables, of whatever is there"),
     ):
@@ -185,10 +192,11 @@ def _name(options: argparse.Namespace) -> str:
     """Return the name of the experiment; ValueError if there is none."""
     name: str | None = options.name
     if name is None and len(options.env) != 1:
-        example = f"{PROGRAM} {options.command} coordination, or --env mpe2.simple_spread_v3"
+        example = f"{python_command(MODULE)} {options.command} coordination, or --env mpe2.simple_spread_v3"
         what = "several environments need a name before --env" if options.env else "name an experiment"
         raise ValueError(f"{what}: {example}")
-    return options.env[0].removesuffix("-v0").replace(":", "-").replace("/", "-") if name is None else name
+    # An environment names the grid on it.
+    return re.sub(r"[:/]", "-", options.env[0].removesuffix("-v0") if name is None else name)
 
 
 def _env(task: str, experiment: Experiment) -> str:
@@ -239,13 +247,13 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _plan(options: argparse.Namespace) -> int:
-    from sb3_saf.experiments.plan import make_plan
+    from sb3_saf.experiments.run import make_plan
 
     experiment, results, selection = _Asked.of(options)
     if not experiment.is_grid:
         print(f"{experiment.name}: counts weights, trains nothing")
         return 0
-    print(make_plan(experiment, selection, _config(options, experiment), results))
+    print(make_plan(experiment, selection, _config(options, experiment), results, Shard.parse(options.shard)))
     return 0
 
 
@@ -273,7 +281,7 @@ def _run(options: argparse.Namespace) -> int:
     if summary.failed:
         print(f"{len(summary.failed)} cells failed; the same command tries them again", file=sys.stderr)
         return 1
-    print(f"next: {PROGRAM} report {experiment.name} -f {results.folder}")
+    print(f"next: {python_command(MODULE)} report {experiment.name} -f {results.folder}")
     return 0
 
 
@@ -283,7 +291,7 @@ def _report(options: argparse.Namespace) -> int:
     if not experiment.is_grid:
         return _print_parameters()
     require("pandas", "matplotlib", "rliable")
-    remedy = f"run it first: {PROGRAM} run {name} --size {_size(options)} -f {results.folder}"
+    remedy = f"run it first: {python_command(MODULE)} run {name} --size {_size(options)} -f {results.folder}"
     if not results.folder.is_dir():
         raise ValueError(f"there is no folder {results.folder}; name another with -f, or {remedy}")
     if results.config() is None or not results.selections(name):
@@ -309,7 +317,7 @@ def _print_parameters() -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from sb3_saf.experiments.check import check_cell
+    from sb3_saf.experiments.cell import check_cell
 
     check = check_cell(options.cell, check_device(options.device))
     if check.equal:

@@ -9,7 +9,8 @@ from typing import Any, Final, NamedTuple
 from sb3_saf.teams.checks import unknown_name
 
 #: The command, as users type it.
-PROGRAM: Final = "python -m sb3_saf.experiments"
+MODULE: Final = "sb3_saf.experiments"
+PROGRAM: Final = f"python -m {MODULE}"
 #: Default seeds of a run: the paper's experiments have at least three.
 DEFAULT_SEEDS: Final = (0, 1, 2)
 
@@ -214,8 +215,12 @@ _ALL: Final = (
 EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for experiment in _ALL}
 
 
-def find_experiment(name: str) -> Experiment:
-    """Return an experiment of the paper; the ValueError suggests the nearest known name."""
+def find_experiment(name: str, others: Collection[str] = ()) -> Experiment:
+    """
+    Return an experiment of the paper; the ValueError suggests the nearest known name.
+
+    :param others: further names to list in the error
+    """
     if name not in EXPERIMENTS:
-        raise unknown_name("experiment", name, EXPERIMENTS)
+        raise unknown_name("experiment", name, [*others, *EXPERIMENTS])
     return EXPERIMENTS[name]

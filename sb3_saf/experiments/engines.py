@@ -9,20 +9,20 @@ its own process, ``python -m sb3_saf.experiments cell FOLDER``, so that a crash 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
-
-from sb3_saf.experiments.files import pack, unpack
 
 #: Read by libraries at import; the number of threads changes the order of summation.
 THREAD_VARIABLES: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -213,7 +213,8 @@ class RayEngine(Engine):
                 lost = f"\n\nlost by Ray ({type(error).__name__}): {_first_line(error)}\n" if is_lost else ""
                 raise CellError(f"{error}{lost}")
             if (archive := answer.result()) is not None:
-                unpack(archive, folder / "result")
+                with zipfile.ZipFile(io.BytesIO(archive)) as packed:
+                    packed.extractall(folder / "result")
             done.set_result(None)
         except Exception as problem:
             done.set_exception(problem)
@@ -224,6 +225,15 @@ class RayEngine(Engine):
             self._ray.cancel(reference, force=True)
         if self._is_ours:
             self._ray.shutdown()
+
+
+def _pack(folder: Path) -> bytes:
+    """Return the files of a folder as one archive; models are compressed already."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            archive.write(path, path.relative_to(folder).as_posix())
+    return buffer.getvalue()
 
 
 def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
@@ -240,7 +250,7 @@ def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
         log = stack.enter_context((folder / "log.txt").open("w", encoding="utf-8"))
         with contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             run_job(folder)
-        return None if is_shared else pack(folder / "result")
+        return None if is_shared else _pack(folder / "result")
 
 
 def _first_line(error: BaseException) -> str:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
-from sb3_saf.experiments.files import plain
 from sb3_saf.teams.checks import unknown_name
+from sb3_saf.teams.files import plain
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from sb3_saf.training.yaml_files import Size
@@ -52,17 +52,6 @@ class Cell:
     def is_trained(self) -> bool:
         """Whether the method is trained, not random."""
         return self.method != RANDOM
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data for :meth:`from_dict`."""
-        tests = [level.env_kwargs for level in self.tests]
-        return {**self.__dict__, "level": self.level.env_kwargs, "tests": tests}
-
-    @classmethod
-    def from_dict(cls, saved: Mapping[str, Any]) -> Cell:
-        """Return the cell of a dict from :meth:`as_dict`."""
-        tests = tuple(Level.of(**level) for level in saved["tests"])
-        return cls(**{**saved, "level": Level.of(**saved["level"]), "tests": tests})
 
     def __str__(self) -> str:
         return f"{self.method} {self.task} {self.level} seed {self.seed}"
@@ -115,12 +104,13 @@ class RunConfig:
         return settings
 
     def describe(self, cell: Cell) -> dict[str, Any]:
-        """Return everything that determines a cell's result, as plain data."""
+        """Return everything that determines a cell's result, as plain data: settings, seed and options of its run."""
         settings = self.settings(cell).as_dict()
         if not cell.is_trained:
             settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
         test = {"episodes": self.episodes, "deterministic": self.deterministic}
-        return plain({**settings, "seed": cell.seed, "test": test})
+        options = {"level": cell.level.env_kwargs, "test": test}
+        return plain({"settings": settings, "seed": cell.seed, "options": options})
 
 
 class LeftOut(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
@@ -78,7 +79,7 @@ def _head(content: Content) -> str:
     treasures = f", {_numbers(table['max_return'])} treasures" if of_treasures else ""
     meaning = "a team return (treasures collected)" if of_treasures else "a team return (rewards of all agents)"
     lines = [
-        f"# {experiment.name}: {experiment.question}",
+        f"# {experiment.name}: {_text(experiment.question)}",
         "",
         f"Size `{config.size}`: {_numbers(table['n_agents'])} agents{treasures}, {steps} game steps of training. "
         f"{', '.join(methods) or 'No method'} and a random team, seeds {_numbers(table['seed'])}. Each number is "
@@ -97,14 +98,14 @@ def _numbers(column: pd.Series) -> str:
 
 def _missing(content: Content) -> str:
     results = content.results
-    lines = [f"- {left_out}" for left_out in content.left_out]
+    lines = [f"- {_text(left_out)}" for left_out in content.left_out]
     if content.missing:
         lines.append(
             f"- **{len(content.missing)} of {len(content.cells)} cells are missing**; numbers below lack them:"
         )
         for cell in content.missing[:_MOST_NAMED]:
             failure = results.failure(cell)
-            lines.append(f"  - {cell}: {'not run yet' if failure is None else f'failed, see `{failure}`'}")
+            lines.append(f"  - {_text(cell)}: {'not run yet' if failure is None else f'failed, see `{failure}`'}")
         if len(content.missing) > _MOST_NAMED:
             lines.append(f"  - and {len(content.missing) - _MOST_NAMED} more")
     lines += [f"- damaged: {error}" for error in results.damaged.values()]
@@ -118,9 +119,15 @@ def _pictures(content: Content, *prefixes: str) -> str:
     return (heading if "curve-" in prefixes else "") + pictures if names else ""
 
 
-def _table(head: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table."""
-    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *body)]
+def _table(head: Sequence[object], body: Iterable[Sequence[object]]) -> list[str]:
+    """Return the lines of a table; ``|`` in a cell would end it."""
+    rows = [[" ".join(str(cell).split()).replace("|", "\\|") for cell in cells] for cells in (head, *body)]
+    return [f"| {' | '.join(cells)} |" for cells in (rows[0], ["---"] * len(head), *rows[1:])]
+
+
+def _text(name: object) -> str:
+    """Return a user's name as text that Markdown does not format."""
+    return re.sub(r"([\\`*<>\[\]])", r"\\\1", str(name))
 
 
 def _show(estimate: Estimate, digits: int = 2) -> str:
@@ -143,8 +150,8 @@ def means(table: pd.DataFrame, view: View) -> str:
         for method, of_method in of_task.groupby("method", sort=False):
             by_level = [of_method.loc[of_method["level"] == level.slug, "return_mean"] for level in levels]
             counts = sorted({len(values) for values in by_level if len(values)})
-            body.append([str(method), *map(_mean, by_level), " or ".join(map(str, counts))])
-        parts += [*_table([f"{task}", *map(str, levels), "seeds"], body), ""]
+            body.append([_text(method), *map(_mean, by_level), " or ".join(map(str, counts))])
+        parts += [*_table([_text(task), *map(_text, levels), "seeds"], body), ""]
     return "\n".join(parts).rstrip()
 
 
@@ -163,12 +170,12 @@ def losses(table: pd.DataFrame, view: View) -> str:
     for task, of_task in rows.groupby("task", sort=False):
         for method, of_method in of_task.groupby("method", sort=False):
             easy, *hard = (_by_seed(of_method, level) for level in (first, *harder))
-            body.append([str(task), str(method), *(_loss(easy, each) for each in hard)])
+            body.append([_text(task), _text(method), *(_loss(easy, each) for each in hard)])
     text = (
         f"Share of the return at {first} that is lost, in percent: mean over seeds of each seed's own loss, 95 % "
         f"interval (Student's t). {_NOTHING} where a seed has no return at {first} to lose."
     )
-    return "\n".join([f"## Loss by {view.axis}", "", text, "", *_table(["task", "", *map(str, harder)], body)])
+    return "\n".join([f"## Loss by {view.axis}", "", text, "", *_table(["task", "", *map(_text, harder)], body)])
 
 
 def _by_seed(rows: pd.DataFrame, level: Level) -> pd.DataFrame:
@@ -201,7 +208,7 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
     parts = ["## Aggregates", "", text, ""]
     methods = list(dict.fromkeys(common["method"]))
     for view in experiment.views:
-        columns = {str(level): found for level in view.levels if (found := _of_level(common, view, level))}
+        columns = {_text(level): found for level in view.levels if (found := _of_level(common, view, level))}
         if columns:
             parts += [*_estimates([f"by {view.axis}{view.suffix}", *columns], methods, columns.values()), ""]
     over_all = interquartile_means(score_matrices(common, "stratum"))
@@ -252,7 +259,8 @@ def _compared(heading: str, text: str, compared: Sequence[Compared]) -> str:
     body = []
     for task, level, _, other, found in compared:
         numbers = [_show(found.first), _show(found.second), _show(found.difference)]
-        body.append([task, str(level), other, ", ".join(map(str, found.seeds)), *numbers, found.verdict])
+        seeds = ", ".join(map(str, found.seeds))
+        body.append([_text(task), _text(level), _text(other), seeds, *numbers, found.verdict])
     return "\n".join([heading, "", text, "", *_table(head, body)])
 
 
@@ -272,8 +280,8 @@ def _reproduction(content: Content) -> str:
     lines.append(
         f"`{PROGRAM} check {folder}/cells/TASK-LEVEL/METHOD/seed-N` runs a cell again and compares. Each cell:"
     )
-    commands = [content.results.cell_folder(cell) / "command.txt" for cell in content.cells]
-    texts = [path.read_text(encoding="utf-8").strip() for path in commands if path.exists()]
+    runs = [run for cell in content.cells if cell.is_trained and (run := content.results.run(cell)) is not None]
+    texts = [run.description["command"] for run in runs]
     lines += ["", "<details><summary>Commands</summary>", "", "```sh", *texts, "```", "", "</details>"]
     return "\n".join([*lines, "", _versions(content)])
 
@@ -297,11 +305,13 @@ def config_words(config: RunConfig) -> list[str]:
 
 def _versions(content: Content) -> str:
     """Return the software and hardware of the cells, one line per variant."""
-    found: dict[str, set[str]] = {}
+    variants: dict[str, set[str]] = {}
     for cell in content.cells:
-        for name, version in content.results.versions(cell).items():
-            found.setdefault(name, set()).add(str(version))
-    lines = [f"{name} {' and '.join(sorted(versions))}" for name, versions in found.items() if name != "host"]
-    mixed = [name for name, versions in found.items() if len(versions) > 1 and name not in ("host", "commit")]
+        if (run := content.results.run(cell)) is not None:
+            for name, version in {**run.description["versions"], "device": run.finished().get("device")}.items():
+                if version is not None and name != "host":
+                    variants.setdefault(name, set()).add(str(version))
+    lines = [f"{name} {' and '.join(sorted(versions))}" for name, versions in variants.items()]
+    mixed = [name for name, versions in variants.items() if len(versions) > 1]
     warning = f" **Cells differ in {', '.join(mixed)}.**" if mixed else ""
     return f"Versions: {', '.join(lines)}.{warning}"

@@ -1,16 +1,16 @@
 """
-Folder of results. A finished cell is one folder, which is created atomically.
+Folder of results. A finished cell is one folder of a run (``training/folders.py``), which appears at once.
 
     settings.json                    configuration of all cells
     cells/TeamTogether-c2-h1/saf/seed-0/
-        cell.json  config.json       the cell; everything that determines its result
-        command.txt                  command that reproduces it
-        versions.json  status.json   commit and software; cost
+        run.json                     everything that determines the result; command and software
         curve.csv  model.zip         returns of the training episodes; the model
         tests/c2-h1.json             returns of the test episodes
+        finished.json                cost, and the digests of these files
     unfinished/TeamTogether-c2-h1/saf/seed-1/
-        job.json  training/          the job; checkpoints and monitor of the training
+        job.json  result/            the job; the folder of its run
         error.txt  log.txt           error and log of the last attempt
+    damaged/...                      cells with changed or missing files, after they were run again
     coordination/experiment.json     a user's experiment
     coordination/selections/*.json   requested selections, for missing cells in reports
     coordination/table.csv           one row per cell and test level, made from the cells
@@ -19,30 +19,63 @@ Folder of results. A finished cell is one folder, which is created atomically.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import filelock
+import msgspec
 
+from sb3_saf.evaluation import EvaluationResult
 from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, Level, find_experiment, own_experiment
-from sb3_saf.experiments.files import differences, plain, read_json, write_json
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection
+from sb3_saf.teams.files import differences, plain, read_json, write_json
+from sb3_saf.training.folders import CURVE, RUN_FILE, Run, finish_run
 
-Types = Mapping[str, type | tuple[type, ...]]
+MODEL: Final = "model.zip"
+T = TypeVar("T")
 
-#: Required entries of files with their types.
-_SETTINGS: Final[Types] = {"size": str, "overrides": dict, "episodes": int, "deterministic": bool}
-_STATUS: Final[Types] = {"wall_seconds": float, "processor_seconds": float}
-_SELECTION: Final[Types] = {"seeds": list, "methods": list, "envs": list, "levels": list}
-_TEST: Final[Types] = {
-    **{"level": dict, "n_agents": int, "max_return": (int, type(None)), "evaluation_seed": int},
-    **{"returns": list, "return_mean": float, "return_low": float, "return_high": float, "wall_seconds": float},
-}
+
+@dataclass(frozen=True)
+class LevelResult:
+    """
+    Result of a test: what was measured. Means, intervals and rates are computed from it.
+
+    :param level: parameters of the level
+    :param n_agents: N
+    :param max_return: the largest possible team return, if known
+    :param evaluation_seed: seed of the games
+    :param returns: team return of each episode
+    :param lengths: game steps of each episode
+    :param successes: whether each episode was won; empty if the games do not report it
+    :param wall_seconds: cost
+    """
+
+    level: dict[str, Any]
+    n_agents: int
+    max_return: int | None
+    evaluation_seed: int
+    returns: list[float]
+    lengths: list[int]
+    successes: list[bool]
+    wall_seconds: float
+
+    @property
+    def evaluation(self) -> EvaluationResult:
+        """Mean, interval and success rate."""
+        return EvaluationResult(self.returns, self.lengths, tuple(self.successes))
+
+
+@dataclass(frozen=True)
+class _OwnExperiment:
+    envs: list[str]
+    vary: dict[str, list[Any]]
 
 
 class Results:
@@ -54,49 +87,48 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        #: Errors of damaged files, by file.
+        #: Errors of damaged files, by file or by cell's folder.
         self.damaged: dict[Path, str] = {}
 
-    def _read(self, path: Path, types: Types) -> dict[str, Any] | None:
+    def _read(self, path: Path, kind: type[T]) -> T | None:
         """Return the content of a file; None if it is missing or invalid."""
-        try:
-            content = read_json(path)
-            wrong = [name for name, kind in types.items() if content and not isinstance(content.get(name), kind)]
-            if wrong or content == {}:
-                raise ValueError(f"{path} has no {', '.join(wrong or types)}")
-        except ValueError as error:
-            self.damaged[path] = str(error)
+        if not path.exists():
             return None
-        return content
+        try:
+            return msgspec.convert(read_json(path), kind)
+        except ValueError as error:
+            self.damaged[path] = str(error) if str(path) in str(error) else f"{path}: {error}"
+            return None
 
     # Settings
 
     def config(self) -> RunConfig | None:
         """Return the configuration of the folder's cells; None for a folder without results."""
-        stored = self._read(self.folder / "settings.json", _SETTINGS)
-        return None if stored is None else RunConfig(**{name: stored[name] for name in _SETTINGS})
+        return self._read(self.folder / "settings.json", RunConfig)
 
     def agree(self, config: RunConfig, cells: Iterable[Cell] = ()) -> None:
         """Check that the folder and its finished cells have these settings; the ValueError contains the differences."""
         stored = self.config()
-        if stored is not None and plain(asdict(stored)) != plain(asdict(config)):
-            changed = differences(asdict(stored), plain(asdict(config)))
+        if stored is not None and (changed := differences(plain(asdict(stored)), plain(asdict(config)))):
             raise ValueError(
                 f"the results in {self.folder} have other settings: {changed}; run with theirs, or choose another "
                 "folder with -f"
             )
         for cell in cells:
-            if self.is_finished(cell) and (found := self.cell_config(cell)) != (wanted := config.describe(cell)):
+            if (run := self.run(cell)) is None:
+                continue
+            wanted = config.describe(cell)
+            if changed := differences({name: run.description[name] for name in wanted}, wanted):
                 raise ValueError(
-                    f"{self.cell_folder(cell)} was trained with other settings: {differences(found, wanted)}; restore "
-                    "them, delete that cell, or choose another folder with -f"
+                    f"{run.folder} was trained with other settings: {changed}; restore them, delete that cell, or "
+                    "choose another folder with -f"
                 )
 
     def save_config(self, config: RunConfig) -> None:
         """Write the configuration of the folder's cells, unless it exists."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.config() is None:
-            write_json(self.folder / "settings.json", plain(asdict(config)))
+            write_json(self.folder / "settings.json", asdict(config))
 
     # Finished cells
 
@@ -104,30 +136,42 @@ class Results:
         """Return the folder of a cell, which may not exist yet."""
         return self.folder / "cells" / cell.id
 
-    def status(self, cell: Cell) -> dict[str, Any] | None:
-        """Return the cost of a cell; None if it is not finished."""
-        return self._read(self.cell_folder(cell) / "status.json", _STATUS)
-
-    def cell_config(self, cell: Cell) -> dict[str, Any]:
-        """Return the settings of a trained cell; empty before training."""
-        return self._read(self.cell_folder(cell) / "config.json", {"algo": str}) or {}
-
-    def versions(self, cell: Cell) -> dict[str, str]:
-        """Return the software and hardware of a trained cell; empty before training."""
-        return self._read(self.cell_folder(cell) / "versions.json", {"python": str}) or {}
-
-    def is_finished(self, cell: Cell) -> bool:
-        """Return whether a cell is trained."""
-        return self.status(cell) is not None and bool(self.cell_config(cell))
-
-    def test(self, cell: Cell, level: Level) -> dict[str, Any] | None:
-        """Return the result of a test; None before it."""
-        path = self.cell_folder(cell) / "tests" / f"{level.slug}.json"
-        found = self._read(path, _TEST) if self.is_finished(cell) else None
-        if found is not None and not (found["returns"] and all(isinstance(value, float) for value in found["returns"])):
-            self.damaged[path] = f"{path} has no returns"
+    def run(self, cell: Cell) -> Run | None:
+        """Return the run of a finished cell; None if it is missing, or its files have changed since."""
+        run = Run(self.cell_folder(cell))
+        if not run.folder.exists():
             return None
-        return found
+        try:
+            kinds = {"wall_seconds": float, "processor_seconds": float}
+            wrong = [name for name, kind in kinds.items() if not isinstance(run.finished().get(name), kind)]
+            damage = [f"{run.folder} has no {name}" for name in wrong]
+            files = (RUN_FILE, MODEL, CURVE) if cell.is_trained else (RUN_FILE,)
+            damage += [text for name in files if (text := run.damage(name)) is not None]
+            assert damage or run.description
+        except ValueError as error:
+            damage = [str(error)]
+        if damage:
+            self.damaged[run.folder] = "; ".join(damage)
+            return None
+        return run
+
+    def test(self, cell: Cell, level: Level) -> LevelResult | None:
+        """Return the result of a test; None before it, or if its file has changed since."""
+        run, name = self.run(cell), f"tests/{level.slug}.json"
+        if run is None or name not in run.finished()["files"]:
+            return None
+        path = run.folder / name
+        if (damage := run.damage(name)) is not None:
+            self.damaged[path] = damage
+            return None
+        result = self._read(path, LevelResult)
+        if result is None:
+            return None
+        n_episodes = run.description["options"]["test"]["episodes"]
+        if len(result.returns) != n_episodes or not all(map(math.isfinite, result.returns)):
+            self.damaged[path] = f"{path} must have {n_episodes} finite returns, got {result.returns}"
+            return None
+        return result
 
     def missing_tests(self, cell: Cell) -> tuple[Level, ...]:
         """Return the levels at which a cell has not been tested; all of them if it is not trained."""
@@ -158,19 +202,22 @@ class Results:
     def publish(self, cell: Cell) -> None:
         """Move the result of an attempt to the cell's folder: a new folder, or further tests of a finished one."""
         result, target = self.unfinished(cell) / "result", self.cell_folder(cell)
-        if self.is_finished(cell):
+        if self.run(cell) is not None:
             (target / "tests").mkdir(exist_ok=True)
             for path in (result / "tests").iterdir():
                 os.replace(path, target / "tests" / path.name)
+            finish_run(target)
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
-            if target.exists():  # damaged; if interrupted between these two lines, the cell is run again
-                shutil.rmtree(target)
+            if target.exists():  # damaged; if interrupted between these lines, the cell is run again
+                kept = self.folder / "damaged" / f"{cell.id}_{time.time_ns()}"
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(target, kept)
             os.replace(result, target)
         self.forget(cell)
 
     def forget(self, cell: Cell) -> None:
-        """Remove the working folder of an unfinished cell."""
+        """Remove the working folder of a finished cell."""
         folder = self.unfinished(cell)
         shutil.rmtree(folder, ignore_errors=True)
         for parent in folder.parents[: len(Path(cell.id).parts)]:
@@ -192,16 +239,14 @@ class Results:
     def selections(self, experiment: str) -> list[Selection]:
         """Return all requested selections."""
         paths = sorted((self.folder / experiment / "selections").glob("*.json"))
-        stored = [found for path in paths if (found := self._read(path, _SELECTION)) is not None]
-        return sorted((Selection(**{name: tuple(entry[name]) for name in _SELECTION}) for entry in stored), key=astuple)
+        return sorted((one for path in paths if (one := self._read(path, Selection)) is not None), key=astuple)
 
     def check_experiment(self, experiment: Experiment) -> None:
         """Check that no other experiment has the same name here; the ValueError contains the differences."""
-        stored = self._read(self.folder / experiment.name / "experiment.json", {"envs": list, "vary": dict})
-        if stored is not None and stored != _own(experiment):
+        stored = self._read(self.folder / experiment.name / "experiment.json", _OwnExperiment)
+        if stored is not None and (changed := differences(asdict(stored), _own(experiment))):
             raise ValueError(
-                f"{self.folder} has another experiment {experiment.name!r}: {differences(stored, _own(experiment))}; "
-                "write another name before --env"
+                f"{self.folder} has another experiment {experiment.name!r}: {changed}; write another name before --env"
             )
 
     def experiment(self, name: str) -> Experiment:
@@ -209,10 +254,13 @@ class Results:
         if name in EXPERIMENTS:
             return EXPERIMENTS[name]
         path = self.folder / name / "experiment.json"
-        stored = self._read(path, {"envs": list, "vary": dict})
+        stored = self._read(path, _OwnExperiment)
         if path in self.damaged:
             raise ValueError(f"{self.damaged[path]}; the same run command writes it anew")
-        return find_experiment(name) if stored is None else own_experiment(name, stored["envs"], stored["vary"])
+        if stored is not None:
+            return own_experiment(name, stored.envs, stored.vary)
+        own = [path.parent.name for folder in ("", "../*/") for path in self.folder.glob(f"{folder}*/experiment.json")]
+        return find_experiment(name, own)
 
 
 def _own(experiment: Experiment) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Run the missing cells of an experiment on an engine, and update the table."""
+"""Plan of an experiment, and the run of its missing cells on an engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from textwrap import shorten
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from filelock import BaseFileLock
 from tqdm import tqdm
@@ -20,10 +20,60 @@ from tqdm import tqdm
 from sb3_saf.experiments.cell import Job
 from sb3_saf.experiments.definitions import Experiment
 from sb3_saf.experiments.engines import Engine
-from sb3_saf.experiments.files import read_json, write_json, write_text
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
-from sb3_saf.experiments.results import Results
+from sb3_saf.experiments.results import MODEL, Results
 from sb3_saf.experiments.tables import write_table
+from sb3_saf.teams.files import write_text
+from sb3_saf.training.folders import Run
+
+
+def make_plan(
+    experiment: Experiment,
+    selection: Selection,
+    config: RunConfig,
+    results: Results,
+    shard: Shard = Shard(),  # noqa: B008 (immutable)
+) -> str:
+    """Return the cells, the game steps and, if cells are finished, the remaining time, as text."""
+    grid = expand(experiment, selection, config)
+    results.agree(config, grid.cells)
+    cells = shard.of(grid.cells)
+    trained = [cell for cell in cells if cell.is_trained]
+    finished = [(cell, run) for cell in trained if (run := results.run(cell)) is not None]
+    steps = {cell.id: config.settings(cell).game_steps for cell in trained}
+    left = sum(steps.values()) - sum(steps[cell.id] for cell, _ in finished)
+    n_tests = sum(len(results.missing_tests(cell)) for cell in cells)
+    each = " or ".join(f"{count:,}" for count in sorted(set(steps.values())))
+    settings = []
+    for task, level, tests in dict.fromkeys((cell.task, cell.level, cell.tests) for cell in trained):
+        here = [cell for cell in trained if (cell.task, cell.level) == (task, level)]
+        methods = " ".join(dict.fromkeys(cell.method for cell in here))
+        seeds = " ".join(str(seed) for seed in dict.fromkeys(cell.seed for cell in here))
+        tested = "" if tests == (level,) else f", tested at {'; '.join(map(str, tests))}"
+        settings.append(f"            {task}, {level}{tested}: {methods}, seeds {seeds}")
+    factors: dict[str, set[Any]] = {
+        "methods": {cell.method for cell in trained},
+        "settings": {(cell.task, cell.level) for cell in trained},
+        "seeds": {cell.seed for cell in trained},
+    }
+    product = " x ".join(f"{len(values)} {name}" for name, values in factors.items())
+    lines = [
+        f"{experiment.name}, size {config.size}: {experiment.question}",
+        *settings,
+        *(f"left out    {left_out}" for left_out in grid.left_out),
+        f"cells       {len(trained)} to train ({product}), {len(finished)} of them finished",
+        f"tests       {n_tests} to play, of {config.episodes} team episodes each, random teams included",
+        f"game steps  {left:,} left of {sum(steps.values()):,} ({each} a cell)",
+    ]
+    if seconds := sum(run.finished()["wall_seconds"] for _, run in finished):
+        rate = sum(steps[cell.id] for cell, _ in finished) / seconds
+        lines.append(f"rate        {rate:,.0f} game steps/s of one worker in the finished cells")
+        lines.append(
+            f"time        about {timedelta(seconds=round(left / rate))} (h:mm:ss) of one worker at this rate"
+            if left
+            else ""
+        )
+    return "\n".join(line for line in lines if line)
 
 
 @dataclass(frozen=True)
@@ -165,17 +215,17 @@ class _Progress:
     def _start(self, cell: Cell) -> Future[None]:
         """Write the worker's input to the cell's folder, and submit it."""
         results, options, folder = self._results, self._options, self._results.unfinished(cell)
-        description = self._config.describe(cell)
+        trained, begun = results.run(cell), False
         with suppress(ValueError):
-            if not options.resume or read_json(folder / "config.json") != description:
-                shutil.rmtree(folder, ignore_errors=True)
+            description, begun_with = self._config.describe(cell), Run(folder / "result").description
+            begun = {name: begun_with[name] for name in description} == description
+        if not (options.resume and begun) or trained is not None:
+            shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("error.txt", "model.zip"):
+        for name in ("error.txt", MODEL):
             (folder / name).unlink(missing_ok=True)
-        model = results.cell_folder(cell) / "model.zip"
-        if results.is_finished(cell) and model.exists():
-            shutil.copy(model, folder)
-        write_json(folder / "config.json", description)
+        if cell.is_trained and trained is not None:
+            shutil.copy(trained.folder / MODEL, folder)
         Job(cell, self._config, options.device, options.threads, options.tensorboard).write(folder)
         return self._engine.submit(folder)
 
@@ -186,7 +236,7 @@ class _Progress:
             self._results.publish(cell)
             self._finished.append(cell)
             found = [(level, self._results.test(cell, level)) for level in cell.tests]
-            returns = ", ".join(f"{test['return_mean']:.2f} ({level})" for level, test in found if test is not None)
+            returns = ", ".join(f"{test.evaluation.mean:.2f} ({level})" for level, test in found if test is not None)
             return f"{self._count()} {cell}: return {returns}{self._rate()}"
         reason = shorten(str(error).strip().splitlines()[-1], width=160, placeholder=" ...")
         if attempt.number <= self._options.retries:

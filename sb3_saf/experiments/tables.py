@@ -29,10 +29,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_saf.experiments.definitions import RANDOM, Experiment, Level, View
-from sb3_saf.experiments.files import write_text
+from sb3_saf.experiments.definitions import MODULE, RANDOM, Experiment, Level, View
 from sb3_saf.experiments.grid import Cell, Grid, expand, merge
 from sb3_saf.experiments.results import Results
+from sb3_saf.teams.files import write_text
+from sb3_saf.training.folders import python_command, read_curve
 from sb3_saf.training.statistics import Estimate, mean_over_seeds
 
 #: Minimum seeds for a comparison: two may agree by chance, and the interval then has no width.
@@ -66,8 +67,7 @@ def read_results(folder: str | Path, name: str) -> Frames:
     tests = frame_of_tests(results, cells)
     if tests.empty:
         raise ValueError(
-            f"{folder} has no finished cell of {name!r}; run it first: "
-            f"python -m sb3_saf.experiments run {name} -f {folder}"
+            f"{folder} has no finished cell of {name!r}; run it first: {python_command(MODULE)} run {name} -f {folder}"
         )
     return Frames(tests.drop(columns=["returns", "cell"]), frame_of_curves(results, cells))
 
@@ -91,27 +91,32 @@ def frame_of_tests(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
 
 
 def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
-    status = results.status(cell)
+    run = results.run(cell)
     for level in cell.tests:
         test = results.test(cell, level)
-        if status is None or test is None:
+        if run is None or test is None:
             continue
-        trained = {f"train_{name}": value for name, value in cell.level.parameters}
+        evaluation, cost = test.evaluation, run.finished()
+        low, high = evaluation.interval()
         yield {
             **{"method": cell.method, "task": cell.task, "train_level": cell.level.slug, "level": level.slug},
-            **trained,
+            **{f"train_{name}": value for name, value in cell.level.parameters},
             **level.env_kwargs,
-            **{name: test[name] for name in ("n_agents", "max_return", "evaluation_seed")},
+            "n_agents": test.n_agents,
+            "max_return": test.max_return,
+            "evaluation_seed": test.evaluation_seed,
             "seed": cell.seed,
-            "game_steps": int(results.cell_config(cell).get("game_steps", 0)),
-            "episodes": len(test["returns"]),
-            **{name: test[name] for name in ("return_mean", "return_low", "return_high")},
-            "success_rate": float("nan") if test.get("success_rate") is None else test["success_rate"],
+            "game_steps": int(run.description["settings"].get("game_steps", 0)),
+            "episodes": len(test.returns),
+            "return_mean": evaluation.mean,
+            "return_low": low,
+            "return_high": high,
+            "success_rate": float("nan") if evaluation.success_rate is None else evaluation.success_rate,
             "score": float("nan"),
-            "returns": " ".join(f"{value:.12g}" for value in test["returns"]),
-            "processor_seconds": status["processor_seconds"],
-            "wall_seconds_training": status["wall_seconds"],
-            "wall_seconds_test": test["wall_seconds"],
+            "returns": " ".join(f"{value:.12g}" for value in test.returns),
+            "processor_seconds": cost["processor_seconds"],
+            "wall_seconds_training": cost["wall_seconds"],
+            "wall_seconds_test": test.wall_seconds,
             "cell": cell.id,
         }
 
@@ -133,20 +138,14 @@ def write_table(experiment: Experiment, results: Results) -> None:
 
 def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
     """Return the learning curves of all trained cells in one table; empty if there are none."""
-    found = []
+    curves = []
     for cell in cells:
-        path = results.cell_folder(cell) / "curve.csv"
-        if not (results.is_finished(cell) and path.exists()):
-            continue
-        try:
-            curve = pd.read_csv(path).rename(columns={"mean_return": "score"})
-            curve = curve[["game_steps", "processor_seconds", "score"]].astype(float)
-        except (ValueError, KeyError) as error:
-            results.damaged[path] = f"{path} is no learning curve: {error}"
-            continue
-        names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, **cell.level.env_kwargs}
-        found.append(curve.assign(**names, seed=cell.seed))
-    return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+        run = results.run(cell) if cell.is_trained else None
+        if run is not None:
+            names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, **cell.level.env_kwargs}
+            curve = read_curve(run.folder)[["game_steps", "processor_seconds", "score"]]
+            curves.append(curve.assign(**names, seed=cell.seed))
+    return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
 
 
 def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:

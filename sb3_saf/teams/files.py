@@ -11,8 +11,9 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
+from io import BufferedWriter
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import filelock
 
@@ -21,7 +22,7 @@ TEMPORARY_PREFIX: Final = ".writing-"
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[BinaryIO]:
+def atomic_file(path: Path) -> Iterator[BufferedWriter]:
     """
     Open a temporary file that replaces a file when it is complete and on disk; after an error the old one is kept.
 

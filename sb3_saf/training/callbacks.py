@@ -7,8 +7,11 @@ import warnings
 from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from tqdm import TqdmExperimentalWarning
 from tqdm.rich import tqdm
@@ -16,28 +19,46 @@ from tqdm.rich import tqdm
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.callbacks.game_steps import team_steps
 from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.vec_env import require_n_agents
 
-#: Minimum seconds over which the rate of training is measured, from the end of the first rollout.
-_MEASURED_SECONDS: Final = 20.0
-_MEASURED_ROLLOUTS: Final = 2
-
 
 class SeededEvalCallback(TeamEvalCallback):
-    """Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy."""
+    """
+    Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy.
+
+    There is at most one evaluation for each rollout, in which the policy stays the same.
+    """
 
     def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._seed = evaluation_seed(seed)
         self._n_evaluations = 0
         self._evaluated_at = -1
+        self._is_evaluated = False
+        #: Seconds of all evaluations.
+        self.seconds = 0.0
+
+    def _on_rollout_start(self) -> None:
+        self._is_evaluated = False
+
+    def _on_step(self) -> bool:
+        if not self._is_evaluated:
+            return super()._on_step()
+        if self._game_steps() >= self._next_evaluation:
+            self._plan_next()
+        return True
 
     def _evaluate(self) -> bool:
+        began = time.perf_counter()
         self._n_evaluations += 1
         self._evaluated_at = self._game_steps()
+        self._is_evaluated = True
         with own_randomness(self._seed + self._n_evaluations, self.model.device):
-            return super()._evaluate()
+            go_on = super()._evaluate()
+        self.seconds += time.perf_counter() - began
+        return go_on
 
     def checkpoint_state(self) -> dict[str, int]:
         """Return the counters, for exact resume."""
@@ -50,6 +71,71 @@ class SeededEvalCallback(TeamEvalCallback):
     def _on_training_end(self) -> None:
         if self.eval_freq > 0 and self._evaluated_at != self._game_steps():
             self._evaluate()
+
+
+class TrainingClock(BaseCallback):
+    """
+    Record processor time and wall time against game steps, also over resumed trainings.
+
+    :param every_game_steps: minimum game steps between two points
+    """
+
+    def __init__(self, every_game_steps: float) -> None:
+        super().__init__()
+        self.every_game_steps = every_game_steps
+        self._points: list[tuple[float, float]] = []
+        self._started_at = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+        self._before = (0.0, 0.0)
+        self._started = (0.0, 0.0)
+
+    @property
+    def points(self) -> npt.NDArray[np.float64]:
+        """Game steps, and processor seconds of this process until then, (K, 2)."""
+        return np.array(self._points, dtype=np.float64).reshape(-1, 2)
+
+    def cost(self) -> dict[str, Any]:
+        """Return the cost of the training."""
+        processor, wall = self._seconds()
+        return {
+            "started": self._started_at,
+            "wall_seconds": wall,
+            "processor_seconds": processor,
+            "threads": th.get_num_threads(),
+            "device": str(self.model.device),
+        }
+
+    def _on_training_start(self) -> None:
+        self._started = (time.process_time(), time.perf_counter())
+
+    def _on_rollout_start(self) -> None:
+        # Rollouts of off-policy algorithms are a few steps each.
+        if not self._points or team_steps(self.model) >= self._points[-1][0] + self.every_game_steps:
+            self._points.append((team_steps(self.model), self._seconds()[0]))
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self._before, self._started = self._seconds(), (0.0, 0.0)
+        self._points.append((team_steps(self.model), self._before[0]))
+
+    def _seconds(self) -> tuple[float, float]:
+        """Return processor seconds and wall seconds of all parts of the training."""
+        if self._started == (0.0, 0.0):
+            return self._before
+        now = (time.process_time(), time.perf_counter())
+        processor, wall = (b + n - s for b, n, s in zip(self._before, now, self._started, strict=True))
+        return processor, wall
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the points, the time until now, and when training began, as plain data."""
+        return {"points": self.points, "seconds": np.array(self._seconds()), "started_at": self._started_at}
+
+    def load_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """Restore a state of :meth:`checkpoint_state`."""
+        self._points = [(float(steps), float(seconds)) for steps, seconds in state["points"]]
+        self._before = (float(state["seconds"][0]), float(state["seconds"][1]))
+        self._started_at = str(state["started_at"])
 
 
 class GameStepsProgressBar(ProgressBarCallback):
@@ -75,30 +161,31 @@ class GameStepsProgressBar(ProgressBarCallback):
             self.pbar.close()
 
 
-class RemainingTime(BaseCallback):
-    """Print once the estimated remaining time, measured on the first rollouts."""
+class ProgressLines(BaseCallback):
+    """Print a line for every tenth of the training, for log files and terminals without a progress bar."""
 
     def __init__(self, verbose: int = 1) -> None:
         super().__init__(verbose)
-        self._n_rollouts = 0
-        self._started = 0.0, 0
-        self._told = verbose == 0
 
-    def _on_rollout_start(self) -> None:
-        self._n_rollouts += 1
-        now, steps = time.perf_counter(), team_steps(self.model)
-        if self._n_rollouts == 2:  # the first one compiles and fills caches
-            self._started = now, steps
-        seconds = now - self._started[0]
-        if self._told or self._n_rollouts < 2 + _MEASURED_ROLLOUTS or seconds < _MEASURED_SECONDS:
-            return
-        self._told = True
-        rate = (steps - self._started[1]) / seconds
-        total = self.locals["total_timesteps"] // require_n_agents(self.training_env)
-        left = timedelta(seconds=round(max(0, total - steps) / rate))
-        print(f"{rate:,.0f} game steps per second: about {left} (h:mm:ss) to go", flush=True)
+    def _on_training_start(self) -> None:
+        self._total = self.locals["total_timesteps"] // require_n_agents(self.training_env)
+        self._begun = time.perf_counter(), team_steps(self.model)
+        self._tenths = 10 * self._begun[1] // self._total
 
     def _on_step(self) -> bool:
+        steps = team_steps(self.model)
+        if self.verbose == 0 or 10 * steps // self._total <= self._tenths:
+            return True
+        self._tenths = 10 * steps // self._total
+        rate = (steps - self._begun[1]) / max(time.perf_counter() - self._begun[0], 1e-9)
+        left = timedelta(seconds=round(max(0, self._total - steps) / rate))
+        episodes = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        mean = f", team return {np.mean(episodes):.2f} in training" if episodes else ""
+        print(
+            f"{10 * self._tenths:3} % of {self._total:,} game steps{mean}; {rate:,.0f} game steps per second, about "
+            f"{left} (h:mm:ss) to go",
+            flush=True,
+        )
         return True
 
 
@@ -119,7 +206,8 @@ class CheckpointInGameSteps(BaseCallback):
         if steps >= self._next:
             self._next = (steps // self.save_freq + 1) * self.save_freq
             path = self.folder / f"rl_model_{steps}_steps.zip"
-            self.model.save(path)
+            with atomic_file(path) as file:
+                self.model.save(file)
             if self.verbose > 0:
                 print(f"Saved {path}")
         return True

@@ -25,7 +25,7 @@ from sb3_saf.training.commands import (
     user_errors,
 )
 from sb3_saf.training.environments import find_environment
-from sb3_saf.training.folders import find_model, read_run
+from sb3_saf.training.folders import find_model
 from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
 from sb3_saf.training.wrappers import load_normalization
 
@@ -95,11 +95,11 @@ def load_team(options: argparse.Namespace) -> TrainedTeam:
     find_algorithm(options.algo)
     environment = find_environment(options.env)
     which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
-    folder, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
-    config = read_run(folder, environment.folder_name)
-    if (config.get("algo"), config.get("env")) != (options.algo, environment.id):
-        raise ValueError(f"{folder} is a run of {config.get('algo')} on {config.get('env')}; give its --algo and --env")
-    trained, settings = saved_settings(config), saved_settings(config, options.env_kwargs)
+    run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
+    trained = run.settings
+    if (trained.algo, trained.env_id) != (options.algo, environment.id):
+        raise ValueError(f"{run.folder} is a run of {trained.algo} on {trained.env_id}; give its --algo and --env")
+    settings = saved_settings(trained.as_dict(), options.env_kwargs)
     if settings.n_agents != trained.n_agents:
         raise ValueError(
             f"the team was trained with {trained.n_agents} agents, got n_agents={settings.n_agents}; leave "

@@ -1,52 +1,292 @@
 """
-Log folders in RL-Zoo3's layout, so that its plotting commands can read them.
+Folder of a run, of ``sb3_saf.train`` and of the cells of experiments: one writer, one reader, one list of its files.
 
-A run is ``FOLDER/ALGO/NAME_NUMBER``, where FOLDER is the option ``-f`` and NAME the environment's name in file names,
-with the model ``NAME.zip`` and its settings in ``NAME/``.
+    run.json         settings, seed, options, command, versions; written first
+    monitor.csv      one line per team episode
+    NAME.zip         the model; best_model.zip, rl_model_STEPS_steps.zip, vecnormalize.npz, evaluations.npz beside it
+    checkpoints/     until the run is finished
+    curve.csv        learning curve: means over the training episodes
+    finished.json    cost, and the digests of the files; written last
+
+``sb3_saf.train`` numbers its runs as RL-Zoo3 does, ``FOLDER/ALGO/NAME_NUMBER`` (NAME is the environment's name in file
+names), and RL-Zoo3's plots can read them.
 """
 
 from __future__ import annotations
 
+import os
 import platform
 import re
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
 import uuid
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-import yaml
+import numpy as np
+import numpy.typing as npt
 
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.files import digest, plain, read_json, write_json, write_text
 from sb3_saf.training.environments import TeamEnvironment
-from sb3_saf.training.run import CHECKPOINTS
-from sb3_saf.training.settings import Settings
-from sb3_saf.training.yaml_files import load_yaml
+from sb3_saf.training.settings import Settings, saved_settings
 
-#: Options that affect a run's results but are not in ``config.yml``.
-_DECIDING: Final = ("eval_freq", "eval_episodes", "n_eval_envs", "eval_env_kwargs", "deterministic_eval", "save_freq")
+if TYPE_CHECKING:
+    import pandas as pd
+
+RUN_FILE: Final = "run.json"
+MONITOR: Final = "monitor.csv"
+CURVE: Final = "curve.csv"
+FINISHED: Final = "finished.json"
+CHECKPOINTS: Final = "checkpoints"
+#: Files that may change or go after a run is finished.
+_UNLISTED: Final = (MONITOR, FINISHED)
+
+#: Source of scores: evaluation games, or training games.
+Source = Literal["evaluation", "training"]
+#: Maximum number of points of a learning curve.
+CURVE_POINTS: Final = 100
+#: Last fraction of training whose episodes are its result.
+_FINAL_PART: Final = 0.1
+
 #: Packages whose versions can change a result.
 _PACKAGES: Final = (
     *("sb3-saf", "stable-baselines3", "sb3-contrib", "rl_zoo3", "optuna", "torch"),
     *("numpy", "numba", "gymnasium", "pettingzoo", "supersuit"),
 )
 _UUID: Final = r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}"
+_NUMBERED: Final = re.compile(rf"(.+)_(\d+)(?:_{_UUID})?")
 _SAVED_MODEL: Final = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
-def run_number(folder: Path, name: str) -> int | None:
-    """Return the number of a run from its folder's name; None if it is no run of that environment."""
-    found = re.fullmatch(rf"{re.escape(name)}_(\d+)(?:_{_UUID})?", folder.name)
-    return int(found[1]) if found else None
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_run(
+    folder: Path, settings: Mapping[str, Any], seed: int, command: str, options: Mapping[str, Any] | None = None
+) -> None:
+    """
+    Write what determines a run, before it begins.
+
+    :param settings: from :meth:`Settings.as_dict`
+    :param command: the command line that makes this run
+    :param options: what else affects its results
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {"settings": settings, "seed": seed, "options": options or {}}
+    write_json(folder / RUN_FILE, {**content, "command": command, "versions": software_versions()})
+
+
+def finish_run(folder: Path, **cost: Any) -> None:
+    """
+    Write the list of a run's files with their digests, and its cost.
+
+    :param cost: ``wall_seconds``, ``processor_seconds``, ...; left out keeps those of an earlier call
+    """
+    path = folder / FINISHED
+    if not cost:
+        cost = {name: value for name, value in read_json(path).items() if name != "files"}
+    files = {name: digest(folder / name) for name in sorted(_files(folder))}
+    write_json(path, {**cost, "files": files})
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """Yield the names of the files of a run and of its tests."""
+    for path in (*folder.iterdir(), *folder.glob("tests/*")):
+        if path.is_file() and path.name not in _UNLISTED and not path.name.startswith("."):
+            yield path.relative_to(folder).as_posix()
+
+
+def software_versions() -> dict[str, str]:
+    """Return the versions of Python, the system, installed packages that can change a result, commit, and host."""
+    versions = {"python": platform.python_version(), "system": platform.platform()}
+    for package in _PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    commit = "unknown"
+    with suppress(OSError, subprocess.SubprocessError):
+        words = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+        done = subprocess.run(words, cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=10)
+        commit = done.stdout.strip()
+    return {**versions, "commit": commit, "host": socket.gethostname()}
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Run:
+    """The folder of a run."""
+
+    folder: Path
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """Content of ``run.json``; ValueError if it is not that of a run."""
+        content = read_json(self.folder / RUN_FILE)
+        kinds = {"settings": dict, "seed": int, "options": dict, "command": str, "versions": dict}
+        wrong = [name for name, kind in kinds.items() if not isinstance(content.get(name), kind)]
+        if wrong:
+            raise ValueError(f"{self.folder / RUN_FILE} has no {', '.join(wrong)}")
+        return content
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return int(self.description["seed"])
+
+    @cached_property
+    def settings(self) -> Settings:
+        """Settings of the run."""
+        return saved_settings(self.description["settings"])
+
+    @property
+    def number(self) -> int:
+        """Number of the run in a log folder."""
+        numbered = _NUMBERED.fullmatch(self.folder.name)
+        return int(numbered[2]) if numbered else 0
+
+    def finished(self) -> dict[str, Any]:
+        """Return cost and files of a finished run; ValueError if it is not finished."""
+        content = read_json(self.folder / FINISHED)
+        if not isinstance(content.get("files"), dict):
+            raise ValueError(f"{self.folder / FINISHED} lists no files")
+        return content
+
+    def damage(self, name: str) -> str | None:
+        """Return what happened to a file since the run was finished; None if nothing did."""
+        path, files = self.folder / name, self.finished()["files"]
+        if name not in files:
+            return f"{path} is not in the list of {FINISHED}"
+        if not path.is_file():
+            return f"{path} is missing"
+        return None if digest(path) == files[name] else f"{path} has changed since the run was finished"
+
+    def curve(self, source: Source) -> pd.DataFrame:
+        """
+        Return the learning curve of team returns.
+
+        :return: columns ``game_steps`` and ``score``; for training also ``episodes``, and ``processor_seconds`` of a
+            finished run
+        :raises ValueError: if there is none
+        """
+        if source == "training":
+            return read_curve(self.folder)
+        import pandas as pd
+
+        path = self.folder / "evaluations.npz"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} has no evaluations; train with --eval-freq, or plot --source training")
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
+        except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is not what sb3_saf.train writes: {error}") from error
+
+    def final_score(self, source: Source) -> float:
+        """Return the mean team return of the last evaluation, or of the last tenth of training."""
+        curve = self.curve(source)
+        if source == "evaluation":
+            return float(curve["score"].iloc[-1])
+        late = curve["game_steps"] > (1 - _FINAL_PART) * curve["game_steps"].iloc[-1]
+        return float(curve["score"][late].mean())
+
+
+def training_curve(monitor: str | Path, n_points: int = CURVE_POINTS) -> pd.DataFrame:
+    """
+    Return the learning curve of the training games, from the file of a TeamMonitor.
+
+    :param monitor: a ``monitor.csv``, or the ``monitor_dir`` of ``make_team_env``
+    :param n_points: maximum number of points, means over about equal numbers of episodes
+    :return: columns ``game_steps``, at the end of the point's episodes, ``score``, mean team return, and ``episodes``
+    :raises ValueError: if no episode has ended
+    """
+    import pandas as pd
+
+    path = Path(monitor)
+    curve = pd.DataFrame(_condensed(path / MONITOR if path.is_dir() else path, n_points))
+    if curve.empty:
+        raise ValueError(f"no episode has ended in {path}; train longer")
+    return curve
+
+
+def read_curve(folder: Path) -> pd.DataFrame:
+    """Return the learning curve of a run's training games, finished or not, as :func:`training_curve`."""
+    import pandas as pd
+
+    path = folder / CURVE
+    if not path.is_file():
+        return training_curve(folder / MONITOR)
+    try:
+        return pd.read_csv(path, dtype=float)[["game_steps", "processor_seconds", "score", "episodes"]]
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no learning curve: {error}") from error
+
+
+def write_curve(folder: Path, clock: npt.NDArray[np.float64], n_games: int) -> None:
+    """
+    Write ``curve.csv``, the learning curve of ``monitor.csv``, which may have hundreds of thousands of lines.
+
+    :param clock: (K, 2) game steps, and the processor seconds until then
+    :param n_games: E, the minimum number of episodes of a point
+    """
+    curve = _condensed(folder / MONITOR, CURVE_POINTS, n_games)
+    seconds = np.interp(curve["game_steps"], clock[:, 0], clock[:, 1])
+    rows = zip(curve["game_steps"], seconds, curve["score"], curve["episodes"], strict=True)
+    lines = [f"{int(end)},{second:.3f},{float(score)!r},{int(count)}" for end, second, score, count in rows]
+    write_text(folder / CURVE, "\n".join(["game_steps,processor_seconds,score,episodes", *lines]) + "\n")
+
+
+def _condensed(monitor: Path, n_points: int, fewest_episodes: int = 1) -> dict[str, npt.NDArray[Any]]:
+    """Return game steps at the end, mean return and number of episodes of equal parts of a monitor's file."""
+    try:
+        with monitor.open(encoding="utf-8") as file:
+            head = [file.readline() for _ in range(2)]
+            if not head[1].startswith("r,l,"):
+                raise ValueError(f"expected the columns r,l,t in its second line, got {head[1]!r}")
+            lines = [line for line in file if line.strip()]
+        episodes = np.loadtxt(lines, delimiter=",", usecols=(0, 1), ndmin=2) if lines else np.empty((0, 2))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{monitor} is not what sb3_saf.train writes: {error}") from error
+    game_steps = np.cumsum(episodes[:, 1]).astype(np.int64)
+    parts = np.array_split(np.arange(len(episodes)), max(1, min(n_points, len(episodes) // fewest_episodes)))
+    parts = [part for part in parts if len(part)]
+    return {
+        "game_steps": np.array([game_steps[part[-1]] for part in parts], dtype=np.int64),
+        "score": np.array([episodes[part, 0].mean() for part in parts], dtype=np.float64),
+        "episodes": np.array([len(part) for part in parts], dtype=np.int64),
+    }
+
+
+# --- runs of sb3_saf.train --------------------------------------------------------------------------------------------
+
+
+def python_command(module: str) -> str:
+    """Return the begin of a command that runs as printed, with this interpreter: ``.venv/bin/python -m MODULE``."""
+    active, own = shutil.which("python"), sys.executable
+    if active is not None and Path(active).parent == Path(own).parent:
+        return f"python -m {module}"
+    with suppress(ValueError):  # another drive
+        own = min(own, os.path.relpath(own), key=len)
+    return f"{shlex.quote(own)} -m {module}"
 
 
 def runs_of(log_folder: Path, algo: str, name: str) -> list[tuple[int, Path]]:
     """List the runs of an algorithm on an environment, with their numbers, in order."""
     folder = log_folder / algo
-    runs = [(run_number(run, name), run) for run in folder.iterdir()] if folder.is_dir() else []
-    return sorted((number, run) for number, run in runs if number is not None and run.is_dir())
+    paths = [path for path in folder.iterdir() if path.is_dir()] if folder.is_dir() else []
+    numbered = [(match, path) for path in paths if (match := _NUMBERED.fullmatch(path.name))]
+    return sorted((int(match[2]), path) for match, path in numbered if match[1] == name)
 
 
 def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = False) -> Path:
@@ -59,43 +299,8 @@ def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = Fa
             folder.mkdir(parents=True)
             return folder
         except FileExistsError:  # another process was faster
-            if folder.parent.is_dir():
-                continue
-            raise
-
-
-def write_run(folder: Path, settings: Settings, seed: int, options: Mapping[str, Any], command: str) -> None:
-    """Write the description of a run: ``config.yml``, ``args.yml``, ``versions.yml``, ``command.txt``."""
-    place = folder / settings.environment.folder_name
-    place.mkdir(exist_ok=True)
-    contents = {
-        "config.yml": {**settings.as_dict(), "seed": seed},
-        "args.yml": {**options, "seed": seed},
-        "versions.yml": software_versions(),
-    }
-    for name, content in contents.items():
-        (place / name).write_text(yaml.safe_dump(_plain(content), sort_keys=False), encoding="utf-8")
-    (place / "command.txt").write_text(command + "\n", encoding="utf-8")
-
-
-def software_versions() -> dict[str, str]:
-    """Return the versions of Python, the system, and installed packages that can change a result."""
-    versions = {"python": platform.python_version(), "system": platform.platform()}
-    for package in _PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            versions[package] = metadata.version(package)
-    return versions
-
-
-def read_run(folder: Path, name: str) -> dict[str, Any]:
-    """Read the settings of a run, ``config.yml``; ValueError if the folder is not that of a run."""
-    path = folder / name / "config.yml"
-    if not path.is_file():
-        raise ValueError(f"{folder} is no run of sb3_saf.train: there is no {path}")
-    config = load_yaml(path.read_text("utf-8"), str(path))
-    if not isinstance(config, dict) or "seed" not in config:
-        raise ValueError(f"{path} does not hold the settings of a run of sb3_saf.train")
-    return config
+            if not folder.parent.is_dir():
+                raise
 
 
 def find_unfinished(
@@ -105,31 +310,28 @@ def find_unfinished(
     Find the latest unfinished run (one with checkpoints) of the same settings and options that no other process uses.
 
     :param seed: seed of the run; None for any
+    :param options: as given to :func:`write_run`
     :return: its folder and seed; None if there is none
+    :raises ValueError: if that run began with another model than ``options["initial_model"]``
     """
-    name, wanted = settings.environment.folder_name, _plain(settings.as_dict())
-    for _, folder in reversed(runs_of(log_folder, settings.algo, name)):
+    wanted = plain({"settings": settings.as_dict(), "options": options})
+    for _, folder in reversed(runs_of(log_folder, settings.algo, settings.environment.folder_name)):
         try:
-            saved, given = (
-                read_run(folder, name),
-                load_yaml((folder / name / "args.yml").read_text("utf-8"), "args.yml"),
-            )
-        except ValueError:  # the run was killed before they were written
+            found = Run(folder).description
+        except ValueError:  # the run was killed before it was written
             continue
-        found = saved.pop("seed")
-        same = saved == wanted and all(given.get(key) == _plain(options.get(key)) for key in _DECIDING)
-        if same and seed in (None, found) and _can_go_on(folder / CHECKPOINTS):
-            return folder, int(found)
+        theirs, ours = dict(found["options"]), dict(wanted["options"])
+        began_with, begins_with = (one.pop("initial_model", None) for one in (theirs, ours))
+        same = found["settings"] == wanted["settings"] and theirs == ours and seed in (None, found["seed"])
+        if not same or (folder / FINISHED).exists() or not _can_go_on(folder / CHECKPOINTS):
+            continue
+        if began_with != begins_with:
+            models = [f"the model {one['path']}" if one else "a new model" for one in (began_with, begins_with)]
+            raise ValueError(
+                f"{folder} began with {models[0]}, got {models[1]}: give the -i of that run, or leave --resume out"
+            )
+        return folder, int(found["seed"])
     return None
-
-
-def _plain(content: object) -> Any:
-    """Convert content to what YAML gives back: tuples become lists."""
-    if isinstance(content, Mapping):
-        return {str(key): _plain(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_plain(value) for value in content]
-    return str(content) if isinstance(content, Path) else content
 
 
 def _can_go_on(folder: Path) -> bool:
@@ -146,17 +348,17 @@ def _can_go_on(folder: Path) -> bool:
 
 def find_model(
     log_folder: Path, algo: str, environment: TeamEnvironment, number: int = 0, which: str | int | None = None
-) -> tuple[Path, Path]:
+) -> tuple[Run, Path]:
     """
     Find a trained model.
 
     :param number: number of the run; 0 for the latest
     :param which: None for the final model, "best", "last" for the last saved one, or the game steps of a saved one
-    :return: the run's folder, and the model's file
+    :return: the run, and the model's file
     :raises ValueError: if there is none, with a fix
     """
     name = environment.folder_name
-    how = f"train first: python -m sb3_saf.train --algo {algo} --env {environment.id} -f {log_folder}"
+    how = f"train first: {python_command('sb3_saf.train')} --algo {algo} --env {environment.id} -f {log_folder}"
     if not (log_folder / algo).is_dir():
         raise ValueError(f"there is no folder {log_folder / algo}; {how}")
     runs = dict(runs_of(log_folder, algo, name))
@@ -165,19 +367,16 @@ def find_model(
     if number and number not in runs:
         raise ValueError(f"there is no run {number} of {environment.id} in {log_folder / algo}; there are {[*runs]}")
     folder = runs[number or max(runs)]
-    path = _model_file(folder, name, which)
+    if which == "last":
+        saved = [(int(match[1]), path) for path in folder.iterdir() if (match := _SAVED_MODEL.fullmatch(path.name))]
+        path = max(saved)[1] if saved else None
+    elif which == "best":
+        path = folder / "best_model.zip"
+    else:
+        path = folder / (f"{name}.zip" if which is None else f"rl_model_{which}_steps.zip")
     if path is None or not path.is_file():
         raise ValueError(
             f"{folder} has no {'saved model' if path is None else path.name}; --save-freq and --eval-freq of "
             "sb3_saf.train save models on the way"
         )
-    return folder, path
-
-
-def _model_file(folder: Path, name: str, which: str | int | None) -> Path | None:
-    if which == "best":
-        return folder / "best_model.zip"
-    if which != "last":
-        return folder / (f"{name}.zip" if which is None else f"rl_model_{which}_steps.zip")
-    saved = [(int(found[1]), path) for path in folder.iterdir() if (found := _SAVED_MODEL.fullmatch(path.name))]
-    return max(saved)[1] if saved else None
+    return Run(folder), path

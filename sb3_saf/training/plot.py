@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.commands import CommandError, OneLineParser, run_command, user_errors
+from sb3_saf.training.environments import folder_name
+from sb3_saf.training.folders import RUN_FILE, Run, Source, python_command
+from sb3_saf.training.settings import Settings, load_settings
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
-    from sb3_saf.training.runs import Run, Source
-
 PROGRAM: Final = "python -m sb3_saf.plot"
+#: Maximum number of changed settings in a method's name.
+_MOST_NAMED: Final = 2
 #: Columns of :func:`describe` that are not parameters of the game.
 _NO_LEVELS: Final = ("env", "size", "seed", "run", "changes", "method")
 
@@ -66,7 +70,6 @@ def _draw(options: argparse.Namespace) -> Figure:
     import pandas as pd
 
     from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_levels
-    from sb3_saf.training.runs import describe, find_runs, setting_names
     from sb3_saf.training.statistics import score_matrices
 
     table = describe(_with_scores(find_runs(options.log_folder, options.algos, options.env), options.source))
@@ -107,6 +110,87 @@ def _with_scores(runs: Sequence[Run], source: Source) -> list[Run]:
     for reason in reasons:
         print(f"left out: {reason}", file=sys.stderr)
     return found
+
+
+# --- runs as a table --------------------------------------------------------------------------------------------------
+
+
+def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
+    """Find the runs in a log folder, of the given algorithms and environments, or of all if none are given."""
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}; give the -f that sb3_saf.train was given")
+    names = {folder_name(env_id) for env_id in env_ids}
+    found: dict[str, list[Run]] = {}
+    for path in sorted(folder.glob(f"*/*/{RUN_FILE}")):
+        run = Run(path.parent)
+        if not names or run.settings.environment.folder_name in names:
+            found.setdefault(path.parts[-3], []).append(run)
+    if not found:
+        of = f" of {', '.join(env_ids)}" if env_ids else ""
+        raise ValueError(
+            f"there are no runs{of} in {folder}; train some: {python_command('sb3_saf.train')} -f {folder}"
+        )
+    for algo in algos:
+        if algo not in found:
+            raise unknown_name(f"algorithm among the runs in {folder}:", algo, found)
+    runs = [run for algo in (algos or found) for run in found[algo]]
+    return sorted(runs, key=lambda run: run.number)
+
+
+def describe(runs: Sequence[Run]) -> pd.DataFrame:
+    """
+    Describe runs in a table.
+
+    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game. A
+        method's name contains its differences from the zoo's settings and from other runs, or a number if these are too
+        many; ``changes`` lists them. Of runs that differ only in their number, the table has the latest
+    """
+    import pandas as pd
+
+    from_zoo = [_different_from_the_zoo(run.settings) for run in runs]
+    kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
+    variants: dict[str, dict[str, int]] = {}
+    rows = []
+    for run, kind, own in zip(runs, kinds, from_zoo, strict=True):
+        # What all runs of the algorithm at that size share is not named.
+        others = [other for of, other in zip(kinds, from_zoo, strict=True) if of == kind]
+        named = sorted(key for key, value in own.items() if any(other.get(key) != value for other in others))
+        changes = " ".join(f"{key}={own[key]}" for key in named)
+        method = f"{kind[0]} {changes}".rstrip()
+        if len(named) > _MOST_NAMED:
+            numbers = variants.setdefault(kind[0], {})
+            method = f"{kind[0]}, variant {numbers.setdefault(changes, len(numbers) + 1)}"
+        identity = {"env": run.settings.env_id, "size": run.settings.size, "seed": run.seed}
+        rows.append({**identity, **run.settings.env_kwargs, "run": run, "changes": changes, "method": method})
+    table = pd.DataFrame(rows)
+    repeated = [column for column in table.columns if column != "run"]
+    return table.drop_duplicates(repeated, keep="last", ignore_index=True)
+
+
+def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
+    """Return settings that differ from the zoo's present ones for the same game, as text."""
+    flat = []
+    for one in (settings, load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)):
+        own = {"n_envs": one.n_envs, "game_steps": one.game_steps, **one.plain, **one.wrapping}
+        flat.append({**own, **own.pop("policy_kwargs", {})})
+    ours, theirs = flat
+    values = {
+        key: ours.get(key, "default")
+        for key in {**theirs, **ours}
+        if repr(ours.get(key)) != repr(theirs.get(key)) and key != "policy_kwargs"
+    }
+    return {key: f"{value:.3g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+
+
+def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
+    """Name the games of each row of :func:`describe`: the environment, and the parameters in which the rows differ."""
+    named = {"method", "changes", "seed", "env", "run", *without}
+    varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
+    names = []
+    for _, row in table.iterrows():
+        parameters = row[varying].dropna()
+        names.append(", ".join([row["env"].removesuffix("-v0"), *(f"{c} {v}" for c, v in parameters.items())]))
+    return names
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

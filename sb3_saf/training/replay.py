@@ -23,7 +23,7 @@ from sb3_saf.training.commands import (
     user_errors,
 )
 from sb3_saf.training.enjoy import make_policy
-from sb3_saf.training.folders import read_run
+from sb3_saf.training.folders import RUN_FILE, Run
 from sb3_saf.training.settings import ALGOS, Settings, load_settings, saved_settings
 
 PROGRAM: Final = "python -m sb3_saf.replay"
@@ -76,13 +76,12 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
     """Return the settings of a model's run, or those of the command line."""
     if not path.exists():
         raise CommandError(f"--model {path} is not there")
-    configs = sorted(path.parent.glob("*/config.yml")) if path.is_file() else []
-    if len(configs) != 1:
+    if not (path.is_file() and (path.parent / RUN_FILE).is_file()):
         return load_settings(options.algo, options.env or "TeamSupport-v0", options.size, options.env_kwargs)
-    config = read_run(path.parent, configs[0].parent.name)
-    if options.env not in (None, config.get("env")):
-        raise CommandError(f"{path} was trained on {config.get('env')}, got --env {options.env}; leave --env out")
-    return saved_settings(config, options.env_kwargs)
+    trained = Run(path.parent).settings
+    if options.env not in (None, trained.env_id):
+        raise CommandError(f"{path} was trained on {trained.env_id}, got --env {options.env}; leave --env out")
+    return saved_settings(trained.as_dict(), options.env_kwargs)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

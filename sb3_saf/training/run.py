@@ -24,11 +24,12 @@ from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.teams.checks import evaluation_seed
-from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback
+from sb3_saf.teams.files import atomic_file
+from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback, TrainingClock
+from sb3_saf.training.folders import CHECKPOINTS, CURVE_POINTS, MONITOR, finish_run, write_curve
 from sb3_saf.training.settings import Settings
 from sb3_saf.training.wrappers import load_normalization, make_callbacks, save_normalization
 
-CHECKPOINTS: Final = "checkpoints"
 #: Evaluations, inspections and checkpoints of a run, unless a frequency is given.
 EVALUATIONS_PER_RUN: Final = 20
 INSPECTIONS_PER_RUN: Final = 10
@@ -131,7 +132,9 @@ class Training:
         with ExitStack() as self._open:  # closes the parts already made if a later one fails
             self.games = self._games(settings, monitor_dir=folder, n_cpus=self.options.n_cpus)
             self.model = self._make_model()
-            self.callbacks = [*callbacks, *self._make_callbacks()]
+            self.clock = TrainingClock(settings.game_steps / (2 * CURVE_POINTS))
+            self.evaluation: SeededEvalCallback | None = None
+            self.callbacks = [self.clock, *callbacks, *self._make_callbacks()]
             self._open = self._open.pop_all()
 
     def close(self) -> None:
@@ -139,7 +142,11 @@ class Training:
         self._open.close()
 
     def learn(self) -> BaseAlgorithm:
-        """Train, save, and return the model. It is also saved if Ctrl-C or SIGTERM ends training."""
+        """
+        Train, save, and return the model. It is also saved if Ctrl-C or SIGTERM ends training.
+
+        Checkpoints are removed when everything else is on disk.
+        """
         try:
             self._learn()
         except (KeyboardInterrupt, SystemExit):
@@ -147,6 +154,9 @@ class Training:
             raise
         self._save()
         if self.folder is not None:
+            if (self.folder / MONITOR).is_file():  # users may have moved or compressed it
+                write_curve(self.folder, self.clock.points, self.settings.n_envs)
+            finish_run(self.folder, **self.clock.cost())
             shutil.rmtree(self.folder / CHECKPOINTS, ignore_errors=True)
         return self.model
 
@@ -172,7 +182,8 @@ class Training:
 
     def _save(self) -> None:
         if self.folder is not None:
-            self.model.save(self.folder / f"{self.options.model_name}.zip")
+            with atomic_file(self.folder / f"{self.options.model_name}.zip") as file:
+                self.model.save(file)
             save_normalization(self.games, self.folder)
 
     def _games(self, settings: Settings, **kwargs: Any) -> CentralizedValueWrapper:
@@ -204,7 +215,8 @@ class Training:
         if self.folder is not None and options.save_freq > 0:
             callbacks.append(CheckpointInGameSteps(options.save_freq, self.folder, options.verbose))
         if eval_freq := self._every(options.eval_freq, EVALUATIONS_PER_RUN):
-            callbacks.append(self._evaluation(eval_freq))
+            self.evaluation = self._evaluation(eval_freq)
+            callbacks.append(self.evaluation)
         inspect_freq = self._every(options.inspect_freq, INSPECTIONS_PER_RUN)
         if options.tensorboard_log is not None and inspect_freq and "normalize" not in self.settings.wrapping:
             callbacks.append(self._inspection(inspect_freq))

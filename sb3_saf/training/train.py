@@ -7,7 +7,6 @@ import importlib
 import os
 import secrets
 import shlex
-import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,8 @@ import yaml
 
 from sb3_saf.teams.checks import MAX_SEED, check_seed
 from sb3_saf.teams.errors import CheckpointError, NonFiniteError, SettingsError
-from sb3_saf.training.callbacks import RemainingTime
+from sb3_saf.teams.files import digest
+from sb3_saf.training.callbacks import ProgressLines
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -34,12 +34,14 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import find_unfinished, make_run_folder, write_run
+from sb3_saf.training.folders import RUN_FILE, find_unfinished, make_run_folder, python_command, write_run
 from sb3_saf.training.run import RunOptions, Training
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
 
 PROGRAM: Final = "python -m sb3_saf.train"
+#: Options that affect a run's results but are not in its settings.
+_DECIDING: Final = ("eval_freq", "eval_episodes", "n_eval_envs", "eval_env_kwargs", "deterministic_eval", "save_freq")
 #: Options with the same name and value in RunOptions.
 _SAME_NAMES: Final = (
     *("eval_freq", "eval_episodes", "n_eval_envs", "deterministic_eval", "save_freq"),
@@ -119,7 +121,9 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
 
 def _add_evaluation(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--eval-freq", type=int, help="game steps between evaluations, -1 for none; by default 20 a run")
-    group.add_argument("--eval-episodes", type=at_least(1), default=32, help="team episodes of an evaluation")
+    group.add_argument(
+        "--eval-episodes", type=at_least(1), help="team episodes of an evaluation; by default 32, 2 for the size smoke"
+    )
     group.add_argument("--n-eval-envs", type=at_least(1), default=32, help="parallel games of an evaluation")
     add_key_values(group, "--eval-env-kwargs", help="parameters of the game that evaluation changes")
     group.add_argument("--deterministic-eval", action="store_true", help="evaluate the most likely actions")
@@ -132,16 +136,16 @@ def _add_evaluation(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--log-interval", type=int, default=-1, help="rollouts between logs, -1 for SB3's, -2 for none")
     group.add_argument("--track", action="store_true", help="log to Weights and Biases, which needs wandb")
-    group.add_argument("--wandb-project-name", default="sb3", help="of --track")
-    group.add_argument("--wandb-entity", help="of --track")
-    group.add_argument("--wandb-group", help="of --track")
-    group.add_argument("-tags", "--wandb-tags", nargs="+", default=[], help="of --track")
+    group.add_argument("--wandb-project-name", default="sb3", help="project of --track")
+    group.add_argument("--wandb-entity", help="user or team of --track")
+    group.add_argument("--wandb-group", help="group of runs of --track")
+    group.add_argument("-tags", "--wandb-tags", nargs="+", default=[], help="tags of --track")
 
 
 def _add_tuning(group: argparse._ArgumentGroup) -> None:
     group.add_argument("-optimize", "--optimize-hyperparameters", action="store_true", help="tune instead of training")
     group.add_argument("--storage", help="sqlite:///FILE.db or journal FILE.log that several processes may share")
-    group.add_argument("--study-name", help="of the study in the storage")
+    group.add_argument("--study-name", help="name of the study in the storage")
     group.add_argument("--trial-id", help="train with the settings of this trial of the study, a number or 'best'")
     group.add_argument("--n-trials", type=at_least(1), default=100, help="trials of this process")
     group.add_argument("--max-total-trials", type=at_least(1), help="trials of all processes together")
@@ -190,6 +194,8 @@ def _check(options: argparse.Namespace) -> None:
     if model is not None and not (model.suffix == ".zip" and model.is_file()):
         raise CommandError(f"--trained-agent must be a .zip that is there, got {str(model)!r}")
     _check_trial(options)
+    if options.eval_episodes is None:
+        options.eval_episodes = 2 if options.size == "smoke" else RunOptions.eval_episodes
     if options.progress is None:
         options.progress = sys.stdout.isatty()
     if options.verbose is None:
@@ -251,9 +257,20 @@ def _train(options: argparse.Namespace, command: str) -> None:
     if options.verbose > 0:
         print(yaml.safe_dump(settings.as_dict(), sort_keys=False), end="")
     seed = None if options.seed == -1 else options.seed
-    unfinished = _find_unfinished(options, settings, seed) if options.resume else None
-    folder, seed = unfinished or (None, secrets.randbelow(MAX_SEED) if seed is None else seed)
-    again = command if options.resume else f"{command} --resume"
+    deciding = {name: getattr(options, name) for name in _DECIDING}
+    if (model := options.trained_agent) is not None:
+        deciding["initial_model"] = {"path": str(model), "sha256": digest(model)}
+    folder = None
+    if options.resume:
+        with user_errors():
+            unfinished = find_unfinished(settings, seed, deciding, options.log_folder)
+        if unfinished is None:
+            print(f"No run of this command in {options.log_folder} is unfinished: a new one begins")
+        else:
+            folder, seed = unfinished
+            print(f"Going on with {folder}")
+    seed = secrets.randbelow(MAX_SEED) if seed is None else seed
+    again = command.replace(PROGRAM, python_command("sb3_saf.train"), 1) + ("" if options.resume else " --resume")
     with ExitStack() as stack:
         with user_errors(ValueError, OSError):
             if folder is None:
@@ -261,17 +278,20 @@ def _train(options: argparse.Namespace, command: str) -> None:
                     options.log_folder, settings.algo, settings.environment.folder_name, unique=options.uuid
                 )
                 stack.callback(_remove_unbegun, folder)
-                write_run(folder, settings, seed, vars(options), command)
+                write_run(folder, settings.as_dict(), seed, command, deciding)
             if options.track:
                 _track(options, settings, seed)
             run_options = _run_options(
                 options, settings, eval_settings=eval_settings, resume_hint=f"go on from there with: {again}"
             )
-            remaining = RemainingTime(verbose=int(not options.progress))
-            training = stack.enter_context(closing(Training(settings, seed, folder, run_options, [remaining])))
+            lines = ProgressLines(verbose=int(not options.progress))
+            training = stack.enter_context(closing(Training(settings, seed, folder, run_options, [lines])))
         _announce(training, folder)
         with user_errors(CheckpointError, NonFiniteError, SettingsError):
             training.learn()
+    if training.evaluation is not None:
+        seconds, whole = training.evaluation.seconds, training.clock.cost()["wall_seconds"]
+        print(f"Evaluation took {seconds / whole:.0%} of {whole:.0f} s (--eval-freq, --eval-episodes)")
     print(f"Saved to {folder}")
 
 
@@ -283,19 +303,11 @@ def _trial(options: argparse.Namespace) -> dict[str, Any]:
     return trial_overrides(options.storage, options.study_name, number)
 
 
-def _find_unfinished(options: argparse.Namespace, settings: Settings, seed: int | None) -> tuple[Path, int] | None:
-    found = find_unfinished(settings, seed, vars(options), options.log_folder)
-    if found is None:
-        print(f"No run of this command in {options.log_folder} is unfinished: a new one begins")
-    else:
-        print(f"Going on with {found[0]}")
-    return found
-
-
 def _remove_unbegun(folder: Path) -> None:
-    """Remove the folder of a run that has not begun, which would count as the latest run."""
-    if not (folder / "monitor.csv").exists():
-        shutil.rmtree(folder, ignore_errors=True)
+    """Remove the folder of a run that has left nothing but its description: it would count as the latest run."""
+    if [path.name for path in folder.iterdir()] == [RUN_FILE]:
+        (folder / RUN_FILE).unlink()
+        folder.rmdir()
 
 
 def _announce(training: Training, folder: Path) -> None:

@@ -25,6 +25,7 @@ from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
+from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import OBS_KEY
 from sb3_saf.training.environments import import_by_name
 
@@ -171,7 +172,8 @@ def save_normalization(env: VecEnv, folder: Path) -> None:
     layer = unwrap_vec_normalize(env)
     if layer is not None:
         arrays: dict[str, Any] = {key: np.array([one.count, *_flat(one)]) for key, one in _statistics(layer).items()}
-        np.savez(folder / NORMALIZATION_FILE, **arrays)
+        with atomic_file(folder / NORMALIZATION_FILE) as file:
+            np.savez(file, **arrays)
 
 
 def load_normalization(env: VecEnv, folder: Path) -> None:
