@@ -88,6 +88,17 @@ RUN = [
     Page(
         "docs/qplex.md", {"60_000 *": "40 *", "n_envs=32": "n_envs=2", "n_envs=64": "n_envs=2", "games, 64": "games, 2"}
     ),
+    Page("docs/outreach/pettingzoo.md", {"100_000 *": "800 *", "n_envs=16": "n_envs=2", "episodes=200": "episodes=2"}),
+    Page(
+        "docs/outreach/stable_baselines3.md",
+        {
+            "100_000 *": "800 *",
+            "make_env(16": "make_env(2",
+            "make_env(32": "make_env(2",
+            "20_000": "400",
+            "=32)": "=2)",
+        },
+    ),
     Page("docs/zoo.md", {'"small"': '"smoke"', "n_envs=32": "n_envs=2"}),
 ]
 
