@@ -30,11 +30,12 @@ if _is_installed("stable_baselines3"):
     from sb3_saf.callbacks.game_steps import GameStepsCallback
     from sb3_saf.checkpoints.callback import TeamCheckpointCallback
     from sb3_saf.checkpoints.learning import resumable_learn, resume
+    from sb3_saf.envs.audit import check_team_env
     from sb3_saf.envs.curriculum import Curriculum, Stage
+    from sb3_saf.envs.equal_spaces import EqualSpaces
     from sb3_saf.envs.gymnasium_team import GymnasiumTeam
     from sb3_saf.envs.joint_observation import CentralizedValueWrapper
     from sb3_saf.envs.monitor import TeamMonitor
-    from sb3_saf.envs.team_game import EqualSpaces
     from sb3_saf.envs.turns import TurnsInParallel
     from sb3_saf.evaluation import (
         EvaluationResult,
@@ -120,6 +121,7 @@ __all__ = [
     "TeamReplayBuffer",
     "TeamRolloutBuffer",
     "TurnsInParallel",
+    "check_team_env",
     "confidence_interval",
     "evaluate_policy",
     "evaluate_team",

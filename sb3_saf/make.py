@@ -12,10 +12,10 @@ from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.curriculum import Curriculum, Stage
-from sb3_saf.envs.game_form import AnyParallelEnv, AskMasks, Signals
+from sb3_saf.envs.equal_spaces import make_team_game, team_game
+from sb3_saf.envs.game_reader import AnyParallelEnv, AskMasks
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.team_game import make_team_game, team_game
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
 from sb3_saf.suites.registry import SuiteTask, find_task
 from sb3_saf.teams.checks import check_choice, check_count
@@ -35,13 +35,19 @@ class Request(NamedTuple):
     :param n_envs: E
     :param backend: None for the default
     :param n_cpus: number of processes
-    :param signals: signals besides own observations
+    :param active: whether rows tell which agents take part
+    :param action_masks: as in :func:`make_team_env`
+    :param state: whether rows have the game's state
+    :param float64: whether observations of float64 stay so
     """
 
     n_envs: int
     backend: Backend | None
     n_cpus: int
-    signals: Signals
+    active: bool
+    action_masks: AskMasks
+    state: bool
+    float64: bool
 
 
 def make_team_env(
@@ -56,6 +62,7 @@ def make_team_env(
     active: bool | None = None,
     action_masks: AskMasks = "auto",
     state: bool = False,
+    float64: bool = False,
     team_reward: TeamReward | None = None,
     curriculum: Sequence[Stage] = (),
     stagger: bool = False,
@@ -73,7 +80,7 @@ def make_team_env(
 
     - An agent that has ended, or not joined yet, keeps its row, filled with zeros; ``"active"`` marks it for the
       critics, and ``TeamRolloutBuffer`` excludes such rows from the loss.
-    - Masks come from observations of the form {"observation", "action_mask"}, which are split, or from
+    - Masks come from Dict observations with an entry such as ``"action_mask"``, which is taken out, or from
       ``infos[agent]["action_mask"]``. Policies of this package take legal actions only.
     - The environment's ``state()`` can be the input of MAPPO's critic, ``policy_kwargs={"critic_input": "state"}``.
 
@@ -96,6 +103,7 @@ def make_team_env(
     :param action_masks: ``"auto"`` for masks if the environment gives any (in observations, or in the infos of its
         first reset), True to require them, False for none
     :param state: whether observations have the environment's ``state()``
+    :param float64: whether observations of float64 stay so; they become float32 otherwise, which networks read
     :param team_reward: reward for learning: ``"given"`` is each agent's own reward, ``"sum"`` and ``"mean"`` are over
         the agents of its team; None for the suite's default, ``"given"`` without a suite. Logs and evaluation always
         report the games' rewards, in the suite's unit
@@ -111,7 +119,7 @@ def make_team_env(
         check_choice("backend", backend, get_args(Backend))
     if team_reward is not None:
         check_choice("team_reward", team_reward, get_args(TeamReward))
-    request = Request(n_envs, backend, n_cpus, Signals(active is not False, action_masks, state))
+    request = Request(n_envs, backend, n_cpus, active is not False, action_masks, state, float64)
     task = find_task(env) if isinstance(env, str) and "/" in env else None
     if isinstance(env, str) and _NAMES_OF_CODE.intersection(env):
         env = _imported(env)
@@ -211,22 +219,22 @@ def _suite(one: SuiteTask, request: Request, seed: int | None, params: dict[str,
             f"{one.id} has an engine of its own, which steps all games at once; leave backend and n_cpus out"
         )
     try:
-        venv = suite.vec_env(one.task, request.n_envs, seed, state=request.signals.state, **params)
+        venv = suite.vec_env(one.task, request.n_envs, seed, state=request.state, **params)
     except TypeError as error:  # most often an argument that it does not have
         raise ValueError(f"{one.id} cannot be made with {params}: {error}") from error
     rows = TeamSpaces.of_rows(venv.observation_space, venv.action_space, venv.n_agents)
-    _check_signals(one.id, rows, request.signals)
+    _check_signals(one.id, rows, request)
     return venv
 
 
-def _check_signals(name: str, rows: TeamSpaces, signals: Signals) -> None:
+def _check_signals(name: str, rows: TeamSpaces, request: Request) -> None:
     has_masks = rows.n_masked_actions is not None
-    if signals.action_masks not in ("auto", has_masks):
+    if request.action_masks not in ("auto", has_masks):
         raise ValueError(
-            f"{name} {'gives' if has_masks else 'has no'} action masks, got action_masks={signals.action_masks}; "
+            f"{name} {'gives' if has_masks else 'has no'} action masks, got action_masks={request.action_masks}; "
             "leave it out"
         )
-    if signals.state and rows.state is None:
+    if request.state and rows.state is None:
         raise ValueError(f"{name} has no state, got state=True; leave it out")
 
 
@@ -253,7 +261,8 @@ def _foreign(env: AnyParallelEnv | EnvFactory, request: Request, seed: int | Non
             f"backend='native' is the compiled core of HECOGrid, got it with {_name(env)}; leave backend out or use "
             "backend='supersuit'"
         )
-    return SuperSuitVecEnv(_bound(env, params), request.n_envs, seed, request.n_cpus, *request.signals)
+    n_envs, _, n_cpus, active, action_masks, state, float64 = request
+    return SuperSuitVecEnv(_bound(env, params), n_envs, seed, n_cpus, active, action_masks, state, float64)
 
 
 def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import threading
 from collections.abc import Callable
@@ -13,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from sb3_saf import TeamRolloutBuffer, make_team_env
+from sb3_saf import TeamRolloutBuffer, check_team_env, make_team_env
 from tests.toy_envs import CounterEnv, TellingEnv
 
 #: Changes what a step returns: observations, rewards, terminations, truncations and infos by agent.
@@ -23,6 +22,8 @@ Fault = Callable[[CounterEnv, list[Any]], Any]
 class MisbehavingEnv(CounterEnv):
     """
     A game with a fault at its second step, or in its reset.
+
+    A third agent has other spaces if ``unequal``. A ``late`` fault comes after the trial episode, which has the seed 0.
 
     :param at_step: changes or replaces what the second step returns
     :param at_reset: the same for observations and infos of resets
@@ -38,9 +39,11 @@ class MisbehavingEnv(CounterEnv):
         space: spaces.Space[Any] | None = None,
         seen: Callable[[int], Any] | None = None,
         action_space: spaces.Space[Any] | None = None,
+        unequal: bool = False,
+        late: bool = False,
     ):
-        self.space, self.seen, self.actions = space, seen, action_space
-        super().__init__()
+        self.space, self.seen, self.actions, self.unequal, self.late = space, seen, action_space, unequal, late
+        super().__init__(n_agents=3 if unequal else 2)
         self.at_step, self.at_reset = at_step, at_reset
         if setup is not None:
             setup(self)
@@ -51,7 +54,15 @@ class MisbehavingEnv(CounterEnv):
     def _make_action_space(self) -> spaces.Space[Any]:
         return super()._make_action_space() if self.actions is None else self.actions
 
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Box(0, 1, (5,)) if agent == "agent_2" else super().observation_space(agent)
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Discrete(7) if agent == "agent_2" else super().action_space(agent)
+
     def _observation(self, index: int, draw: np.float32) -> Any:
+        if index == 2:
+            return np.zeros(5, np.float32)
         return super()._observation(index, draw) if self.seen is None else self.seen(self.steps)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -60,7 +71,7 @@ class MisbehavingEnv(CounterEnv):
 
     def step(self, actions: dict[str, Any]) -> Any:
         result = list(super().step(actions))
-        if self.steps != 2 or self.at_step is None:
+        if self.steps != 2 or self.at_step is None or (self.late and self.last_seed == 0):
             return tuple(result)
         return self.at_step(self, result) or tuple(result)
 
@@ -101,125 +112,136 @@ def set_to(name: str, value: Any) -> Callable[[Any], None]:
     return lambda env: setattr(env, name, value)
 
 
-PLACE = "in game 0 at step 2"
-A_STEP = "expected step of counter_v0 to return (observations, rewards, terminations, truncations, infos)"
-A_RESET = "expected reset of counter_v0 to return (observations, infos)"
-WIDER = "; make the space as wide as what the game gives"
+STEP = "step of counter_v0 to return (observations, rewards, terminations, truncations, infos)"
+RESET = "reset of counter_v0 to return (observations, infos)"
 
+#: Faults, and words that the errors have in common with their names.
 FAULTS: list[tuple[dict[str, Any], str]] = [
-    # rewards
-    (lacks(REWARD), f"expected a reward for agent_1, which acted, {PLACE}, got rewards for ['agent_0']; give every "
-     "agent that acts a reward, 0.0 for none"),
-    (gives(REWARD, "1.0"), f"expected a number as the reward of agent_1 {PLACE}, got '1.0'"),
-    (gives(REWARD, None), f"expected a number as the reward of agent_1 {PLACE}, got None"),
-    (gives(REWARD, [1.0, 2.0]), f"expected a number as the reward of agent_1 {PLACE}, got [1.0, 2.0]"),
-    (gives(REWARD, np.ones(2)), f"expected a number as the reward of agent_1 {PLACE}, got array([1., 1.])"),
-    (gives(REWARD, 1j), f"expected a number as the reward of agent_1 {PLACE}, got 1j"),
-    (gives(REWARD, {"team": 1.0}), f"expected a number as the reward of agent_1 {PLACE}, got {{'team': 1.0}}"),
-    (gives(REWARD, [[1], [1, 2]]), f"expected a number as the reward of agent_1 {PLACE}, got [[1], [1, 2]]"),
-    (gives(REWARD, np.nan), "rewards must be finite, got nan at step 2 for agent 1 of game 0"),
-    (gives(REWARD, -np.inf), "rewards must be finite, got -inf at step 2 for agent 1 of game 0"),
-    (replaces(REWARD, np.ones(2)), f"{A_STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, ndarray, dict, "
-     "dict, dict"),
-    # observations
-    (lacks(OBSERVATION), f"expected an observation for agent_1, which takes part, {PLACE}, got observations for "
-     "['agent_0']"),
-    (gives(OBSERVATION, None), f"expected an observation for agent_1, which takes part, {PLACE}, got"),
-    (gives(OBSERVATION, np.zeros(4)), f"observation of agent_1 {PLACE}: expected float32 of shape (3,), got float64 of "
-     "shape (4,)"),
-    (gives(OBSERVATION, "abc"), f"observation of agent_1 {PLACE}: expected float32 of shape (3,), got <U3 of shape ()"),
-    (gives(OBSERVATION, [1, [2], [3, 4]]), f"observation of agent_1 {PLACE}: expected float32 of shape (3,), got "
-     "object"),
-    (gives(OBSERVATION, np.zeros(3, complex)), f"observation of agent_1 {PLACE}: expected float32 of shape (3,), got "
-     "complex128"),
-    (gives(OBSERVATION, [0, np.nan, 0]), "observations must be finite, got nan at step 2 for agent 1 of game 0"),
-    (sees(spaces.Discrete(4, start=5), 9, 5), f"observation of agent_0 {PLACE}: expected values from 5 to 8 as in "
-     f"Discrete(4, start=5), got 9{WIDER}"),
-    (sees(spaces.Discrete(4), 1.5, 1), f"observation of agent_0 {PLACE}: expected int64 of shape (), got float64"),
-    (sees(spaces.MultiDiscrete([2, 3]), [1, 3], [0, 0]), f"observation of agent_0 {PLACE}: expected values from 0 to 2 "
-     f"as in MultiDiscrete([2 3]), got 3{WIDER}"),
-    (sees(spaces.MultiBinary(2), [0, 2], [0, 1]), f"observation of agent_0 {PLACE}: expected values from 0 to 1 as in "
-     f"MultiBinary(2), got 2{WIDER}"),
+    (lacks(REWARD), "a reward for agent_1, which acted, in step 2"),
+    (gives(REWARD, "1.0"), "the reward of agent_1 in step 2 of a trial episode, got '1.0'"),
+    (gives(REWARD, None), "the reward of agent_1 in step 2 of a trial episode, got None"),
+    (gives(REWARD, [1.0, 2.0]), "the reward of agent_1 in step 2"),
+    (gives(REWARD, np.ones(2)), "the reward of agent_1 in step 2"),
+    (gives(REWARD, 1j), "the reward of agent_1 in step 2"),
+    (gives(REWARD, {"team": 1.0}), "the reward of agent_1 in step 2"),
+    (gives(REWARD, [[1], [1, 2]]), "the reward of agent_1 in step 2"),
+    (gives(REWARD, np.nan), "the reward of agent_1 in step 2 of a trial episode, got nan"),
+    (gives(REWARD, -np.inf), "the reward of agent_1 in step 2 of a trial episode, got -inf"),
+    (replaces(REWARD, np.ones(2)), f"{STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, ndarray"),
+    (lacks(OBSERVATION), "an observation for agent_1, which takes part, in step 2"),
+    (gives(OBSERVATION, None), "an observation for agent_1, which takes part, in step 2"),
+    (gives(OBSERVATION, np.zeros(4)), "agent_1 in step 2 of a trial episode: expected float32 of shape (3,), got"),
+    (gives(OBSERVATION, 0.5), "agent_1 in step 2 of a trial episode: expected float32 of shape (3,), got float64 of"),
+    (gives(OBSERVATION, "abc"), "agent_1 in step 2 of a trial episode: expected float32 of shape (3,), got <U3"),
+    (gives(OBSERVATION, [1, [2], [3, 4]]), "agent_1 in step 2 of a trial episode: expected float32 of shape (3,)"),
+    (gives(OBSERVATION, np.zeros(3, complex)), "agent_1 in step 2 of a trial episode: expected float32 of shape"),
+    (gives(OBSERVATION, [0, np.nan, 0]), "agent_1 in step 2 of a trial episode: expected finite values, got nan"),
+    (sees(spaces.Discrete(4, start=5), 9, 5), "agent_0 in step 2 of a trial episode: expected values from 5 to 8"),
+    (sees(spaces.Discrete(4), -1, 1), "agent_0 in step 2 of a trial episode: expected values from 0 to 3"),
+    (sees(spaces.Discrete(4), 1.5, 1), "agent_0 in step 2 of a trial episode: expected int64 of shape ()"),
+    (sees(spaces.MultiDiscrete([2, 3]), [1, 3], [0, 0]), "expected values from 0 to 2 as in MultiDiscrete([2 3])"),
+    (sees(spaces.MultiBinary(2), [0, 2], [0, 1]), "expected values from 0 to 1 as in MultiBinary(2), got 2"),
     (sees(spaces.Box(0, 19, (2,), np.uint8), np.array([3, 255], np.uint8), np.zeros(2, np.uint8)),
-     f"observation of agent_0 {PLACE}: expected values from 0 to 19 as in Box(0, 19, (2,), uint8), got 255{WIDER}"),
-    (sees(spaces.Dict(a=spaces.Discrete(2)), {"b": 0}, {"a": 0}), f"observation of agent_0 {PLACE}: expected a dict "
-     "with ['a'], got ['b']"),
-    (sees(spaces.Tuple([spaces.Discrete(2)] * 2), (0,), (0, 0)), f"observation of agent_0 {PLACE}: expected 2 parts, "
-     "got (0,)"),
-    (sees(spaces.Dict(a=spaces.Discrete(2)), {"a": 2}, {"a": 0}), f"observation of agent_0 {PLACE}, 'a': expected "
-     f"values from 0 to 1 as in Discrete(2), got 2{WIDER}"),
-    # terminations, truncations and agents
-    (gives(TERMINATION, "False"), f"expected True or False for agent_1 in terminations {PLACE}, got 'False'"),
-    (gives(TERMINATION, np.nan), f"expected True or False for agent_1 in terminations {PLACE}, got nan"),
-    (gives(TERMINATION, None), f"expected True or False for agent_1 in terminations {PLACE}, got None"),
-    (gives(TERMINATION, 2), f"expected True or False for agent_1 in terminations {PLACE}, got 2"),
-    (gives(TERMINATION, np.array([True, False])), f"expected True or False for agent_1 in terminations {PLACE}, got "
-     "array([ True, False])"),
-    (gives(TRUNCATION, "yes"), f"expected True or False for agent_1 in truncations {PLACE}, got 'yes'"),
-    (replaces(TERMINATION, np.zeros(2, bool)), f"{A_STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, dict, "
-     "ndarray, dict, dict"),
-    ({"at_step": lambda env, result: setattr(env, "agents", None)}, "expected agents of counter_v0 to be a list of "
-     f"names {PLACE}, got None"),
-    ({"at_step": lambda env, result: setattr(env, "agents", "agent_0")}, "expected agents of counter_v0 to be a list "
-     f"of names {PLACE}, got 'agent_0'"),
-    ({"at_step": lists("agent_0", "agent_7")}, "expected names from possible_agents (['agent_0', 'agent_1']) in agents "
-     f"of counter_v0 {PLACE}, got 'agent_7'"),
-    # infos, and results as a whole
-    (gives(INFO, "fine"), f"expected a dict as the info of agent_1 {PLACE}, got 'fine'"),
-    (gives(INFO, [1]), f"expected a dict as the info of agent_1 {PLACE}, got [1]"),
-    (replaces(INFO, []), f"{A_STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, dict, dict, dict, list"),
-    (replaces(INFO, "fine"), "got 5 values: dict, dict, dict, dict, str"),
-    ({"at_step": lambda env, result: tuple(result[:4])}, "got 4 values: dict, dict, dict, dict (one dict of dones, as "
-     "in older versions): return terminations for agents whose game is over"),
-    ({"at_step": lambda env, result: 0.5}, f"{A_STEP}, as PettingZoo 1.24 and later do, got an object of type float"),
-    # resets
-    ({"at_reset": lambda env, result: result[0]}, f"{A_RESET}, as PettingZoo 1.24 and later do, got a dict with the "
-     "keys ['agent_0', 'agent_1'] (observations alone"),
-    ({"at_reset": lambda env, result: (result[0], [])}, f"{A_RESET}, as PettingZoo 1.24 and later do, got 2 values: "
-     "dict, list"),
-    ({"at_reset": lists()}, "expected at least one name in agents after reset of game 0, got none"),
-    ({"at_reset": lists("left")}, "in agents of counter_v0 in game 0 at step 0, got 'left'"),
-    ({"at_reset": lambda env, result: result[0].clear()}, "expected an observation for agent_0, which takes part, in "
-     "game 0 at step 0, got observations for []"),
-    ({"at_reset": lambda env, result: result[1].update(agent_0="new")}, "expected a dict as the info of agent_0 in "
-     "game 0 at step 0, got 'new'"),
+     "agent_0 in step 2 of a trial episode: expected values from 0 to 19 as in Box(0, 19, (2,), uint8), got 255"),
+    (sees(spaces.Dict(a=spaces.Discrete(2)), {"b": 0}, {"a": 0}), "expected a dict with ['a'], got ['b']"),
+    (sees(spaces.Tuple([spaces.Discrete(2)] * 2), (0,), (0, 0)), "expected 2 parts, got (0,)"),
+    (sees(spaces.Dict(a=spaces.Discrete(2)), {"a": 2}, {"a": 0}), "'a': expected values from 0 to 1"),
+    (gives(TERMINATION, "False"), "True or False for agent_1 in terminations in step 2"),
+    (gives(TERMINATION, np.nan), "True or False for agent_1 in terminations in step 2"),
+    (gives(TERMINATION, None), "True or False for agent_1 in terminations in step 2"),
+    (gives(TERMINATION, 2), "True or False for agent_1 in terminations in step 2"),
+    (gives(TERMINATION, np.array([True, False])), "True or False for agent_1 in terminations in step 2"),
+    (gives(TRUNCATION, "yes"), "True or False for agent_1 in truncations in step 2"),
+    (replaces(TERMINATION, np.zeros(2, bool)), f"{STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, dict, n"),
+    ({"at_step": lambda env, result: setattr(env, "agents", None)}, "agents of counter_v0 to be a list"),
+    ({"at_step": lambda env, result: setattr(env, "agents", "agent_0")}, "agents of counter_v0 to be a list"),
+    ({"at_step": lists("agent_0", "agent_7")}, "in agents of counter_v0 in step 2 of a trial episode, got 'agent_7'"),
+    (gives(INFO, "fine"), "a dict as the info of agent_1 in step 2 of a trial episode, got 'fine'"),
+    (gives(INFO, [1]), "a dict as the info of agent_1 in step 2 of a trial episode, got [1]"),
+    (replaces(INFO, []), f"{STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, dict, dict, dict, list"),
+    ({"at_step": lambda env, result: tuple(result[:4])}, "got 4 values: dict, dict, dict, dict (one dict of dones"),
+    ({"at_step": lambda env, result: 0.5}, f"{STEP}, as PettingZoo 1.24 and later do, got an object of type float"),
+    ({"at_reset": lambda env, result: result[0]}, "(observations alone, as in older versions)"),
+    ({"at_reset": lambda env, result: (result[0], [])}, f"{RESET}, as PettingZoo 1.24 and later do, got 2 values"),
+    ({"at_reset": lists()}, "expected at least one name in agents of counter_v0 after reset, got none"),
+    ({"at_reset": lists("left")}, "in agents of counter_v0 at the reset of a trial episode, got 'left'"),
+    ({"at_reset": lambda env, result: result[0].clear()}, "an observation for agent_0, which takes part, at the reset"),
+    ({"at_reset": lambda env, result: result[1].update(agent_0="new")}, "a dict as the info of agent_0 at the reset"),
     ({"setup": set_to("reset", lambda: None)}, "expected counter_v0 to have reset(seed=None, options=None)"),
-    # what is known before the first episode
-    ({"setup": set_to("possible_agents", ["a", "b", "a"])}, "expected different names in possible_agents of "
-     "counter_v0, got 'a' more than once in ['a', 'b', 'a']"),
-    ({"setup": set_to("possible_agents", [])}, "expected counter_v0 to list its agents in possible_agents"),
-    ({"setup": set_to("observation_space", {})}, "expected observation_space(agent) to be a method that gives an "
-     "agent's space, got dict"),
-    ({"space": spaces.Box(0, 1, (0,))}, "expected an observation space with at least one entry, got Box([], [], (0,), "
-     "float32); give agents without anything to see one constant entry"),
-    ({"action_space": spaces.Box(0, 1, (2, 0))}, "expected an action space with at least one entry, got Box("),
-    ({"space": spaces.Dict()}, "expected an observation space with at least one entry, got Dict()"),
+    ({"at_step": lambda env, result: env.possible_agents.pop() and None}, "the same possible_agents at all times"),
+    ({"space": spaces.Box(0, 1, (0,))}, "expected an observation space with at least one entry"),
+    ({"action_space": spaces.Box(0, 1, (2, 0))}, "expected an action space with at least one entry"),
+    ({"space": spaces.Dict()}, "expected an observation space with at least one entry"),
     ({"space": spaces.Text(3)}, "expected an observation space that is one of Discrete, MultiDiscrete, MultiBinary"),
     ({"action_space": spaces.Tuple([spaces.Discrete(2)])}, "expected an action space that is one of Discrete"),
 ]  # fmt: skip
 
 
+@pytest.mark.parametrize("unequal", [False, True])
+@pytest.mark.parametrize(("fault", "message"), FAULTS, ids=lambda value: value[:50] if isinstance(value, str) else "")
+def test_each_fault_is_named_when_the_environment_is_made(fault: dict[str, Any], message: str, unequal: bool) -> None:
+    """Agents with different spaces are checked against their own, before they are padded."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make_team_env(MisbehavingEnv, 2, seed=0, unequal=unequal, **fault)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_team_env(MisbehavingEnv(unequal=unequal, **fault))
+
+
+#: Faults that come after the trial, and words of their errors.
+LATE_FAULTS: list[tuple[dict[str, Any], str]] = [
+    (lacks(REWARD), "agent_1, which acted, in game 0 at step 2"),
+    (gives(REWARD, "1.0"), "agent_1 in game 0 at step 2"),
+    (gives(REWARD, np.nan), "rewards must be finite, got nan at step 2 for agent 1 of game 0"),
+    (gives(OBSERVATION, None), "agent_1"),
+    (gives(OBSERVATION, np.zeros(4)), "agent_1"),
+    (gives(OBSERVATION, 0.5), "agent_1"),
+    (gives(OBSERVATION, np.zeros(3, complex)), "agent_1"),
+    (gives(OBSERVATION, [0, np.nan, 0]), "observations must be finite, got nan at step 2 for agent 1 of game 0"),
+    (gives(TERMINATION, "False"), "agent_1 in terminations in game 0 at step 2"),
+    ({"at_step": lambda env, result: tuple(result[:4])}, "got 4 values"),
+    ({"at_step": lists("agent_0", "agent_7")}, "in game 0 at step 2, got 'agent_7'"),
+    ({"at_step": lambda env, result: result[0].update(agent_1=7), "space": spaces.Discrete(4), "seen": lambda step: 0},
+     "agent_1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("unequal", [False, True])
 @pytest.mark.parametrize(
     ("fault", "message", "n_cpus"),
-    # Whether a worker's errors arrive does not depend on their words.
-    [*((*fault, 1) for fault in FAULTS), *((*fault, 2) for fault in FAULTS[::10])],
-    ids=lambda value: value[:70] if isinstance(value, str) else "",
+    [*((*fault, 1) for fault in LATE_FAULTS), *((*fault, 2) for fault in LATE_FAULTS[::5])],
 )
-def test_each_fault_is_named(fault: dict[str, Any], message: str, n_cpus: int) -> None:
-    with contextlib.ExitStack() as stack, pytest.raises(ValueError, match=re.escape(message)):
-        play_two_steps(stack, n_cpus, fault)
-
-
-def play_two_steps(stack: contextlib.ExitStack, n_cpus: int, fault: dict[str, Any]) -> None:
-    env = make_team_env(MisbehavingEnv, 2, seed=0, n_cpus=n_cpus, **fault)
-    stack.callback(env.close)
-    env.reset()
-    for _ in range(2):
+def test_faults_after_the_trial_are_named(fault: dict[str, Any], message: str, n_cpus: int, unequal: bool) -> None:
+    env = make_team_env(MisbehavingEnv, 2, seed=1, n_cpus=n_cpus, unequal=unequal, late=True, **fault)
+    try:
+        env.reset()
         env.step(np.zeros(env.num_envs, dtype=int))
+        with pytest.raises(ValueError, match=re.escape(message)):
+            env.step(np.zeros(env.num_envs, dtype=int))
+    finally:
+        env.close()
 
 
-def test_the_table_is_as_long_as_promised() -> None:
-    assert len(FAULTS) >= 40
+@pytest.mark.parametrize(
+    ("setup", "message"),
+    [
+        (set_to("possible_agents", ["a", "b", "a"]), "got 'a' more than once in ['a', 'b', 'a']"),
+        (set_to("possible_agents", []), "expected counter_v0 to list its agents in possible_agents"),
+        (set_to("observation_space", {}), "expected observation_space(agent) to be a method"),
+    ],
+)
+def test_games_without_agents_or_spaces(setup: Callable[[Any], None], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make_team_env(MisbehavingEnv, setup=setup)
+
+
+def test_the_trial_disturbs_no_game_and_no_generator() -> None:
+    game = CounterEnv()
+    before = np.random.get_state()[1].tolist()  # noqa: NPY002
+    env = make_team_env(game, 1, seed=3)
+    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
+    assert game.episode == 0
+    env.reset()
+    assert env.get_attr("episode") == [1, 1]
 
 
 @pytest.mark.parametrize("n_cpus", [1, 2])
@@ -234,47 +256,39 @@ def test_an_info_that_cannot_be_copied(n_cpus: int) -> None:
         env.step(np.zeros(2, dtype=int))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"agent_0": np.zeros(3)}, "4 zeros and ones (one per action), got array([0., 0., 0.])"),
-        ({"agent_0": np.array([0, 1, 2, 0])}, "4 zeros and ones (one per action), got array([0, 1, 2, 0])"),
-        ({"agent_0": "all"}, "4 zeros and ones (one per action), got 'all'"),
-    ],
-)
-def test_wrong_masks(change: dict[str, Any], message: str) -> None:
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("mask", [np.zeros(3), np.array([0, 1, 2, 0]), "all", None])
+def test_wrong_masks(mask: Any, late: bool) -> None:
     class Game(TellingEnv):
         def step(self, actions: dict[str, Any]) -> Any:
             *rest, infos = super().step(actions)
-            return (*rest, {agent: {**infos[agent], "action_mask": change.get(agent)} for agent in infos})
+            if late and self.last_seed == 0:
+                return (*rest, infos)
+            return (*rest, {agent: {**infos[agent], "action_mask": mask} for agent in infos})
 
-    env = make_team_env(Game, masks="info")
-    env.reset()
-    where = "expected 'action_mask' in the info of agent_0 in game 0 at step 1, "
-    with pytest.raises(ValueError, match=re.escape(where + message)):
+    def play() -> None:
+        env = make_team_env(Game, seed=1, masks="info", action_masks=True if mask is None else "auto")
+        env.reset()
         env.step(np.array([0, 1]))
+
+    with pytest.raises(ValueError, match=r"'action_mask' in the info of agent_0 in .* 1.*4 zeros and ones"):
+        play()
 
 
 def test_a_state_of_another_shape() -> None:
     env = make_team_env(TellingEnv, state=True)
     env.set_attr("state", lambda: np.zeros(3))
-    with pytest.raises(
-        ValueError, match=r"the state of game 0 at step 0: expected float32 of shape \(2,\), got float6"
-    ):
+    with pytest.raises(ValueError, match=r"the state in game 0 at step 0: expected float32 of shape \(2,\)"):
         env.reset()
 
 
 def test_observations_outside_the_bounds_of_floats_are_warned_of_once() -> None:
     """Rounding alone may cause it, and policies accept any float."""
     game = sees(spaces.Box(0, 1, (2,)), [0.5, 1.5], [0, 0])
-    env = make_team_env(MisbehavingEnv, 2, **game)
-    env.reset()
-    env.step(np.zeros(4, dtype=int))
-    with pytest.warns(
-        UserWarning, match=r"agent_0 in game 0 at step 2: expected values from 0.0 to 1.0 .* got 1.5;"
-    ) as w:
-        env.step(np.zeros(4, dtype=int))
+    with pytest.warns(UserWarning, match=r"agent_0 in step 2 .*: expected values from 0.0 to 1.0 .* got 1.5") as w:
+        env = make_team_env(MisbehavingEnv, 2, **game)
     assert len(w) == 1
+    env.reset()
     for _ in range(3):
         env.step(np.zeros(4, dtype=int))  # warnings are errors
 

@@ -30,9 +30,9 @@ from sb3_saf import (
     make_team_env,
     resumable_learn,
 )
+from sb3_saf.envs.equal_spaces import EqualSpaces
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
 from sb3_saf.envs.space_reader import PartsSpace
-from sb3_saf.envs.team_game import EqualSpaces
 from sb3_saf.envs.team_reward import SharedReward
 from sb3_saf.policies.extractors import PaperCNN, PartsEncoder
 from sb3_saf.suites.__main__ import main

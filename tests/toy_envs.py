@@ -429,7 +429,7 @@ class TracingEnv(CounterEnv):
         self.path = path
 
     def close(self) -> None:
-        if self.episode:  # the copy from which the spaces are read never plays
+        if self.last_seed != 0:  # as the copy has that plays a trial episode
             with open(self.path, "a") as file:
                 file.write("closed\n")
 

@@ -30,12 +30,12 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from sb3_saf.checkpoints.data import decode, encode
-from sb3_saf.envs.game_layers import layers_of
+from sb3_saf.envs.audit import layers_of
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.rows import ACTION_MASK_KEY
 
 if TYPE_CHECKING:
-    from sb3_saf.envs.supersuit_game import TeamMarkovVectorEnv
+    from sb3_saf.envs.supersuit_games import TeamMarkovVectorEnv
 
 #: How a game is copied: by its own methods, or by pickling.
 Way = Literal["get_state", "pickle"]

@@ -57,17 +57,21 @@ class SpaceReader:
     """
     Check and convert a game's values for one space.
 
-    Shape and kind of the numbers must be those of the space. Integers outside the bounds are refused; floats outside
-    them are noted once in ``notes``, so that the caller can warn.
+    Shape and kind of the numbers must be those of the space. Integers outside the bounds, which index tables, are
+    refused. With ``notes``, NaN and infinity are refused, too, and floats outside the bounds are noted once.
 
     :param space: the game's space: of fixed shape, or a Dict or Tuple of such spaces
     :param notes: gets the first note
+    :param float64: whether Boxes of float64 stay so; they become float32 otherwise
     """
 
-    def __init__(self, space: spaces.Space[Any], notes: list[str]) -> None:
+    def __init__(self, space: spaces.Space[Any], notes: list[str] | None = None, float64: bool = True) -> None:
         self.space = space
         #: Space of the results of :meth:`read`.
         self.rows: spaces.Space[Any] = counted_from_zero(space)
+        if not float64 and isinstance(space, spaces.Box) and space.dtype == np.float64:
+            with np.errstate(over="ignore"):
+                self.rows = spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
         self._notes = notes
         self._parts = {key: SpaceReader(part, notes) for key, part in parts_of(space).items()}
         if not self._parts and isinstance(space, FIXED_SHAPE):
@@ -75,13 +79,11 @@ class SpaceReader:
             self._is_shifted = bool(np.any(self._start != 0))
             self._shape, self._dtype = space.shape, np.dtype(space.dtype)
             self._is_float = self._dtype.kind == "f"
-            self._low, self._high = self._bounds()
-
-    def _bounds(self) -> tuple[Any, Any]:
-        """Return the bounds, None where the dtype implies them."""
-        low, high = bounds_of(self.space)
-        limits = (-np.inf, np.inf) if self._is_float else _limits(self._dtype)
-        return _unless_always(low, limits[0]), _unless_always(high, limits[1])
+            self._low, self._high = None, None
+            if notes is not None or not self._is_float:
+                low, high = bounds_of(space)
+                limits = (-np.inf, np.inf) if self._is_float else _limits(self._dtype)
+                self._low, self._high = _unless_always(low, limits[0]), _unless_always(high, limits[1])
 
     def blank(self) -> Any:
         """Return an observation of zeros."""
@@ -116,13 +118,18 @@ class SpaceReader:
                 )
             if self._is_float:  # bounds are rounded to the dtype, so values must be before they are compared
                 array = array.astype(self._dtype)
+        if self._notes is not None and self._is_float and not np.isfinite(array).all():
+            raise ValueError(
+                f"observation of {owner}: expected finite values, got {array[~np.isfinite(array)].reshape(-1)[0]}"
+            )
         if self._high is not None and _any_above(array, self._high):
             self._report(array, array > self._high, owner)
         if self._low is not None and (array < self._low).any():
             self._report(array, array < self._low, owner)
         if self._is_shifted:
             array = array - self._start
-        return array.astype(self._dtype, copy=False)
+        with np.errstate(over="ignore"):
+            return array.astype(self.rows.dtype, copy=False)
 
     def _report(self, array: Array, outside: Any, owner: str) -> None:
         """Raise ValueError for integers outside the bounds, note floats."""
@@ -133,7 +140,7 @@ class SpaceReader:
         )
         if not self._is_float:
             raise ValueError(f"{message}; make the space as wide as what the game gives")
-        if not self._notes:
+        if self._notes is not None and not any(note.startswith("observation of") for note in self._notes):
             self._notes.append(message)
 
 
@@ -177,9 +184,10 @@ class FlatReader(SpaceReader):
 
     :param space: see :class:`SpaceReader`
     :param notes: see :class:`SpaceReader`
+    :param float64: see :class:`SpaceReader`
     """
 
-    def __init__(self, space: spaces.Space[Any], notes: list[str]) -> None:
+    def __init__(self, space: spaces.Space[Any], notes: list[str] | None = None, float64: bool = True) -> None:
         super().__init__(space, notes)
         self._structured = self.rows
         flat = spaces.flatten_space(self._structured)
@@ -187,7 +195,7 @@ class FlatReader(SpaceReader):
         leaves = leaves_of(self._structured)
         if any(_is_picture(leaf) for leaf in leaves):
             flat = PartsSpace(flat, _parts_of_vector(leaves))
-        elif flat.dtype == np.float64 and all(leaf.dtype != np.float64 for leaf in leaves):
+        elif flat.dtype == np.float64 and not (float64 and any(leaf.dtype == np.float64 for leaf in leaves)):
             # Mixed integers and float32 would give float64, which takes twice the memory.
             flat = spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
         self.rows = flat

@@ -1,37 +1,290 @@
-"""Games of one process (SuperSuit's ``ConcatVecEnv`` with fixes) and the source they are made from."""
+"""
+Games as rows, on SuperSuit's classes.
+
+SuperSuit's ``MarkovVectorEnv`` (the agents of a game as rows) and ``ConcatVecEnv`` (several games) are base classes
+here: they split actions, join rows and draw; episodes, ends, infos, seeds, attributes and processes are our own code.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import random
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import cloudpickle
 import numpy as np
 import numpy.typing as npt
-from supersuit.vector import ConcatVecEnv
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from supersuit.vector import ConcatVecEnv, MarkovVectorEnv
 
-from sb3_saf.envs.game_copies import Way, find_way
-from sb3_saf.envs.game_form import GameForm
-from sb3_saf.envs.supersuit_game import Info, Infos, TeamMarkovVectorEnv
+from sb3_saf.envs import audit
+from sb3_saf.envs.audit import check_is_parallel
+from sb3_saf.envs.game_copies import Way, find_way, pickled, unpickled
+from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
+from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED
+
+Info: TypeAlias = "dict[str, Any]"
+Infos: TypeAlias = "list[Info]"
+
+#: Keys of infos that Stable-Baselines3 or this package uses. A game's own entries with these names are renamed.
+RESERVED_KEYS: Final = frozenset({TERMINAL_OBSERVATION, TRUNCATED, ACTIVE_KEY, "episode"})
+
+_MASKS = frozenset(audit.INFO_MASKS)
+_UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
 
 
-class Question(NamedTuple):
+# ---- one game
+
+
+class TeamMarkovVectorEnv(MarkovVectorEnv):
     """
-    Query to a game.
+    The agents of one game as rows that end together.
 
-    :param game: index among all E games
-    :param function: of :mod:`sb3_saf.envs.game_layers`, called with the game
-    :param args: further arguments
+    Changes to :class:`supersuit.vector.MarkovVectorEnv`:
+
+    - an agent that has ended or not joined yet keeps its row;
+    - rewards that the game pays to agents that do not act (after their end, while they are away) are in their rows;
+    - the last step's infos are kept: those of the next episode's reset are in ``reset_infos``;
+    - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
+    - rows have signals on request: active agents, action masks, the game's state.
+
+    :param env: the game
+    :param reader: reads it
+    :param index: index of the game, for messages
+    :param notes: gets warnings
     """
 
-    game: int
-    function: Callable[..., Any]
-    args: tuple[Any, ...]
+    par_env: AnyParallelEnv
+
+    def __init__(self, env: AnyParallelEnv, reader: GameReader, index: int, notes: list[str]) -> None:
+        if not hasattr(env, "metadata"):
+            env.metadata = {}
+        if not hasattr(env.unwrapped, "render_mode"):
+            env.unwrapped.render_mode = None
+        check_is_parallel(env, is_factory=True)
+        super().__init__(env, black_death=True)
+        self.observation_space = reader.rows.to_row_space()
+        self.agents = reader.agents
+        #: Infos of the last reset, one per row.
+        self.reset_infos: Infos = []
+        self._index = index
+        self._reader = reader
+        self._notes = notes
+        self._is_closed = False
+        self._count_step(0)
+        self._ended: set[Any] = set()
+        #: Agents that take part, in the order of the rows: a set with an order.
+        self._playing: dict[Any, None] = {}
+
+    def _count_step(self, number: int) -> None:
+        self._n_steps = number
+        #: Game and step, for messages.
+        self._place = f"in game {self._index} at step {number}"
+
+    def reset(self, seed: int | None = None, options: Info | None = None) -> tuple[Any, Infos]:
+        """
+        Begin an episode.
+
+        :param seed: seed of the game, None to continue its random stream
+        :param options: options for the game
+        :return: observations and infos of the N rows
+        """
+        observations, infos = audit.reset(self.par_env, seed, options)
+        self._count_step(0)
+        self._ended.clear()
+        self._playing = self._find_playing()
+        if not self._playing:
+            raise ValueError(f"expected at least one name in agents after reset of game {self._index}, got none")
+        self.reset_infos = self._infos(infos, self._playing, reserved=frozenset())
+        return self._rows(observations, infos, self._playing, self._playing), self.reset_infos
+
+    def step(self, actions: npt.NDArray[Any]) -> tuple[Any, Any, Any, Any, Infos]:
+        """Step the game with the actions of the N rows (see PettingZoo); the next episode begins automatically."""
+        acted = self._playing
+        chosen = dict(zip(self.agents, iterate(self.action_space, actions), strict=True))
+        self._count_step(self._n_steps + 1)
+        result = self.par_env.step({agent: chosen[agent] for agent in acted})
+        observations, rewards, terminations, truncations, infos = audit.step_results(self.par_env, result)
+        paid = [audit.reward_of(rewards, agent, self._place, agent in acted) for agent in self.agents]
+        terminated = {agent for agent in acted if audit.end_of("terminations", terminations, agent, self._place)}
+        truncated = {agent for agent in acted if audit.end_of("truncations", truncations, agent, self._place)}
+        truncated -= terminated
+        self._note_respawned(terminations, truncations)
+        self._ended |= terminated | truncated
+        self._playing = self._find_playing()
+        row_infos = self._infos(infos, acted)
+        over = not self._playing
+        if over or terminated or truncated:
+            last = self._rows(observations, infos, acted, truncated, over=True)
+            for agent, info, row in zip(self.agents, row_infos, iterate(self.observation_space, last), strict=True):
+                if over or agent in terminated or agent in truncated:
+                    info[TERMINAL_OBSERVATION] = row
+                    info[TRUNCATED] = agent in truncated
+        # Rows are copies, so games may reuse their arrays in the reset.
+        rows = self.reset()[0] if over else self._rows(observations, infos, self._playing, self._playing)
+        ends_by_limit = np.array([over and agent in truncated for agent in self.agents])
+        return rows, np.array(paid, dtype=np.float32), over & ~ends_by_limit, ends_by_limit, row_infos
+
+    def close(self) -> None:
+        """Close the game, once."""
+        if not self._is_closed:
+            self._is_closed = True
+            super().close()
+
+    def _find_playing(self) -> dict[Any, None]:
+        """Return the agents that take part; an agent that has ended does not return."""
+        present = audit.present_agents(self.par_env, self.agents, self._place)
+        return {agent: None for agent in self.agents if agent in present and agent not in self._ended}
+
+    def _note_respawned(self, terminations: Mapping[Any, Any], truncations: Mapping[Any, Any]) -> None:
+        """Warn of agents that have ended and play again."""
+        for agent in self._ended.intersection(self.par_env.agents):
+            if not self._notes and not terminations.get(agent, True) and not truncations.get(agent):
+                self._notes.append(
+                    f"{agent} has ended and is in agents again {self._place}, not ended any more: an agent that has "
+                    "ended stays out until its team's episode ends. Let agents that will return leave agents without "
+                    "an end: they wait, and play on"
+                )
+
+    def _infos(
+        self, infos: Mapping[Any, Any], acted: Container[Any], reserved: frozenset[str] = RESERVED_KEYS
+    ) -> Infos:
+        """Copy the infos of all rows, since games may reuse theirs; rename ``reserved`` keys."""
+        rows = []
+        for agent in self.agents:
+            info = _copied(audit.info_of(infos, agent, self._place), agent)
+            for key in reserved.intersection(info):
+                info[f"game_{key}"] = info.pop(key)
+            if agent not in acted:
+                info[ACTIVE_KEY] = False
+            if self._reader.watches_masks and not self._notes and not _MASKS.isdisjoint(info):
+                self._notes.append(
+                    f"the info of {agent} has action masks {self._place}, which the infos of a trial episode had not: "
+                    "they are not used; give them from the first reset on, or pass action_masks=True"
+                )
+            rows.append(info)
+        return rows
+
+    def _rows(
+        self,
+        observations: Mapping[Any, Any],
+        infos: Mapping[Any, Any],
+        shown: Container[Any],
+        active: Container[Any],
+        over: bool = False,
+    ) -> Any:
+        """
+        Stack the observations of the N rows.
+
+        :param shown: agents whose observations are shown
+        :param active: agents that take part, and must have an observation
+        :param over: whether these are last observations, on which no agent acts
+        """
+        reader, place = self._reader, self._place
+        rows = {
+            agent: reader.own(observations, agent, place, agent in active) if agent in shown else reader.blank
+            for agent in self.agents
+        }
+        if reader.rows.is_dict:
+            state = reader.state(self.par_env, place)
+            rows = {
+                agent: {
+                    OBS_KEY: own,
+                    **reader.signals(observations, infos, agent, place, agent in active, over),
+                    **state,
+                }
+                for agent, own in rows.items()
+            }
+        empty: Any = create_empty_array(self.observation_space, self.num_envs)
+        return concatenate(self.observation_space, list(rows.values()), empty)
+
+    def snapshot(self, way: Way) -> dict[str, Any]:
+        """Return the complete state of the game, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
+        if way == "pickle":
+            content = {"pickled": pickled(self.par_env)}
+        else:
+            content = {"state": audit.game_attribute(self.par_env, "get_state")()}
+        return {"n_steps": self._n_steps, "ended": [agent in self._ended for agent in self.agents], **content}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Restore a snapshot; the infos of the last reset are not part of it."""
+        if "pickled" in snapshot:
+            self.par_env = unpickled(snapshot["pickled"], self.par_env)
+        else:
+            audit.reset(self.par_env, None, None)
+            audit.game_attribute(self.par_env, "set_state")(snapshot["state"])
+        self._count_step(snapshot["n_steps"])
+        self._ended = {agent for agent, ended in zip(self.agents, snapshot["ended"], strict=True) if ended}
+        self._playing = self._find_playing()
+        self.reset_infos = [{} for _ in self.agents]
 
 
-class Played(NamedTuple):
+def _copied(info: Mapping[str, Any], agent: Any) -> Info:
+    """Copy an info."""
+    if all(type(value) in _UNCHANGING for value in info.values()):
+        return dict(info)  # equivalent to a deep copy, and ten times faster
+    try:
+        return deepcopy(dict(info))
+    except Exception as error:
+        raise TypeError(
+            f"the info of {agent} cannot be copied ({error}), it is {info}; leave out what cannot be copied"
+        ) from error
+
+
+# ---- the games of one process
+
+
+class GameSource:
+    """
+    Factory or environment from which games are made.
+
+    It is stored pickled if possible, so that a function that returns an existing environment makes copies of it.
+
+    :param make_env: the factory or the environment
+    :param is_factory: whether ``make_env`` is a factory
+    :param n_cpus: number of processes in which games will be made; with one process a factory need not be picklable
+        (for instance of a local class with ``functools.lru_cache`` on its methods)
+    :raises ValueError: if it cannot be copied, with a fix
+    """
+
+    def __init__(self, make_env: Any, is_factory: bool, n_cpus: int) -> None:
+        self._is_factory = is_factory
+        self._pickled: bytes | None = None
+        self._original = make_env
+        try:
+            self._pickled = cloudpickle.dumps(make_env)
+        except Exception as error:
+            if n_cpus > 1:
+                raise ValueError(
+                    f"n_cpus={n_cpus} sends {make_env} to worker processes, but pickling it failed ({error}); move "
+                    "what it uses to the top level of a module (functools.lru_cache on methods of a class inside a "
+                    "function is such a thing), or use n_cpus=1, where nothing is sent"
+                ) from error
+            if not is_factory:
+                self._original = self._copy()
+        else:
+            self._original = None
+
+    def build(self) -> Any:
+        """Make a game."""
+        if self._pickled is not None:
+            content = cloudpickle.loads(self._pickled)
+            return content() if self._is_factory else content
+        return self._original() if self._is_factory else self._copy()
+
+    def _copy(self) -> Any:
+        try:
+            return deepcopy(self._original)
+        except Exception as error:
+            raise ValueError(
+                f"each game needs its own copy of {self._original}, but copying it failed ({error}); "
+                "pass a function that makes the environment instead"
+            ) from error
+
+
+class Step(NamedTuple):
     """
     Results of a step of some games, by row.
 
@@ -51,100 +304,62 @@ class Played(NamedTuple):
     notes: list[str]
 
 
-class GameSource:
-    """
-    Factory or environment from which games are made.
-
-    It is stored pickled if possible, so that a function that returns an existing environment makes copies of it.
-
-    :param make_env: the factory or the environment
-    :param is_factory: whether ``make_env`` is a factory
-    :param n_cpus: number of processes in which games will be made; with one process a factory need not be picklable
-        (for instance of a local class with ``functools.lru_cache`` on its methods)
-    :raises ValueError: if it cannot be copied, with a fix
-    """
-
-    def __init__(self, make_env: Any, is_factory: bool, n_cpus: int) -> None:
-        self._is_factory = is_factory
-        self._pickled: bytes | None = None
-        self._original: Any = None
-        try:
-            self._pickled = cloudpickle.dumps(make_env)
-        except Exception as error:
-            if n_cpus > 1:
-                raise ValueError(
-                    f"n_cpus={n_cpus} sends {make_env} to worker processes, but pickling it failed ({error}); move "
-                    "what it uses to the top level of a module (functools.lru_cache on methods of a class inside a "
-                    "function is such a thing), or use n_cpus=1, where nothing is sent"
-                ) from error
-            self._original = make_env if is_factory else _deep_copy(make_env)
-
-    def build(self) -> Any:
-        """Make a game."""
-        if self._pickled is not None:
-            content = cloudpickle.loads(self._pickled)
-            return content() if self._is_factory else content
-        return self._original() if self._is_factory else deepcopy(self._original)
-
-
-def _deep_copy(env: Any) -> Any:
-    try:
-        return deepcopy(env)
-    except Exception as error:
-        raise ValueError(
-            f"each game needs its own copy of {env}, but copying it failed ({error}); "
-            "pass a function that makes the environment instead"
-        ) from error
-
-
 class TeamConcatVecEnv(ConcatVecEnv):
     """
-    Games of this process, one after another.
+    Games of one process, one after another.
 
     Changes to :class:`supersuit.vector.ConcatVecEnv`: each game gets its own seed and options, attributes and methods
     of games are accessible, and all games are closed even if closing one fails.
 
     :param source: makes the games
-    :param form: form of the games
+    :param reader: reads the games
     :param indices: indices of the games among all E
+    :param is_worker: whether the process has no other games: it then seeds the global generators of Python and NumPy,
+        from which games may draw, since processes are forked with equal ones
     :raises ValueError: if the source returns the same environment twice
     """
 
-    def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:
+    def __init__(self, source: GameSource, reader: GameReader, indices: Sequence[int], is_worker: bool = False) -> None:
         self._notes: list[str] = []
         self._indices = indices
+        self._is_worker = is_worker
         self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, close also runs if construction failed
         super().__init__(
-            [lambda index=index: TeamMarkovVectorEnv(source.build(), form, index, self._notes) for index in indices]
+            [lambda index=index: TeamMarkovVectorEnv(source.build(), reader, index, self._notes) for index in indices]
         )
-        self._n_agents = len(form.agents)
-        self._new_game = lambda: TeamMarkovVectorEnv(source.build(), form, indices[0], [])
+        self._n_agents = len(reader.agents)
+        self._new_game = lambda: TeamMarkovVectorEnv(source.build(), reader, indices[0], [])
         self._way: Way | None = None
-        _check_all_differ(self.vec_envs)
+        n_objects = len({id(game.par_env.unwrapped) for game in self.vec_envs})
+        if n_objects < len(self.vec_envs):
+            raise ValueError(
+                "expected a function that makes a new environment at each call, got one that returned the same object "
+                f"for {len(self.vec_envs) - n_objects + 1} games"
+            )
 
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """Begin an episode in every game of this process; seeds and options are those of all E games."""
+        if self._is_worker and (seed := seeds[self._indices[0]]) is not None:
+            random.seed(seed)
+            np.random.seed(seed % 2**32)  # noqa: NPY002
         games = zip(self._indices, self.vec_envs, strict=True)
         started = [game.reset(seed=seeds[index], options=options[index]) for index, game in games]
         observations, infos = zip(*started, strict=True)
         return self.concat_obs(observations), [info for game in infos for info in game]
 
-    def play(self, actions: npt.NDArray[Any]) -> Played:
+    def play(self, actions: npt.NDArray[Any]) -> Step:
         """Step every game of this process; actions are those of the B rows of all games."""
         first, last = self._indices[0], self._indices[-1] + 1
         rows = actions[first * self._n_agents : last * self._n_agents]
         observations, rewards, terminations, truncations, infos = self.step(rows)
         reset_infos = [info for game in self.vec_envs for info in game.reset_infos]
-        return Played(observations, rewards, terminations | truncations, infos, reset_infos, self._notes)
+        return Step(observations, rewards, terminations | truncations, infos, reset_infos, self._notes)
 
-    def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
-        """Answer the queries to games of this process, keyed by their position in ``questions``."""
-        games = dict(zip(self._indices, self.vec_envs, strict=True))
-        return {
-            place: function(games[game].par_env, *args)
-            for place, (game, function, args) in enumerate(questions)
-            if game in games
-        }
+    def ask(self, games: Iterable[int], function: Callable[..., Any], *args: Any) -> dict[int, Any]:
+        """Call a function with each of some games, those of this process, and arguments; return answers by game."""
+        asked = set(games)
+        own = zip(self._indices, self.vec_envs, strict=True)
+        return {index: function(game.par_env, *args) for index, game in own if index in asked}
 
     def snapshots(self) -> list[dict[str, Any]]:
         """Copy the games of this process; raise CheckpointError if they cannot be copied."""
@@ -163,23 +378,3 @@ class TeamConcatVecEnv(ConcatVecEnv):
         with ExitStack() as closing:
             for game in reversed(self.vec_envs):  # callbacks run in reverse order
                 closing.callback(game.close)
-
-
-def _check_all_differ(games: Sequence[TeamMarkovVectorEnv]) -> None:
-    n_objects = len({id(game.par_env.unwrapped) for game in games})
-    if n_objects < len(games):
-        raise ValueError(
-            "expected a function that makes a new environment at each call, got one that returned the same object "
-            f"for {len(games) - n_objects + 1} games"
-        )
-
-
-def joined(parts: Sequence[Any]) -> Any:
-    """Join observations of the rows of several processes."""
-    if len(parts) == 1:
-        return parts[0]
-    if isinstance(parts[0], Mapping):
-        return {key: joined([part[key] for part in parts]) for key in parts[0]}
-    if isinstance(parts[0], tuple):
-        return tuple(joined(entries) for entries in zip(*parts, strict=True))
-    return np.concatenate(parts)

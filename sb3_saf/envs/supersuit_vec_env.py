@@ -5,24 +5,23 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
-from sb3_saf.envs import game_layers
+from sb3_saf.envs import audit
+from sb3_saf.envs.audit import check_is_parallel
+from sb3_saf.envs.equal_spaces import EqualSpaces, trial_of
 from sb3_saf.envs.game_copies import check_signature, signature
-from sb3_saf.envs.game_form import AskMasks, GameForm, MakeEnv, Signals, check_is_parallel, first_infos_of, game_form
+from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv
 from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
-from sb3_saf.envs.supersuit_games import GameSource, Question, TeamConcatVecEnv
+from sb3_saf.envs.supersuit_games import GameSource, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.conversion import AgentConversion, conversions_of
 from sb3_saf.teams.rows import Array
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
@@ -32,13 +31,12 @@ class SuperSuitVecEnv(TeamVecEnv):
     Games of a PettingZoo ParallelEnv as rows of one VecEnv, flattened by SuperSuit.
 
     Agents are in the order of ``possible_agents``. The N rows of a team are done together, when its last agent has
-    ended. The row of an agent that ended earlier (or has not joined) holds zeros and no reward, and its infos hold
-    ``"active": False``; the info of the step at which it ended holds its ``"terminal_observation"``.
-
-    Infos of done rows hold ``"terminal_observation"`` and ``"TimeLimit.truncated"`` (True if that row's agent was
-    truncated and not terminated at that step); reset infos are in ``reset_infos`` only. A game's own infos named
-    ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which Stable-Baselines3 or
-    this package uses, are renamed: ``"game_episode"``, ...
+    ended. The row of an agent that ended earlier (or has not joined) holds zeros, and its infos hold ``"active":
+    False``; its reward is what the game pays it all the same. The info of the step at which an agent ended holds its
+    ``"terminal_observation"``, the last row, and ``"TimeLimit.truncated"`` (True if it was truncated and not
+    terminated), and those of all rows when the game is over. Reset infos are in ``reset_infos`` only. A game's own
+    infos named ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which
+    Stable-Baselines3 or this package uses, are renamed: ``"game_episode"``, ...
 
     Observations and actions of Discrete and MultiDiscrete spaces are counted from 0 in rows, whatever the ``start``
     of the game's space. Actions of a Box of integers may be given as floats, which are rounded.
@@ -55,7 +53,9 @@ class SuperSuitVecEnv(TeamVecEnv):
     - ``"action_mask"``, MultiBinary(A): 1 for legal actions; zeros for agents that do not act;
     - ``"state"``: the game's ``state()``, in the rows of all its agents, active or not.
 
-    An exception in a game is raised unchanged, also from a worker process; call ``reset`` afterwards.
+    At construction a trial episode of a copy is audited (:func:`sb3_saf.check_team_env`); in later steps shapes, and
+    the bounds of integers, which index tables. An exception in a game is raised unchanged, also from a worker process;
+    call ``reset`` afterwards.
 
     :param make_env: a function that makes the environment, or an environment, which is copied for each game. For worker
         processes cloudpickle must be able to pickle it
@@ -64,12 +64,13 @@ class SuperSuitVecEnv(TeamVecEnv):
     :param n_cpus: number of worker processes; 1 keeps all games in this process
     :param active: whether rows have ``"active"``
     :param action_masks: None leaves observations unchanged. ``"auto"`` adds masks to rows if the game gives any, in
-        observations of the form {"observation", "action_mask"} or in ``infos[agent]["action_mask"]``, True requires
-        them, False adds none; all three split observations of that form, and flatten Dicts and Tuples of scalars and
-        vectors to one vector, as ``gymnasium.spaces.flatten`` does
+        Dicts of observations or in ``infos[agent]["action_mask"]``, True requires them, False adds none; all three take
+        masks out of the observations, and flatten Dicts and Tuples of scalars and vectors to one vector, as
+        ``gymnasium.spaces.flatten`` does
     :param state: whether rows have the game's ``state()``
-    :raises ValueError: if the environment is no ParallelEnv, cannot be copied, its agents differ in their spaces, or a
-        requested signal is missing
+    :param float64: whether observations of float64 stay so; False makes them float32
+    :raises ValueError: if the environment is no ParallelEnv or breaks its rules, cannot be copied, its agents differ in
+        their spaces, or a requested signal is missing
     """
 
     def __init__(
@@ -81,22 +82,32 @@ class SuperSuitVecEnv(TeamVecEnv):
         active: bool = False,
         action_masks: AskMasks | None = None,
         state: bool = False,
+        float64: bool = False,
     ) -> None:
         n_games = check_count("n_games", n_games)
         n_cpus = min(check_count("n_cpus", n_cpus), n_games)
-        source, form, self.conversions = _source_and_form(make_env, n_cpus, Signals(active, action_masks, state))
-        self.possible_agents = list(form.agents)
-        self._game_action_space = form.action_space
+        source, reader = _source_and_reader(make_env, n_cpus, active, action_masks, state, float64)
+        for note in reader.notes:
+            warnings.warn(note, UserWarning, stacklevel=2)
+        self.possible_agents = list(reader.agents)
+        self.conversions = reader.conversions
+        self._game_action_space = reader.action_space
         self._closed = self._begun = self._has_warned = False
         self._actions: Array | None = None
-        self._games = (
-            TeamConcatVecEnv(source, form, range(n_games))
-            if n_cpus == 1
-            else WorkerGames(source, form, n_games, n_cpus)
-        )
+        #: The first rows of the games, if all games began alike, None otherwise.
+        self._first_rows: bytes | None = None
+        self._games: TeamConcatVecEnv | WorkerGames
+        if n_cpus == 1:
+            self._games = TeamConcatVecEnv(source, reader, range(n_games))
+        else:
+            self._games = WorkerGames(source, reader, n_games, n_cpus)
         try:
             super().__init__(
-                n_games, len(form.agents), form.rows.to_row_space(), counted_from_zero(form.action_space), seed
+                n_games,
+                len(reader.agents),
+                reader.rows.to_row_space(),
+                counted_from_zero(reader.action_space),
+                seed,
             )
         except BaseException:
             self.close()
@@ -110,6 +121,8 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._begun, self._actions = False, None
         options = [own or None for own in self._options[:: self.n_agents]]
         observations, self.reset_infos = self._games.reset_all(self._seeds_of_games(), options)
+        games = {_bytes_of(observations, game, self.n_agents) for game in range(self.n_games)}
+        self._first_rows = games.pop() if len(games) == 1 and self.n_games > 1 and self._next_seeds else None
         self._next_seeds = None
         self._reset_options()
         self._begun = True
@@ -131,15 +144,27 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Step all games; return observations, rewards (float32), dones (bool) and infos of the B rows."""
         if self._actions is None:
             raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
-        actions = _in_games_form(self._game_action_space, self._actions)
+        actions, start = self._actions, first_value(self._game_action_space)
+        if np.any(start != 0):
+            actions = (actions + start).astype(actions.dtype, copy=False)
         self._begun, self._actions = False, None
         step = self._games.play(actions)
         self._begun = True
         for row in np.flatnonzero(step.dones).tolist():
             self.reset_infos[row] = step.reset_infos[row]
-        if step.notes and not self._has_warned:
+        notes = list(step.notes)
+        if self._first_rows is not None and step.dones.any():
+            game = int(np.flatnonzero(step.dones)[0]) // self.n_agents
+            if _bytes_of(step.observations, game, self.n_agents) != self._first_rows:
+                notes.append(
+                    f"all {self.n_games} games began alike, although their seeds differ and their episodes do: the "
+                    "game seems to ignore reset(seed=...), so that all copies play the same; draw episodes from a "
+                    "generator made in reset: if seed is not None: self.rng = np.random.default_rng(seed)"
+                )
+            self._first_rows = None
+        if notes and not self._has_warned:
             self._has_warned = True
-            warnings.warn(f"{step.notes[0]}; later ones are not reported", UserWarning, stacklevel=2)
+            warnings.warn(f"{notes[0]}; later warnings are not reported", UserWarning, stacklevel=2)
         return step.observations, step.rewards, step.dones, step.infos
 
     def close(self) -> None:
@@ -204,29 +229,27 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     # ---- queries by row
 
-    def _ask(self, questions: Sequence[Question]) -> list[Any]:
+    def _ask(self, games: Iterable[int], function: Callable[..., Any], *args: Any) -> list[Any]:
+        """Call a function with some games, once each, and return one answer for each entry of ``games``."""
         self._check_open()
-        answers = self._games.ask(questions)
-        return [answers[place] for place in range(len(questions))]
+        listed = list(games)
+        answers = self._games.ask(listed, function, *args)
+        return [answers[game] for game in listed]
 
-    def _ask_rows(self, indices: VecEnvIndices, function: Callable[..., Any], *args: Any) -> list[Any]:
-        """Query the games of some rows, once each; return for each row the answer of its game."""
-        games = [row // self.n_agents for row in chosen_indices(indices, self.num_envs)]
-        asked = list(dict.fromkeys(games))
-        answers = dict(zip(asked, self._ask([Question(game, function, args) for game in asked]), strict=True))
-        return [answers[game] for game in games]
+    def _games_of(self, rows: VecEnvIndices) -> list[int]:
+        return [row // self.n_agents for row in chosen_indices(rows, self.num_envs)]
 
     def has_attr(self, attr_name: str) -> bool:
         """Return whether all games, or wrappers around them, have an attribute."""
-        return all(self._ask_rows(None, game_layers.has_attribute, attr_name))
+        return all(self._ask(range(self.n_games), audit.has_game_attribute, attr_name))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Get an attribute of the rows' games, or of wrappers around them; worker processes return copies."""
-        return self._ask_rows(indices, game_layers.get_attribute, attr_name)
+        return self._ask(self._games_of(indices), audit.game_attribute, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the rows' games, or of the wrappers around them that have it; once per game."""
-        self._ask_rows(indices, game_layers.set_attribute, attr_name, value)
+        self._ask(self._games_of(indices), audit.set_game_attribute, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
@@ -234,46 +257,64 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Call a method of the rows' games, once for every row; ``action_masks`` once per game (see the class)."""
         rows = chosen_indices(indices, self.num_envs)
         if method_name == "action_masks" and not method_args and not method_kwargs:
-            masks = self._ask_rows(rows, game_layers.action_masks, self.possible_agents)
+            masks = self._ask(self._games_of(rows), _action_masks, self.possible_agents)
             return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
-        return self._call([row // self.n_agents for row in rows], method_name, method_args, method_kwargs)
+        return [self._call(game, method_name, method_args, method_kwargs) for game in self._games_of(rows)]
 
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
         """Call a method once per game (see the base class)."""
-        return self._call(chosen_indices(games, self.n_games, "game"), method_name, args, kwargs)
+        return self._ask(chosen_indices(games, self.n_games, "game"), _call_method, method_name, args, kwargs)
 
-    def _call(self, games: Sequence[int], *call: Any) -> list[Any]:
-        return self._ask([Question(game, game_layers.call_method, call) for game in games])
+    def _call(self, game: int, *call: Any) -> Any:
+        return self._ask([game], _call_method, *call)[0]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """Return whether the rows' games are wrapped in a wrapper."""
-        names = wrapper_class.__module__, wrapper_class.__qualname__
-        return self._ask_rows(indices, game_layers.is_wrapped, *names)
+        return self._ask(self._games_of(indices), _is_wrapped, wrapper_class)
 
 
-def _source_and_form(
-    make_env: MakeEnv, n_cpus: int, signals: Signals
-) -> tuple[GameSource, GameForm, tuple[AgentConversion, ...]]:
-    """Determine form and conversions of the game from an example, and return them with the source of the games."""
+def _source_and_reader(
+    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks | None, state: bool, float64: bool
+) -> tuple[GameSource, GameReader]:
+    """Audit a copy of the game, and return the source of the games with their reader."""
     is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
-    example: Any = make_env() if is_factory else make_env
-    check_is_parallel(example, is_factory)
+    if not is_factory:
+        check_is_parallel(make_env, is_factory)
+    source = GameSource(make_env, is_factory, n_cpus)
+    example = source.build()
     try:
-        source = GameSource(make_env, is_factory, n_cpus)
-        form = game_form(example, partial(first_infos_of, source.build), signals)
-        game, row_actions = getattr(example, "unequal", example), counted_from_zero(form.action_space)
-        conversions = conversions_of(game, form.rows.own, row_actions, form.masks == "info" and game is example)
+        check_is_parallel(example, is_factory)
+        return source, GameReader(example, trial_of(example), active, action_masks, state, float64)
     finally:
-        if is_factory:
-            # Games may require a reset before they are closed; the example has none.
-            with suppress(Exception):
-                example.close()
-    return source, form, conversions
+        with suppress(Exception):  # of games that must be reset before they are closed
+            example.close()
 
 
-def _in_games_form(space: spaces.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Shift actions to the ``start`` of the game's space."""
-    start = first_value(space)
-    return (actions + start).astype(actions.dtype, copy=False) if np.any(start != 0) else actions
+def _call_method(env: Any, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    return audit.game_attribute(env, name)(*args, **kwargs)
+
+
+def _is_wrapped(env: Any, wrapper_class: type[Any]) -> bool:
+    return any(isinstance(layer, wrapper_class) for layer in audit.layers_of(env))
+
+
+def _action_masks(env: Any, agents: Sequence[Any]) -> list[Any]:
+    """Return the masks of a game's method ``action_masks``; any action of agents that it leaves out is legal."""
+    masks = audit.game_attribute(env, "action_masks")()
+    if not isinstance(masks, Mapping):
+        masks = dict.fromkeys(agents, masks)
+    if isinstance(env, EqualSpaces):
+        return [env.padded_mask(agent, masks.get(agent)).astype(bool) for agent in agents]
+    anything = np.ones_like(next(iter(masks.values())), dtype=bool) if masks else None
+    return [masks.get(agent, anything) for agent in agents]
+
+
+def _bytes_of(observations: Any, game: int, n_agents: int) -> bytes:
+    """Return the rows of a game as bytes."""
+    if isinstance(observations, Mapping):
+        return b"".join(_bytes_of(part, game, n_agents) for part in observations.values())
+    if isinstance(observations, tuple):
+        return b"".join(_bytes_of(part, game, n_agents) for part in observations)
+    return np.asarray(observations[game * n_agents : (game + 1) * n_agents]).tobytes()

@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing import connection
@@ -23,9 +23,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_saf.envs.game_form import GameForm
-from sb3_saf.envs.supersuit_game import Info, Infos
-from sb3_saf.envs.supersuit_games import GameSource, Played, Question, TeamConcatVecEnv, joined
+from sb3_saf.envs.game_reader import GameReader
+from sb3_saf.envs.supersuit_games import GameSource, Info, Infos, Step, TeamConcatVecEnv
 
 #: Time limit in seconds for a worker process to close its games.
 CLOSE_TIMEOUT = 10.0
@@ -47,16 +46,15 @@ class GameProcess(gymnasium.Env[Any, Any]):
     does not end the process.
 
     :param source: makes the games
-    :param form: form of the games
+    :param reader: reads the games
     :param indices: indices of the games among all E
     """
 
     observation_space = action_space = spaces.Discrete(1)
 
-    def __init__(self, source: GameSource, form: GameForm, indices: Sequence[int]) -> None:
-        self._make_games = partial(TeamConcatVecEnv, source, form, indices)
+    def __init__(self, source: GameSource, reader: GameReader, indices: Sequence[int]) -> None:
+        self._make_games = partial(TeamConcatVecEnv, source, reader, indices, is_worker=True)
         self._games: TeamConcatVecEnv | None = None
-        threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def run(self, payload: bytes) -> bytes:
         """Call a method of this class: pickled name and arguments to pickled result or :class:`Failure`."""
@@ -82,16 +80,10 @@ class GameProcess(gymnasium.Env[Any, Any]):
         """Call a method of the games."""
         return getattr(self._games, name)(*args)
 
-    def close_games(self, timeout: float) -> None:
-        """Close the games; end the process after ``timeout`` seconds."""
-        timer = threading.Timer(timeout, os._exit, [1])
-        timer.daemon = True
-        timer.start()
-        try:
-            if self._games is not None:
-                self._games.close()
-        finally:
-            timer.cancel()
+    def close_games(self) -> None:
+        """Close the games."""
+        if self._games is not None:
+            self._games.close()
 
 
 class WorkerGames:
@@ -99,18 +91,18 @@ class WorkerGames:
     Games in several processes, with the methods of :class:`TeamConcatVecEnv`.
 
     :param source: makes the games
-    :param form: of the games
+    :param reader: reads the games
     :param n_games: E
     :param n_cpus: maximum number of processes, started with the default start method of :mod:`multiprocessing`
     """
 
-    def __init__(self, source: GameSource, form: GameForm, n_games: int, n_cpus: int) -> None:
+    def __init__(self, source: GameSource, reader: GameReader, n_games: int, n_cpus: int) -> None:
         size = -(-n_games // n_cpus)
         self._groups = [range(first, min(first + size, n_games)) for first in range(0, n_games, size)]
         #: Why the processes have ended, None while they run.
         self.ended: str | None = None
         self._venv = SubprocVecEnv(
-            [partial(GameProcess, source, form, group) for group in self._groups],
+            [partial(GameProcess, source, reader, group) for group in self._groups],
             start_method=multiprocessing.get_start_method(),
         )
         self._watch = _Watch(self._venv.processes, [_named(group) for group in self._groups])
@@ -122,13 +114,13 @@ class WorkerGames:
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """Begin an episode in every game (see :class:`TeamConcatVecEnv`)."""
         observations, infos = zip(*self._run("call", "reset_all", seeds, options), strict=True)
-        return joined(observations), [info for group in infos for info in group]
+        return _joined(observations), [info for group in infos for info in group]
 
-    def play(self, actions: npt.NDArray[Any]) -> Played:
+    def play(self, actions: npt.NDArray[Any]) -> Step:
         """Step every game (see :class:`TeamConcatVecEnv`)."""
-        steps: list[Played] = self._run("call", "play", actions)
-        return Played(
-            joined([step.observations for step in steps]),
+        steps: list[Step] = self._run("call", "play", actions)
+        return Step(
+            _joined([step.observations for step in steps]),
             np.concatenate([step.rewards for step in steps]),
             np.concatenate([step.dones for step in steps]),
             [info for step in steps for info in step.infos],
@@ -136,10 +128,10 @@ class WorkerGames:
             [note for step in steps for note in step.notes],
         )
 
-    def ask(self, questions: Iterable[Question]) -> dict[int, Any]:
-        """Query games (see :class:`TeamConcatVecEnv`)."""
+    def ask(self, games: Iterable[int], function: Callable[..., Any], *args: Any) -> dict[int, Any]:
+        """Call a function with games (see :class:`TeamConcatVecEnv`)."""
         answers: dict[int, Any] = {}
-        for group in self._run("call", "ask", list(questions)):
+        for group in self._run("call", "ask", list(games), function, *args):
             answers |= group
         return answers
 
@@ -230,21 +222,13 @@ def _packed_failure(error: BaseException) -> bytes:
         return bytes(cloudpickle.dumps(Failure(RuntimeError(f"{type(error).__name__}: {error}"), trace)))
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent has ended, even by a kill."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-
 def _close_workers(venv: SubprocVecEnv, owner: int) -> list[bytes]:
     """Close the games of all running processes and end these; return their replies."""
     if os.getpid() != owner:  # a copy in a forked process
         return []
     replies: list[bytes] = []
     with suppress(EOFError, OSError):
-        replies = venv.env_method("run", cloudpickle.dumps(("close_games", (CLOSE_TIMEOUT,))))
+        replies = venv.env_method("run", cloudpickle.dumps(("close_games", ())))
         venv.close()
     _kill(venv.processes)
     return replies
@@ -255,3 +239,12 @@ def _kill(processes: Sequence[BaseProcess]) -> None:
         process.kill()
     for process in processes:
         process.join()
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Join observations of the rows of several processes."""
+    if isinstance(parts[0], Mapping):
+        return {key: _joined([part[key] for part in parts]) for key in parts[0]}
+    if isinstance(parts[0], tuple):
+        return tuple(_joined(entries) for entries in zip(*parts, strict=True))
+    return np.concatenate(parts)

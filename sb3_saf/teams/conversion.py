@@ -257,7 +257,11 @@ class AgentConversion(msgspec.Struct, frozen=True):
 
 
 def conversions_of(
-    env: Any, own: spaces.Space[Any], row_actions: spaces.Space[Any], needs_mask: bool
+    env: Any,
+    own: spaces.Space[Any],
+    row_actions: spaces.Space[Any],
+    needs_mask: bool,
+    mask_keys: Mapping[Any, str | None],
 ) -> tuple[AgentConversion, ...]:
     """
     Return the conversions of a game's agents, in the order of ``possible_agents``.
@@ -266,14 +270,14 @@ def conversions_of(
     :param own: space of a row's own observation
     :param row_actions: action space of rows
     :param needs_mask: whether the game gives action masks in its infos
+    :param mask_keys: key of the masks in an agent's observations, if they have masks
     """
     conversions = []
     for agent in env.possible_agents:
-        observed, key = env.observation_space(agent), None
-        entries = dict(getattr(observed, "spaces", None) or {}) if isinstance(observed, Mapping) else {}
-        if len(entries) == 2 and _ACTION_MASK in entries:
-            key = _ACTION_MASK
-            observed = next(space for name, space in entries.items() if name != key)
+        observed, key = env.observation_space(agent), mask_keys.get(agent)
+        if key is not None:
+            others = {name: space for name, space in observed.spaces.items() if name != key}
+            observed = next(iter(others.values())) if len(others) == 1 else type(observed)(list(others.items()))
         action_space = env.action_space(agent)
         conversions.append(AgentConversion.of(observed, action_space, own, row_actions, key, needs_mask or bool(key)))
     return tuple(conversions)

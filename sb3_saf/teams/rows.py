@@ -31,6 +31,9 @@ TEAM_KEYS: Final[tuple[TeamKey, ...]] = get_args(TeamKey)
 
 OptionalKey = Literal["active", "action_mask", "state"]
 
+#: SB3's keys of infos: the last observation of an episode, and whether a time limit ended it.
+TERMINAL_OBSERVATION: Final = "terminal_observation"
+TRUNCATED: Final = "TimeLimit.truncated"
 #: SB3's key of infos for success of an episode, logged as ``rollout/success_rate``.
 IS_SUCCESS: Final = "is_success"
 #: Entry of the last info of an episode that was cut short (``make_team_env(..., stagger=True)``).
@@ -285,6 +288,18 @@ def n_mask_entries(action_space: spaces.Space[Any]) -> int | None:
     if isinstance(action_space, spaces.MultiBinary) and len(action_space.shape) == 1:
         return 2 * action_space.shape[0]
     return None
+
+
+def first_choices(action_space: spaces.Space[Any]) -> Array:
+    """Return the mask (A,) int8 that allows only the first choice of each dimension of the actions."""
+    n_entries = n_mask_entries(action_space)
+    assert n_entries is not None, "actions with masks"
+    mask = np.zeros(n_entries, dtype=np.int8)
+    if isinstance(action_space, spaces.MultiDiscrete):
+        mask[np.cumsum(action_space.nvec) - action_space.nvec] = 1
+    else:
+        mask[:: 2 if isinstance(action_space, spaces.MultiBinary) else n_entries] = 1
+    return mask
 
 
 def check_masks(action_mask: spaces.Space[Any] | None, action_space: spaces.Space[Any]) -> None:

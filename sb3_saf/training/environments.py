@@ -14,7 +14,7 @@ import hecogrid_envs
 from hecogrid_envs import TASK_NAMES
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.task import TaskName
-from sb3_saf.envs.team_game import team_game
+from sb3_saf.envs.equal_spaces import team_game
 from sb3_saf.envs.vec_game import VecGame
 from sb3_saf.suites.registry import SuiteTask, find_task
 from sb3_saf.teams.checks import unknown_name

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
-from sb3_saf.envs.game_form import has_masks_inside
+from sb3_saf.envs.audit import mask_key_of
 from sb3_saf.envs.space_reader import FlatReader, can_be_flattened
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.randomness import game_seeds
@@ -125,8 +125,8 @@ class _Reader:
 
     def __init__(self, team: TrainedTeam, env: Any) -> None:
         space = env.observation_space(env.possible_agents[0])
-        has_parts = can_be_flattened(space) and not has_masks_inside(space)
-        self._flat = FlatReader(space, []) if has_parts else None
+        has_masks = mask_key_of(space, env.action_space(env.possible_agents[0]))[0] is not None
+        self._flat = FlatReader(space) if can_be_flattened(space) and not has_masks else None
         self._spaces = TeamSpaces.from_observation_space(team.policy.observation_space)
         self._normalization = _normalization_of(team) if team.settings.wrapping.get("normalize") else None
 

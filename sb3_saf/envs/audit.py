@@ -1,0 +1,524 @@
+"""Audit of other people's games: a trial episode of random legal actions, in which all that a game gives is checked."""
+
+from __future__ import annotations
+
+import inspect
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from math import isfinite
+from typing import Any, Final
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+
+from sb3_saf.envs.gymnasium_team import GymnasiumTeam, is_gymnasium_team
+from sb3_saf.envs.space_reader import SpaceReader, leaves_of
+from sb3_saf.teams.randomness import own_randomness
+from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, first_choices, n_mask_entries
+
+#: Steps of a trial, and its limit in seconds.
+TRIAL_STEPS: Final = 30
+TRIAL_SECONDS: Final = 1.0
+#: Keys of infos under which games give action masks.
+INFO_MASKS: Final = (ACTION_MASK_KEY, "action_masks", "avail_actions", "available_actions")
+#: Key by which some games say that all agents have ended.
+ALL: Final = "__all__"
+
+_RESET: Final = "(observations, infos)"
+_STEP: Final = "(observations, rewards, terminations, truncations, infos)"
+_SINCE: Final = "as PettingZoo 1.24 and later do"
+
+
+def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None:
+    """
+    Check that a game gives what ``make_team_env`` needs, by playing random legal actions, as SB3's ``check_env`` does.
+
+    Agents, spaces, observations, rewards, ends, infos and action masks are checked until the first episode ends.
+    ``make_team_env`` does the same for 30 steps, on a copy of the game.
+
+    :param env: PettingZoo ParallelEnv or Gymnasium environment of several agents; it is reset and played
+    :param n_steps: maximum number of steps
+    :param seconds: time limit in seconds
+    :raises ValueError: naming the agent, the step, what was expected, and what the game gave
+    """
+    game = GymnasiumTeam(env) if is_gymnasium_team(env) else env
+    check_is_parallel(game, is_factory=False)
+    trial = Trial(game)
+    trial.play(n_steps, seconds)
+    if trial.error is not None:
+        raise trial.error
+    for note in trial.notes:
+        warnings.warn(note, UserWarning, stacklevel=2)
+
+
+class Trial:
+    """
+    Trial episode of a game.
+
+    Errors of the game itself end the trial, so that they are raised where the game is used.
+
+    :param env: the game, which is played
+    :raises ValueError: if agents have spaces that cannot be in rows
+    """
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.agents = tuple(agents_of(env))
+        #: Warnings about the game.
+        self.notes: list[str] = []
+        #: Error raised by the game itself.
+        self.error: BaseException | None = None
+        #: Times at which an agent could act, and how often it was given a mask, by key of the infos.
+        self.n_turns = 0
+        self.n_masks: dict[str, int] = {}
+        self._actions = {agent: deepcopy(space_of(self.env, "action", agent)) for agent in self.agents}
+        observed = {agent: space_of(self.env, "observation", agent) for agent in self.agents}
+        self.mask_keys = {agent: mask_key_of(observed[agent], self._actions[agent])[0] for agent in self.agents}
+        self._readers = {agent: SpaceReader(space, self.notes) for agent, space in observed.items()}
+        for space in self._actions.values():
+            space.seed(0)
+
+    def play(self, n_steps: int = TRIAL_STEPS, seconds: float = TRIAL_SECONDS) -> None:
+        """Play one episode, at most ``n_steps`` steps and ``seconds``; the global random generators are restored."""
+        deadline = time.monotonic() + seconds
+        with own_randomness(0, th.device("cpu")):
+            self._place = "at the reset of a trial episode"
+            result = self._called(reset, self.env, 0, None)
+            if result is None:
+                return
+            observations, infos = result
+            playing = self._playing(frozenset())
+            if not playing:
+                raise ValueError(f"expected at least one name in agents of {self.env} after reset, got none")
+            ended: frozenset[Any] = frozenset()
+            for step in range(1, n_steps + 1):
+                self._check_seen(observations, infos, playing)
+                if not playing or time.monotonic() > deadline:
+                    return
+                actions = self._called(self._legal_actions, observations, infos, playing)
+                result = None if actions is None else self._called(self.env.step, actions)
+                if result is None:
+                    return
+                self._place = f"in step {step} of a trial episode"
+                observations, rewards, terminations, truncations, infos = step_results(self.env, result)
+                for agent in playing:
+                    reward = reward_of(rewards, agent, self._place, required=True)
+                    if not isfinite(reward):
+                        raise ValueError(
+                            f"expected a finite number as the reward of {agent} {self._place}, got {reward}"
+                        )
+                for name, flags in (("terminations", terminations), ("truncations", truncations)):
+                    ended |= {agent for agent in playing if end_of(name, flags, agent, self._place)}
+                playing = self._playing(ended)
+
+    def _called(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call the game; return None if it fails."""
+        try:
+            return function(*args)
+        except FormError:
+            raise
+        except (Exception, SystemExit) as error:
+            self.error = error
+            return None
+
+    def _playing(self, ended: frozenset[Any]) -> list[Any]:
+        names = tuple(agents_of(self.env))
+        if names != self.agents:
+            raise ValueError(
+                f"expected the same possible_agents at all times, got {list(self.agents)}, and {list(names)} "
+                f"{self._place}; a game that sets self.agents = self.possible_agents removes agents from both: write "
+                "self.agents = list(self.possible_agents)"
+            )
+        present = present_agents(self.env, self.agents, self._place)
+        return [agent for agent in self.agents if agent in present and agent not in ended]
+
+    def _check_seen(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], playing: Sequence[Any]) -> None:
+        for agent in playing:
+            self._readers[agent].read(observation_of(observations, agent, self._place), f"{agent} {self._place}")
+            self._check_mask(observations, agent)
+        for agent in self.agents:
+            info = info_of(infos, agent, self._place)
+            if agent in playing:
+                self.n_turns += 1
+                self._count_masks(info, agent)
+
+    def _check_mask(self, observations: Mapping[Any, Any], agent: Any) -> None:
+        key = self.mask_keys[agent]
+        if key is not None:
+            mask_of(observations[agent][key], self._actions[agent], f"the observation of {agent} {self._place}")
+
+    def _count_masks(self, info: Mapping[str, Any], agent: Any) -> None:
+        for key, value in info.items():
+            if key in INFO_MASKS:
+                if value is not None and n_mask_entries(self._actions[agent]) is not None:
+                    mask_of(value, self._actions[agent], f"the info of {agent} {self._place}", key)
+                    self.n_masks[key] = self.n_masks.get(key, 0) + 1
+            elif looks_like_mask(key):
+                note = (
+                    f"infos have {key!r}, which looks like action masks, but is not used; name it {ACTION_MASK_KEY!r}"
+                )
+                if note not in self.notes:
+                    self.notes.append(note)
+
+    def _legal_actions(
+        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], playing: Sequence[Any]
+    ) -> dict[Any, Any]:
+        masks: dict[Any, Any] = {}
+        for agent in playing:
+            key = self.mask_keys[agent]
+            given = [(infos.get(agent) or {}).get(name) for name in INFO_MASKS]
+            masks[agent] = observations[agent][key] if key is not None else next(filter(_is_given, given), None)
+        if all(mask is None for mask in masks.values()):
+            shown = game_attribute(self.env, "action_masks")() if has_game_attribute(self.env, "action_masks") else {}
+            masks = {agent: shown.get(agent) if isinstance(shown, Mapping) else shown for agent in playing}
+        return {agent: self._sample(agent, mask) for agent, mask in masks.items()}
+
+    def _sample(self, agent: Any, mask: Any) -> Any:
+        space = self._actions[agent]
+        flags = np.asarray(mask)
+        if flags.shape != (n_mask_entries(space),):
+            return space.sample()
+        flags = flags.astype(np.int8)
+        if isinstance(space, spaces.MultiDiscrete):
+            return space.sample(mask=tuple(np.split(flags, np.cumsum(space.nvec)[:-1])))
+        if isinstance(space, spaces.MultiBinary):
+            off, on = flags.reshape(-1, 2).astype(bool).T
+            return np.where(off & on, space.sample(), on).astype(space.dtype)
+        return space.sample(mask=flags)
+
+
+def _is_given(value: Any) -> bool:
+    return value is not None
+
+
+class FormError(ValueError):
+    """Raised for a game that breaks PettingZoo's API."""
+
+
+# ---- attributes, agents and spaces
+
+
+def layers_of(env: Any) -> list[Any]:
+    """Return the environment and all that it wraps, down to the bare game."""
+    layers: list[Any] = [env]
+    while True:
+        # Not getattr: PettingZoo's wrappers forward unknown names to the environment they wrap.
+        own = getattr(layers[-1], "__dict__", {})
+        inner = own.get("env", own.get("aec_env"))
+        if inner is None:
+            break
+        layers.append(inner)
+    bare = env.unwrapped
+    return layers if any(layer is bare for layer in layers) else [*layers, bare]
+
+
+def has_game_attribute(env: Any, name: str) -> bool:
+    """Return whether the game, or a wrapper around it, has an attribute."""
+    return hasattr(env, name) or hasattr(env.unwrapped, name)
+
+
+def game_attribute(env: Any, name: str) -> Any:
+    """Return an attribute of the game or of a wrapper around it."""
+    return getattr(env, name) if hasattr(env, name) else getattr(env.unwrapped, name)
+
+
+def set_game_attribute(env: Any, name: str, value: Any) -> None:
+    """Set an attribute on the outermost layer that has it itself, else on the bare game."""
+    layers = layers_of(env)
+    owners = (layer for layer in layers if name in getattr(layer, "__dict__", {}) or hasattr(type(layer), name))
+    setattr(next(owners, layers[-1]), name, value)
+
+
+def check_is_parallel(env: Any, is_factory: bool) -> None:
+    """
+    Check that an object is a ParallelEnv with named agents; ``possible_agents`` becomes a list.
+
+    :param env: the argument of the user, or what a factory returned
+    :param is_factory: whether a factory returned it
+    :raises ValueError: if it is not, with a fix
+    """
+    origin = "a function that returned " if is_factory else ""
+    if isinstance(env, AECEnv):
+        raise ValueError(
+            f"expected a PettingZoo ParallelEnv, got {origin}the AECEnv {env}; "
+            "convert it with pettingzoo.utils.conversions.aec_to_parallel, or, where agents take turns, with "
+            "sb3_saf.TurnsInParallel"
+        )
+    if not isinstance(env, ParallelEnv):
+        hint = f"; pass {env.__name__}.parallel_env(...)" if hasattr(env, "parallel_env") else ""
+        raise ValueError(
+            "expected a PettingZoo ParallelEnv or a function that makes one, "
+            f"got {origin}an object of type {type(env).__name__}{hint}"
+        )
+    agents = agents_of(env)
+    if not agents:
+        raise ValueError(f"expected {env} to list its agents in possible_agents (each gets a row), got none")
+    doubles = [agent for i, agent in enumerate(agents) if agent in agents[:i]]
+    if doubles:
+        raise ValueError(
+            f"expected different names in possible_agents of {env}, got {doubles[0]!r} more than once in {agents}"
+        )
+    if not isinstance(env.possible_agents, (list, tuple)):
+        bare = env.unwrapped if hasattr(env, "env") else env
+        bare.possible_agents = agents
+
+
+def agents_of(env: Any) -> list[Any]:
+    """Return ``possible_agents`` as a list; games also give arrays, and keys of dicts."""
+    agents = getattr(env, "possible_agents", None)
+    return agents.tolist() if isinstance(agents, np.ndarray) else [] if agents is None else list(agents)
+
+
+def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
+    """
+    Return an agent's space.
+
+    :param env: the game
+    :param kind: ``"observation"`` or ``"action"``
+    :param agent: its name
+    :raises ValueError: if it cannot be in rows
+    """
+    method = getattr(env, f"{kind}_space")
+    if not callable(method):
+        raise ValueError(
+            f"expected {kind}_space(agent) to be a method that gives an agent's space, got {type(method).__name__}; "
+            f"write it as: def {kind}_space(self, agent): return self.{kind}_spaces[agent]"
+        )
+    space = method(agent)
+    parts = leaves_of(space) if kind == "observation" else [space]
+    if not all(isinstance(part, FIXED_SHAPE) for part in parts):
+        names = ", ".join(part.__name__ for part in FIXED_SHAPE)
+        containers = ", or a Dict or Tuple of those" if kind == "observation" else ""
+        raise ValueError(f"expected an {kind} space that is one of {names}{containers}, got {space} for {agent}")
+    if not parts or any(0 in (part.shape or ()) for part in parts):
+        raise ValueError(
+            f"expected an {kind} space with at least one entry, got {space} for {agent}; give agents without "
+            f"{'anything to see' if kind == 'observation' else 'a choice'} one constant entry"
+        )
+    return space
+
+
+def present_agents(env: Any, possible_agents: Sequence[Any], place: str) -> set[Any]:
+    """Return the agents that a game lists in ``agents``, all of which must be in ``possible_agents``."""
+    agents = env.agents
+    if isinstance(agents, (str, bytes)) or not isinstance(agents, Iterable):
+        raise ValueError(f"expected agents of {env} to be a list of names {place}, got {agents!r}")
+    present = set(agents)
+    unknown = present.difference(possible_agents)
+    if unknown:
+        raise ValueError(
+            f"expected names from possible_agents ({list(possible_agents)}) in agents of {env} {place}, got "
+            f"{next(agent for agent in agents if agent in unknown)!r}"
+        )
+    return present
+
+
+# ---- results of reset and step
+
+
+def reset(env: Any, seed: int | None, options: dict[str, Any] | None) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
+    """Reset a game; return observations and infos by agent."""
+    try:
+        result = env.reset(seed=seed, options=options)
+    except TypeError as error:
+        try:
+            inspect.signature(env.reset).bind(seed=seed, options=options)
+        except TypeError:
+            raise FormError(
+                f"expected {env} to have reset(seed=None, options=None), {_SINCE}, got "
+                f"reset{inspect.signature(env.reset)}; add the arguments and draw the episode from the seed"
+            ) from error
+        except ValueError:  # functions without a signature
+            pass
+        raise
+    if not _are_dicts(result, 2):
+        hint = ""
+        if isinstance(result, Mapping):
+            hint = (
+                " (observations alone, as in older versions): return observations, {agent: {} for agent in self.agents}"
+            )
+        raise FormError(f"expected reset of {env} to return {_RESET}, {_SINCE}, got {_described(result)}{hint}")
+    observations, infos = result
+    return observations, infos
+
+
+def step_results(env: Any, result: Any) -> tuple[Mapping[Any, Any], ...]:
+    """Check that a step returned five dicts by agent."""
+    if not _are_dicts(result, 5):
+        hint = ""
+        if _are_dicts(result, 4):
+            hint = (
+                " (one dict of dones, as in older versions): return terminations for agents whose game is over and, "
+                "beside them, truncations for those whom a time limit stops"
+            )
+        raise FormError(f"expected step of {env} to return {_STEP}, {_SINCE}, got {_described(result)}{hint}")
+    return tuple(result)
+
+
+def observation_of(observations: Mapping[Any, Any], agent: Any, place: str) -> Any:
+    """Return the observation of an agent that takes part."""
+    observation = observations.get(agent)
+    if observation is None:
+        raise ValueError(
+            f"expected an observation for {agent}, which takes part, {place}, got observations for "
+            f"{[name for name, value in observations.items() if value is not None]}"
+        )
+    return observation
+
+
+def reward_of(rewards: Mapping[Any, Any], agent: Any, place: str, required: bool) -> float:
+    """Return the reward of an agent; agents that did not act need none."""
+    reward = rewards.get(agent)
+    if reward is None and agent not in rewards:
+        if not required:
+            return 0.0
+        raise ValueError(
+            f"expected a reward for {agent}, which acted, {place}, got rewards for {list(rewards)}; give every agent "
+            "that acts a reward, 0.0 for none"
+        )
+    if isinstance(reward, (float, int)):
+        return reward
+    number = _single(reward)
+    if number is None:
+        if reward is None and not required:
+            return 0.0
+        raise ValueError(f"expected a number as the reward of {agent} {place}, got {reward!r}")
+    return float(number)
+
+
+def end_of(name: str, flags: Mapping[Any, Any], agent: Any, place: str) -> bool:
+    """Return whether an agent, or all by ``"__all__"``, ended (``name``); False for an agent without an entry."""
+    value = flags.get(agent, False)
+    if value is True or (value is False and ALL not in flags):
+        return value
+    number = _single(value)
+    if number not in (0, 1):
+        raise ValueError(f"expected True or False for {agent} in {name} {place}, got {value!r}")
+    return bool(number) or bool(flags.get(ALL, False))
+
+
+def info_of(infos: Mapping[Any, Any], agent: Any, place: str) -> Mapping[str, Any]:
+    """Return the info of an agent, an empty one if there is none."""
+    info = infos.get(agent)
+    if info is None:
+        return {}
+    if type(info) is not dict and not isinstance(info, Mapping):
+        raise ValueError(f"expected a dict as the info of {agent} {place}, got {info!r}")
+    return info
+
+
+def _single(value: Any) -> Any:
+    """Return the number of a scalar or an array of one entry, None for any other value."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        return None
+    return array.item() if array.size == 1 and array.dtype.kind in "biuf" else None
+
+
+def _are_dicts(result: Any, count: int) -> bool:
+    return isinstance(result, (tuple, list)) and len(result) == count and all(isinstance(x, Mapping) for x in result)
+
+
+def _described(result: Any) -> str:
+    if isinstance(result, Mapping):
+        return f"a dict with the keys {list(result)}"
+    if isinstance(result, (tuple, list)):
+        return f"{len(result)} values: {', '.join(type(value).__name__ for value in result)}"
+    return f"an object of type {type(result).__name__}"
+
+
+# ---- action masks
+
+
+def looks_like_mask(key: Any) -> bool:
+    """Return whether an entry of observations or infos has a name that masks of actions have."""
+    name = str(key).lower()
+    of_actions = "action" in name or "move" in name
+    return "mask" in name or (of_actions and any(word in name for word in ("legal", "avail", "valid")))
+
+
+def mask_key_of(observed: spaces.Space[Any], actions: spaces.Space[Any]) -> tuple[Any, list[str]]:
+    """
+    Find the action masks in a Dict of observations.
+
+    :param observed: the agent's observation space
+    :param actions: its action space
+    :return: key of the masks, None if there are none; notes about entries that look like masks but do not fit
+    :raises ValueError: if ``"action_mask"`` does not fit the actions
+    """
+    if not isinstance(observed, spaces.Dict) or len(observed.spaces) < 2:
+        return None, []
+    n_entries = n_mask_entries(actions)
+    notes: list[str] = []
+    keys: list[Any] = []
+    for key, space in observed.spaces.items():
+        if not looks_like_mask(key):
+            continue
+        fits = n_entries is not None and isinstance(space, FIXED_SHAPE) and space.shape == (n_entries,)
+        if fits:
+            keys.append(key)
+        elif key == ACTION_MASK_KEY:
+            raise ValueError(
+                f"expected {ACTION_MASK_KEY!r} in observations to have one entry per choice of {actions}, "
+                f"{'none can be masked' if n_entries is None else n_entries}, got {space}"
+            )
+        else:
+            notes.append(
+                f"observations have {key!r}, which looks like action masks, but {space} does not fit the actions "
+                f"{actions}: it is an ordinary part of the observation"
+            )
+    chosen = ACTION_MASK_KEY if ACTION_MASK_KEY in keys else next(iter(keys), None)
+    notes += [
+        f"observations have {key!r} beside the action masks in {chosen!r}: it is an ordinary part of the observation"
+        for key in keys
+        if key != chosen
+    ]
+    return chosen, notes
+
+
+def without_mask(observed: spaces.Space[Any], key: Any) -> spaces.Space[Any]:
+    """Return the space of observations without their masks; that of the other entry if there is one only."""
+    assert isinstance(observed, spaces.Dict)
+    others = [(name, space) for name, space in observed.spaces.items() if name != key]
+    return others[0][1] if len(others) == 1 else spaces.Dict(others)
+
+
+def own_part(observation: Mapping[str, Any], observed: spaces.Space[Any], key: Any) -> Any:
+    """Return an observation without its mask (see :func:`without_mask`)."""
+    assert isinstance(observed, spaces.Dict)
+    names = [name for name in observed.spaces if name != key]
+    return observation[names[0]] if len(names) == 1 else {name: observation[name] for name in names}
+
+
+def mask_of(value: Any, actions: spaces.Space[Any], owner: str, key: str = ACTION_MASK_KEY) -> np.ndarray:
+    """
+    Return a mask of legal actions as int8, (A,).
+
+    :param value: what the game gave
+    :param actions: the agent's action space
+    :param owner: for the message
+    :param key: its name
+    :raises ValueError: unless it is A zeros and ones
+    """
+    n_entries = n_mask_entries(actions)
+    try:
+        mask = np.asarray(value)
+    except ValueError:
+        mask = np.asarray(None)
+    if mask.shape == (n_entries,) and mask.dtype.kind in "biuf" and ((mask == 0) | (mask == 1)).all():
+        return mask.astype(np.int8)
+    raise ValueError(
+        f"expected {key!r} in {owner} to be {n_entries} zeros and ones (one per action), got {value!r}; give it at "
+        "every step to every agent that acts, or pass action_masks=False"
+    )
+
+
+def stuck(masks: np.ndarray, actions: spaces.Space[Any]) -> np.ndarray:
+    """Return which masks (B, A) allow nothing in some dimension of the actions, (B,) bool."""
+    starts = np.flatnonzero(first_choices(actions))
+    return (np.add.reduceat(masks != 0, starts, axis=1) == 0).any(axis=1)
