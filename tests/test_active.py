@@ -123,11 +123,11 @@ def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
         ),
         (
             lambda: make_team_env(CounterEnv, action_masks=True).reset(),
-            r"expected 'action_mask' in the info of agent_0 in game 0 at step 0, 4 zeros and ones .* got None",
+            r"expected 'action_mask' in the info of agent_0 in game 0 at step 0 to be 4 zeros and ones .* got None",
         ),
         (
             lambda: make_team_env(DictEnv, action_masks=True),
-            r"action masks are for Discrete actions, got the action space Box\(.*pass action_masks=False",
+            r"action masks are for Discrete, .* got Box\(.*pass action_masks=False",
         ),
         (
             lambda: telling_env(stuck=0).reset(),
@@ -135,10 +135,6 @@ def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
         ),
         (lambda: make_team_env("TeamTogether", state=True), "state=True goes through SuperSuit"),
         (lambda: make_team_env("TeamTogether", active=True), "active=True goes through SuperSuit"),
-        (
-            lambda: make_team_env(UnequalEnv, kind="kind of action"),
-            "expected actions that are Discrete for all agents, or vectors .* for all, where agents differ",
-        ),
         (
             lambda: TeamSpaces.of_rows(
                 spaces.Dict(obs=spaces.Discrete(3), active=spaces.Discrete(3)), spaces.Discrete(2), 2

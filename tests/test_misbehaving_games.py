@@ -236,9 +236,9 @@ def test_games_without_agents_or_spaces(setup: Callable[[Any], None], message: s
 
 def test_the_trial_disturbs_no_game_and_no_generator() -> None:
     game = CounterEnv()
-    before = np.random.get_state()[1].tolist()  # noqa: NPY002
+    before = np.random.get_state(legacy=False)["state"]["key"].tolist()  # noqa: NPY002
     env = make_team_env(game, 1, seed=3)
-    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
+    assert np.random.get_state(legacy=False)["state"]["key"].tolist() == before  # noqa: NPY002
     assert game.episode == 0
     env.reset()
     assert env.get_attr("episode") == [1, 1]

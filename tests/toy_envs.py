@@ -311,12 +311,11 @@ class TellingEnv(CounterEnv):
         observations |= {a: self._observe()[a] for a in joined}
         return (observations, *rest, self._with_masks(infos))
 
+    def action_masks(self) -> dict[str, npt.NDArray[np.bool_]]:
+        return {agent: self.mask(self._index(agent)).astype(bool) for agent in self.agents}
+
     def state(self) -> npt.NDArray[Any]:
         return np.array([self.steps, len(self.agents)], np.float32)
-
-
-class OddError(BaseException):
-    """Not a subclass of Exception."""
 
 
 class FaultyEnv(CounterEnv):
@@ -325,7 +324,7 @@ class FaultyEnv(CounterEnv):
 
     :param seed: of the failing game, None for all games
     :param how: "raise", "exit", "die" (the process ends at once), "shape", "dtype" (of the observation),
-        "info" (one that cannot be copied), "odd" (an error that is no Exception)
+        "info" (one that cannot be copied)
     """
 
     def __init__(self, how: str, seed: int | None = None, **kwargs: Any):
@@ -348,8 +347,6 @@ class FaultyEnv(CounterEnv):
                 observations = dict.fromkeys(observations, np.array(["a", "b", "c"]))
             if self.how == "info":
                 infos = {agent: {"lock": threading.Lock()} for agent in infos}
-            if self.how == "odd":
-                raise OddError
         return (observations, *rest, infos)
 
 

@@ -62,9 +62,9 @@ class GameReader:
         self.agents = tuple(agents_of(env))
         #: Warnings about the game.
         self.notes = list(trial.notes)
-        self._observed = _common_space(env, "observation", self.agents)
+        self._observed = common_space(env, "observation", self.agents)
         #: The game's action space of each agent.
-        self.action_space = _common_space(env, "action", self.agents)
+        self.action_space = common_space(env, "action", self.agents)
         self._mask_key: Any = None
         own = self._observed
         if action_masks is not None:
@@ -176,7 +176,7 @@ class GameReader:
         return {} if self._state is None else {STATE_KEY: self._state.read(env.state(), f"the state {place}")}
 
 
-def _common_space(env: Any, kind: str, agents: tuple[Any, ...]) -> spaces.Space[Any]:
+def common_space(env: Any, kind: str, agents: tuple[Any, ...]) -> spaces.Space[Any]:
     """Return the space of all agents; raise ValueError if they differ."""
     by_agent = {agent: space_of(env, kind, agent) for agent in agents}
     first = by_agent[agents[0]]

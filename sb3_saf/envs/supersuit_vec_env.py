@@ -17,7 +17,7 @@ from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.equal_spaces import EqualSpaces, trial_of
 from sb3_saf.envs.game_copies import check_signature, signature
-from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv
+from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv, common_space
 from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
 from sb3_saf.envs.supersuit_games import GameSource, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
@@ -286,6 +286,8 @@ def _source_and_reader(
     example = source.build()
     try:
         check_is_parallel(example, is_factory)
+        for kind in ("observation", "action"):
+            common_space(example, kind, tuple(example.possible_agents))
         return source, GameReader(example, trial_of(example), active, action_masks, state, float64)
     finally:
         with suppress(Exception):  # of games that must be reset before they are closed
