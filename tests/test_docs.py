@@ -6,6 +6,7 @@ import ast
 import doctest
 import importlib
 import re
+import shlex
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -165,6 +166,15 @@ def test_commands_exist(page: Path) -> None:
         assert find_spec(module.rstrip(".")) is not None, f"python -m {module}"
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     assert set(re.findall(r"(?:^|`)make ([a-z-]+)", text, re.MULTILINE)) <= targets
+
+
+@EVERY_PAGE
+def test_printed_commands_are_understood(page: Path) -> None:
+    """The options of each command exist, and take the values on the page."""
+    text = re.sub(r"\\\n", " ", page.read_text(encoding="utf-8"))
+    for program, words in re.findall(r"python -m sb3_saf\.(train|enjoy|plot|replay) +(\w[^`#|\n]*|-[^`#|\n]*)", text):
+        parser = importlib.import_module(f"sb3_saf.training.{program}").make_parser()
+        parser.parse_args(shlex.split(words))
 
 
 def test_every_public_name_is_in_the_reference() -> None:
