@@ -107,22 +107,6 @@ class TestSelection:
         table = selection_by_group(self.WEIGHTS, self.ZONES, 3)
         np.testing.assert_array_equal(table, [[1, 0], [np.nan, np.nan], [0.5, 0.5]])
 
-    @pytest.mark.parametrize(
-        ("weights", "each", "mean"),
-        [
-            ([[1, 0], [1, 0], [1, 0]], 0, 0),  # collapsed
-            ([[1, 0], [0, 1], [1, 0]], 0, 0.918296),  # confident, and different
-            ([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5]], 1, 1),  # blended
-        ],
-    )
-    def test_entropies_tell_collapse_confidence_and_blending_apart(
-        self, weights: list[list[float]], each: float, mean: float
-    ) -> None:
-        pool = np.repeat(np.array(weights)[:, np.newaxis], 2, axis=1)
-        game = recorded(pool_weights=pool, pool_actions=np.zeros((3, 2, 2, 3)))
-        scalars = pool_scalars(game, spaces.Discrete(3))
-        assert (scalars["pool/entropy"], scalars["pool/entropy_of_mean"]) == pytest.approx((each, mean))
-
     def test_dependence_on_zones(self) -> None:
         zones = np.array([0, 0, 1, 1])
         assert zone_dependence(np.array([[1, 0], [1, 0], [0, 1], [0, 1]]), zones) == pytest.approx(1)
