@@ -20,12 +20,11 @@ from hecogrid_envs import TASK_NAMES
 from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training.callbacks import ProgressLines
-from sb3_saf.training.enjoy import TrainedTeam
+from sb3_saf.training.enjoy import Film, write_video
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import python_command, read_curve, write_run
 from sb3_saf.training.run import RunOptions, train
 from sb3_saf.training.settings import Settings, load_settings
-from sb3_saf.training.watching import play, write_video
 
 N_EPISODES = 64
 #: Number of pictures in TensorBoard, which take a few seconds each.
@@ -85,10 +84,22 @@ def train_team(options: Options) -> BaseAlgorithm:
     return train(options.settings, options.seed, options.output, run, [lines])
 
 
-def evaluate(options: Options, model: Any) -> EvaluationResult:
-    """Return team returns of games not used in training, the same for every model."""
-    with closing(options.settings.make_env(options.seed, evaluation=True, n_envs=N_EPISODES)) as games:
-        return evaluate_team(model, games, n_eval_episodes=N_EPISODES, deterministic=False)
+def evaluate(options: Options, model: Any, film: Path | None = None) -> EvaluationResult:
+    """
+    Return team returns of games not used in training, the same for every model.
+
+    :param film: GIF of the first game to write; None for none
+    """
+    games = options.settings.make_env(
+        options.seed, evaluation=True, n_envs=N_EPISODES, render_mode=None if film is None else "rgb_array"
+    )
+    frames: list[Any] = []
+    with closing(games):
+        env = games if film is None else Film(games, frames.append)
+        result = evaluate_team(model, env, n_eval_episodes=N_EPISODES, deterministic=False)
+    if film is not None:
+        write_video(film, frames)
+    return result
 
 
 def describe(settings: Settings) -> str:
@@ -103,15 +114,6 @@ def draw_curve(options: Options, random: EvaluationResult) -> Path:
     figure = draw_curves(curve, describe(options.settings), references={"random team": random.mean})
     path = options.output / "learning_curve.png"
     figure.savefig(path)
-    return path
-
-
-def record_episode(options: Options, model: BaseAlgorithm) -> Path:
-    """Play one game with decentralised execution and write it as a GIF."""
-    path = options.output / "episode.gif"
-    with closing(options.settings.make_game("rgb_array")) as game:
-        team = TrainedTeam(options.settings, model.policy, options.output / "model.zip")
-        write_video(path, list(play(game, team, options.seed, deterministic=False)))
     return path
 
 
@@ -135,9 +137,10 @@ def main(arguments: list[str] | None = None) -> None:
         f"{settings.n_envs} games, in a few minutes"
     )
     model = train_team(options)
-    trained = evaluate(options, model)
+    gif = options.output / "episode.gif"
+    trained = evaluate(options, model, gif)
     random = evaluate(options, RandomPolicy(model.action_space, seed=options.seed))
-    curve, gif, page = draw_curve(options, random), record_episode(options, model), write_replay(options, model)
+    curve, page = draw_curve(options, random), write_replay(options, model)
     print(f"\nTeam return (treasures collected), {N_EPISODES} fresh games, mean and 95 % interval")
     print(f"  SAF     {trained}")
     print(f"  random  {random}")

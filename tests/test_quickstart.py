@@ -26,7 +26,7 @@ def test_it_leaves_a_model_that_can_be_replayed_a_curve_a_video_and_logs(
     model = PPO.load(output / "model.zip")
     assert model.num_timesteps == 1600 * 5
     assert imageio.imread(output / "learning_curve.png").shape[0] > 400
-    assert len(imageio.imread(output / "episode.gif")) == 51
+    assert 20 < len(imageio.imread(output / "episode.gif")) <= 50
     assert list((output / "tb" / "saf_1").glob("events.out.tfevents.*"))
     assert "</html>" in (output / "replay.html").read_text()
     for name in ("model.zip", "learning_curve.png", "episode.gif", "replay.html", "tb"):

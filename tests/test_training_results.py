@@ -21,11 +21,9 @@ from sb3_saf import EvaluationResult, evaluate_team
 from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.enjoy import TrainedTeam
 from sb3_saf.training.folders import Run, training_curve, write_run
 from sb3_saf.training.plot import describe, find_runs, setting_names
-from sb3_saf.training.settings import load_settings
-from sb3_saf.training.watching import play
+from sb3_saf.training.settings import Settings, load_settings
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
@@ -90,29 +88,35 @@ def test_a_team_with_memory(logs: Path, tmp_path: Path) -> None:
     assert len(enjoy(logs, "--algo", "saf-lstm", "--gif", str(tmp_path / "g.gif")).returns) == 6
 
 
-def test_gif_mp4_and_text_show_every_step(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gif_mp4_and_text_show_every_step_of_the_first_game(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     enjoy(logs, "--gif", str(tmp_path / "new" / "game.gif"))
     gif = imageio.imread(tmp_path / "new" / "game.gif")
-    assert len(gif) == 11
-    assert len(np.unique(gif.reshape(11, -1), axis=0)) > 5  # it moves
+    assert 5 < len(gif) <= 10  # equal pictures are joined
+    assert len(np.unique(gif.reshape(len(gif), -1), axis=0)) > 5  # it moves
     enjoy(logs, "--mp4", str(tmp_path / "game.mp4"))
-    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / "game.mp4")[0] == 11
+    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / "game.mp4")[0] == 10
     capsys.readouterr()
-    enjoy(logs, "--text")
-    pages = capsys.readouterr().out
-    assert all(f"step {step} " in pages for step in range(11))
+    enjoy(logs, "--text", "--seed", "9", "--exp-id", "3")
+    pages = capsys.readouterr().out.split("team return")[0]
+    assert [step for step in range(12) if f"step {step} " in pages] == list(range(10))
+    games = Run(logs / "saf" / f"{ENV}_3").settings.make_env(9, evaluation=True, n_envs=1, render_mode="ansi")
+    games.reset()
+    assert pages.startswith(games.env_method("render", indices=[0])[0])
 
 
-def test_the_shown_game_is_the_first_that_is_measured(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = Run(logs / "saf" / f"{ENV}_3")
-    measured = run.settings.make_env(9, evaluation=True, n_envs=1)
-    measured.reset()
-    (expected,) = measured.env_method("get_state", indices=0)
-    env = run.settings.make_game("ansi")
-    path = run.folder / f"{ENV}.zip"
-    first = next(iter(play(env, TrainedTeam(run.settings, PPO.load(path).policy, path), 9, True)))
-    assert all(np.array_equal(env.get_state()[key], expected[key]) for key in ("treasures", "walls", "agent_pos"))
-    assert first.startswith("step 0")
+def test_games_are_made_once(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    def counted(settings: Settings, *args: Any, **kwargs: Any) -> Any:
+        made.append(kwargs["n_envs"])
+        return make_env(settings, *args, **kwargs)
+
+    make_env = Settings.make_env
+    monkeypatch.setattr(Settings, "make_env", counted)
+    enjoy(logs, "--gif", str(tmp_path / "game.gif"))
+    assert made == [6]
 
 
 def test_a_window_needs_a_display(

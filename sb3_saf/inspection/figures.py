@@ -209,7 +209,6 @@ _HEIGHT: Final = 320
 _GAP: Final = 6
 _N_MOMENTS: Final = 6
 _PER_ROW: Final = 3
-_SECONDS_PER_STEP: Final = 0.125
 _COLOURS: Final = 64
 
 
@@ -228,11 +227,12 @@ def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
     return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
 
 
-def gif(pictures: Sequence[Picture]) -> bytes:
+def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:
     """
     Encode all pictures as a repeating GIF. TensorBoard shows a GIF like any image; SB3's ``Video`` would need moviepy.
 
     :param pictures: (height, width, 3) each
+    :param seconds: time that each is shown
     """
     from PIL import Image
 
@@ -242,9 +242,7 @@ def gif(pictures: Sequence[Picture]) -> bytes:
     palette = Image.fromarray(sample).quantize(_COLOURS)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     file = io.BytesIO()
-    indexed[0].save(
-        file, "GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * _SECONDS_PER_STEP), loop=0
-    )
+    indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * seconds), loop=0)
     return file.getvalue()
 
 

@@ -1,20 +1,27 @@
-"""``python -m sb3_saf.enjoy``: measure the return of a trained team, and show one of its games."""
+"""``python -m sb3_saf.enjoy``: measure the return of a trained team, and show the first of its games."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from contextlib import closing
-from dataclasses import dataclass
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.weights import load_weights
+from sb3_saf.inspection.figures import gif
 from sb3_saf.teams.checks import check_seed
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
     DefaultsFormatter,
     OneLineParser,
@@ -30,22 +37,11 @@ from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_set
 from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.enjoy"
+#: Game steps per second, of games that name no other speed.
+FPS: Final = 8
 
-
-@dataclass(frozen=True)
-class TrainedTeam:
-    """A policy, the settings of its games, and the file of its weights."""
-
-    settings: Settings
-    policy: BasePolicy
-    path: Path
-
-    def measure(self, n_episodes: int, seed: int, deterministic: bool) -> EvaluationResult:
-        """Measure team returns over games not used in training, each episode in a separate game."""
-        set_random_seed(seed)
-        with closing(self.settings.make_env(seed, evaluation=True, n_envs=n_episodes)) as games:
-            load_normalization(games, self.path.parent)
-            return evaluate_team(self.policy, games, n_episodes, deterministic=deterministic)
+Frame = Any
+Show = Callable[[Frame], object]
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -73,55 +69,137 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
-    """Measure and show; return the team returns."""
+    """Measure, and show the first game meanwhile; return the team returns."""
     options = make_parser().parse_args(arguments)
     import_packages(options.gym_packages)
-    with user_errors():
-        check_seed(options.seed)
-        team = load_team(options)
-    from sb3_saf.training import watching
-
-    # The screen is opened before the measurement, so that display errors occur immediately.
-    with user_errors(ValueError, RuntimeError, ImportError), watching.open_screen(team, options) as screen:
-        result = team.measure(options.episodes, options.seed, options.deterministic)
-        print(f"{options.algo} on {options.env}, weights of {team.path}")
+    with user_errors(ValueError, RuntimeError, ImportError):
+        seed = check_seed(options.seed)
+        find_algorithm(options.algo)
+        environment = find_environment(options.env)
+        which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
+        run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
+        trained = run.settings
+        if (trained.algo, trained.env_id) != (options.algo, environment.id):
+            raise ValueError(f"{run.folder} is a run of {trained.algo} on {trained.env_id}; give its --algo and --env")
+        settings = saved_settings(trained.as_dict(), options.env_kwargs)
+        if settings.n_agents != trained.n_agents:
+            raise ValueError(
+                f"the team was trained with {trained.n_agents} agents, got n_agents={settings.n_agents}; leave "
+                "n_agents out of --env-kwargs"
+            )
+        mode = None if options.no_render else "ansi" if options.text else "rgb_array"
+        games = settings.make_env(seed, evaluation=True, n_envs=options.episodes, render_mode=mode)
+        with closing(games):
+            policy = make_policy(settings, path, games)
+            load_normalization(games, run.folder)
+            set_random_seed(seed)
+            with open_screen(options, games) as show:
+                env = games if show is None else Film(games, show)
+                result = evaluate_team(policy, env, options.episodes, deterministic=options.deterministic)
+        print(f"{options.algo} on {options.env}, weights of {path}")
         print(f"team return {result}")
-        watching.show_game(screen, team, options.seed, options.deterministic)
     return result
 
 
-def load_team(options: argparse.Namespace) -> TrainedTeam:
-    """Find a run, and make its policy. Weights are read as numbers: no code of the model's file is run."""
-    find_algorithm(options.algo)
-    environment = find_environment(options.env)
-    which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
-    run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
-    trained = run.settings
-    if (trained.algo, trained.env_id) != (options.algo, environment.id):
-        raise ValueError(f"{run.folder} is a run of {trained.algo} on {trained.env_id}; give its --algo and --env")
-    settings = saved_settings(trained.as_dict(), options.env_kwargs)
-    if settings.n_agents != trained.n_agents:
-        raise ValueError(
-            f"the team was trained with {trained.n_agents} agents, got n_agents={settings.n_agents}; leave "
-            "n_agents out of --env-kwargs"
-        )
-    return TrainedTeam(settings, make_policy(settings, path), path)
-
-
-def make_policy(settings: Settings, path: Path) -> BasePolicy:
+def make_policy(settings: Settings, path: Path, games: VecEnv) -> BasePolicy:
     """Make the policy of the settings with the weights of a model's file, read as numbers only."""
-    with closing(settings.make_env(0, n_envs=1)) as games:
-        kwargs = settings.hyperparams.get("policy_kwargs", {})
-        policy = settings.spec.policy_class(
-            games.observation_space, games.action_space, lr_schedule=_no_learning, **kwargs
-        )
+    kwargs = settings.hyperparams.get("policy_kwargs", {})
+    policy = settings.spec.policy_class(
+        games.observation_space, games.action_space, lr_schedule=lambda progress: 0.0, **kwargs
+    )
     load_weights(policy, path)
     policy.set_training_mode(False)
     return policy
 
 
-def _no_learning(progress_remaining: float) -> float:
-    return 0.0
+class Film(TeamVecEnvWrapper):
+    """
+    Show the first game of a vector environment until its first episode ends.
+
+    :param venv: the games, made with a render mode
+    :param show: called with what ``render`` of the first game returns, a picture or text, after each step but the last
+    """
+
+    def __init__(self, venv: VecEnv, show: Show) -> None:
+        super().__init__(venv)
+        self._show = show
+        self._is_over = False
+
+    def reset(self) -> VecEnvObs:
+        """Start new episodes, and show the first game."""
+        observations = self.venv.reset()
+        self._is_over = False
+        self._show_first()
+        return observations
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Wait for the step, and show the first game."""
+        results = self.venv.step_wait()
+        self._is_over = self._is_over or bool(results[2][0])
+        if not self._is_over:
+            self._show_first()
+        return results
+
+    def _show_first(self) -> None:
+        self._show(self.venv.env_method("render", indices=[0])[0])
+
+
+@contextmanager
+def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | None]:
+    """Yield the function that shows pictures or text as the options say; None for nothing."""
+    metadata = games.get_attr("metadata", [0])[0] if games.has_attr("metadata") else None
+    fps = int((metadata or {}).get("render_fps", FPS))
+    if options.no_render:
+        yield None
+    elif options.text:
+        yield _print_in_place
+    elif options.gif is not None or options.mp4 is not None:
+        ending, path = (".gif", options.gif) if options.gif is not None else (".mp4", options.mp4)
+        if path.suffix.lower() != ending:
+            raise ValueError(f"--{ending[1:]} needs a file that ends with {ending}, got {str(path)!r}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        frames: list[Frame] = []
+        yield frames.append
+        write_video(path, frames, fps)
+        print(path)
+    else:
+        from hecogrid_envs.window import HumanWindow
+
+        window = HumanWindow(options.env, fps)
+        try:
+            yield lambda frame: window.show(_picture(frame))
+        except (ImportError, RuntimeError) as error:
+            reason = str(error).partition(";")[0]
+            raise RuntimeError(f"{reason}; use --gif FILE, --mp4 FILE, --text, or --no-render") from None
+        finally:
+            window.close()
+
+
+def _picture(frame: Frame) -> Any:
+    if not isinstance(frame, np.ndarray):
+        raise ValueError(f"expected pictures from render() with render_mode='rgb_array', got {frame!r}")
+    return frame
+
+
+def write_video(path: Path, frames: Sequence[Frame], fps: int = FPS) -> None:
+    """Write pictures, (height, width, 3) each, as GIF or MP4, by the path's ending."""
+    pictures = [_picture(frame) for frame in frames]
+    if path.suffix.lower() == ".gif":
+        path.write_bytes(gif(pictures, 1 / fps))
+        return
+    import imageio.v3 as imageio
+
+    height, width, _ = pictures[0].shape  # H.264 needs even sizes
+    even = np.pad(np.stack(pictures), ((0, 0), (0, height % 2), (0, width % 2), (0, 0)))
+    imageio.imwrite(path, even, plugin="FFMPEG", fps=fps, macro_block_size=1)
+
+
+def _print_in_place(frame: Frame) -> None:
+    """Print a game: in place on a terminal, else one page after the other."""
+    on_terminal = sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb"
+    print(("\x1b[2J\x1b[H" if on_terminal else "") + str(frame), end="\n\n", flush=True)
+    if on_terminal:
+        time.sleep(1 / FPS)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

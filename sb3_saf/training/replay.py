@@ -60,14 +60,14 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
     with user_errors(ValueError, OSError, ExportError):
         seed = evaluation_seed(check_seed(options.seed))
         settings = [_settings_of(path, options) for path in options.model]
-        players: dict[str, Any] = {
-            name: Actor.load(path) if path.is_dir() else make_policy(own, path)
-            for name, path, own in zip(_names(options.model), options.model, settings, strict=True)
-        }
         render_mode = None if settings[0].environment.task else "rgb_array"  # HECOGrid is drawn from its state
         with closing(
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
         ) as games:
+            players: dict[str, Any] = {
+                name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
+                for name, path, own in zip(_names(options.model), options.model, settings, strict=True)
+            }
             gamma = settings[0].hyperparams.get("gamma", 0.99)
             return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
 
