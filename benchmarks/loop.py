@@ -59,8 +59,8 @@ class FreeGames(VecEnv):
 
     def __init__(self, n_games: int, n_agents: int) -> None:
         box = spaces.Box(-1.0, 1.0, (N_NUMBERS,), np.float32)
-        super().__init__(n_games * n_agents, box, spaces.Discrete(N_ACTIONS))
-        self.n_agents, self.n_games, self.render_mode = n_agents, n_games, None
+        self.n_agents, self.n_games, self.render_mode, self.num_envs = n_agents, n_games, None, n_games * n_agents
+        super().__init__(self.num_envs, box, spaces.Discrete(N_ACTIONS))
         generator = np.random.default_rng(0)
         self._observations = generator.uniform(-1, 1, (EPISODE, self.num_envs, N_NUMBERS)).astype(np.float32)
         self._rewards = generator.uniform(-1, 1, (EPISODE, self.num_envs)).astype(np.float32)
