@@ -95,7 +95,7 @@ def test_an_update_says_how_values_change() -> None:
         before = normalizer(outputs)
         scale, shift = normalizer.update(some_returns(mean, seed=seed))
         th.testing.assert_close(normalizer(outputs), before * scale + shift, rtol=1e-5, atol=1e-5)
-    assert normalizer.update(np.zeros(0)) == Rescaling(1.0, 0.0)
+    assert [float(value) for value in normalizer.update(np.zeros(0))] == [1.0, 0.0]
 
 
 def test_returns_that_hardly_vary_are_not_blown_up() -> None:
@@ -210,7 +210,7 @@ def test_forgetting_to_denormalise_breaks_advantages(
     """
     right = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages.copy()
     with monkeypatch.context() as patch:
-        patch.setattr(ValueNormalizer, "forward", lambda self, outputs, active=None: outputs)
+        patch.setattr(ValueNormalizer, "forward", lambda self, outputs, *_: outputs)
         wrong = rollout_of_a_constant_critic(time_limit, normalize=True).rollout_buffer.advantages
     assert abs(wrong - right).max() == pytest.approx(error, abs=0.1)
     assert abs(right).max() > 1.0
@@ -253,8 +253,8 @@ def test_a_buffer_that_never_updates_the_statistics_fails(load: bool, tmp_path: 
 class Frozen(ValueNormalizer):
     """Mean 0 and variance 1, constant."""
 
-    def update(self, returns: npt.NDArray[np.floating]) -> Rescaling:
-        return Rescaling(1.0, 0.0)
+    def update(self, returns: npt.NDArray[np.floating], agents: npt.NDArray[np.integer] | None = None) -> Rescaling:
+        return Rescaling(th.tensor(1.0), th.tensor(0.0))
 
 
 def test_off_leaves_everything_as_it_was() -> None:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf.buffers.later import LaterValues, compute_together
 from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
-from sb3_saf.teams.checks import check_whole_teams
+from sb3_saf.teams.checks import check_choice, check_whole_teams
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, TEAM_KEY, Array, TeamSpaces
 
 #: Arrays with one entry per step and row, without the observations.
@@ -34,10 +34,11 @@ class RolloutReturns:
     Returns of one rollout, for policies that normalise values.
 
     :param returns: all returns used for training
+    :param agents: their agents, in the same shape
     """
 
-    def __init__(self, returns: npt.NDArray[np.floating]) -> None:
-        self._returns = returns
+    def __init__(self, returns: npt.NDArray[np.floating], agents: npt.NDArray[np.integer]) -> None:
+        self._returns, self._agents = returns, agents
         self._rescaling: Rescaling | None = None
 
     def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
@@ -47,7 +48,7 @@ class RolloutReturns:
         :param normalizer: normaliser of the trained policy
         """
         if self._rescaling is None:
-            self._rescaling = normalizer.update(self._returns)
+            self._rescaling = normalizer.update(self._returns, self._agents)
         return self._rescaling
 
 
@@ -95,6 +96,8 @@ class TeamMinibatch(dict[str, th.Tensor]):
         """
         scale, shift = self._returns.rescaling(normalizer)
         if self._old_values is not None:
+            agents = self[AGENT_KEY].reshape(-1).long()
+            scale, shift = (values[agents] if values.ndim else values for values in (scale, shift))
             self._old_values.mul_(scale).add_(shift)
             self._old_values = None
 
@@ -145,6 +148,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     :param ends: whether an agent's return ends with its ``"own"`` end, or with the episode of its ``"team"``. The
         latter is for agents that receive the team's reward after their own end (``make_team_env(...,
         team_reward="sum")``), so that a later success also counts for them
+    :param normalize_advantage: ``"agent"`` gives the advantages of each agent mean 0 and standard deviation 1 over the
+        rollout, for agents whose own rewards differ in scale: PPO normalises over the rows of all agents, where the one
+        that is paid more drowns the others. A rollout in which agents of a team were paid alike stays as it is, and so
+        does every one with None
     :raises ValueError: if the space is not that of teams, the rows are not whole teams, or ``ends`` is invalid
     """
 
@@ -158,16 +165,18 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         gamma: float = 0.99,
         n_envs: int = 1,
         ends: Ends = "own",
+        normalize_advantage: Literal["agent"] | None = None,
     ) -> None:
-        if ends not in get_args(Ends):
-            raise ValueError(f"ends must be {' or '.join(map(repr, get_args(Ends)))}, got {ends!r}")
+        check_choice("ends", ends, get_args(Ends))
+        check_choice("normalize_advantage", normalize_advantage, ("agent", None))
         self.ends = ends
+        self.normalize_advantage = normalize_advantage
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
         self.n_agents = self.team_spaces.n_agents
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
         self._allocated = False
-        self._returns = RolloutReturns(np.zeros(0))
+        self._returns = RolloutReturns(np.zeros(0), self._agents[:0])
         self._later: list[tuple[int, LaterValues[Any]]] = []
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
@@ -269,6 +278,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         policies of this package return zero for inactive agents, which replaces c_T. Advantages of inactive rows are
         unused.
 
+        With ``normalize_advantage="agent"``, the advantages of each agent then get mean 0 and standard deviation 1 over
+        its rows, unless all agents of each team received the same rewards.
+
         With ``ends="team"``, m_t = 1 - b_{t+1}, and V of an inactive agent is the mean of V over the active agents of
         its team, since all receive the same reward.
 
@@ -276,22 +288,35 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param dones: (B,) whether an episode ended with the last step
         """
         self._compute_later_values()
-        if self.active is None:
-            super().compute_returns_and_advantage(last_values, dones)
-            self._returns = RolloutReturns(self.returns)
-            return
-        idle = self.active.reshape(self.buffer_size, self.n_envs) == 0
-        if self.ends == "team":
-            self.values = self._with_values_of_teams(self.values, ~idle)
+        counted = np.ones((self.buffer_size, self.n_envs), dtype=np.bool_)
+        if self.active is not None:
+            counted = self.active.reshape(self.buffer_size, self.n_envs) != 0
+        starts = self.episode_starts
+        if self.active is not None and self.ends == "team":
+            self.values = self._with_values_of_teams(self.values, counted)
             last = last_values.reshape(-1).cpu().numpy()
             last_values = th.from_numpy(self._with_values_of_teams(last, last != 0))
-            super().compute_returns_and_advantage(last_values, dones)
-        else:
-            starts = self.episode_starts
-            self.episode_starts = np.where(idle, np.float32(1), starts)
-            super().compute_returns_and_advantage(last_values, dones)
-            self.episode_starts = starts
-        self._returns = RolloutReturns(self.returns[~idle])
+        elif self.active is not None:
+            self.episode_starts = np.where(counted, starts, np.float32(1))
+        super().compute_returns_and_advantage(last_values, dones)
+        self.episode_starts = starts
+        agents = np.broadcast_to(self._agents, counted.shape)
+        self._returns = RolloutReturns(self.returns[counted], agents[counted])
+        if self.normalize_advantage == "agent" and not self._is_reward_shared(counted):
+            for agent in range(self.n_agents):
+                rows = counted & (agents == agent)
+                advantages = self.advantages[rows].astype(np.float64)
+                if len(advantages):
+                    self.advantages[rows] = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+    def _is_reward_shared(self, counted: npt.NDArray[np.bool_]) -> bool:
+        """Return whether the active agents of each team received the same rewards in all steps of the rollout."""
+        by_team = (self.buffer_size, self.n_games, self.n_agents)
+        rewards, playing = self.rewards.reshape(by_team), counted.reshape(by_team)
+        highest, lowest = (
+            reduce(np.where(playing, rewards, limit), axis=2) for reduce, limit in ((np.max, -np.inf), (np.min, np.inf))
+        )
+        return bool((highest <= lowest).all())
 
     def _with_values_of_teams(self, values: Array, active: npt.NDArray[np.bool_]) -> Array:
         """Return values (..., B) in which those of inactive agents are the mean over their team's active agents."""

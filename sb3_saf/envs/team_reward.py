@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -23,6 +23,8 @@ class SharedReward(TeamVecEnvWrapper):
     :param venv: rows of flattened teams
     :param team_reward: ``"sum"`` or ``"mean"`` over the agents of a team
     """
+
+    shares_reward: ClassVar[bool] = True
 
     def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"]) -> None:
         super().__init__(venv)

@@ -32,12 +32,12 @@ class Rescaling(NamedTuple):
     """
     Conversion of the critic's values from the old statistics to new ones: ``scale * value + shift``.
 
-    :param scale: new standard deviation / old
+    :param scale: new standard deviation / old, () or (N,) for statistics of each agent
     :param shift: in the units of returns
     """
 
-    scale: float
-    shift: float
+    scale: th.Tensor
+    shift: th.Tensor
 
 
 class ValueNormalizer(nn.Module):
@@ -45,24 +45,29 @@ class ValueNormalizer(nn.Module):
     Running mean and variance of all returns with equal weights, and the conversion of the critic's outputs to values.
 
     Before the first update the mean is 0 and the variance 1: values are the critic's outputs, bit for bit.
+
+    :param n_agents: N for statistics of each agent's own returns; None for one of all
     """
 
     mean: th.Tensor
     var: th.Tensor
     count: th.Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, n_agents: int | None = None) -> None:
         super().__init__()
-        self.register_buffer("mean", th.tensor(0.0))
-        self.register_buffer("var", th.tensor(1.0))
-        self.register_buffer("count", th.tensor(0, dtype=th.int64))
+        shape = () if n_agents is None else (n_agents,)
+        self.register_buffer("mean", th.zeros(shape))
+        self.register_buffer("var", th.ones(shape))
+        self.register_buffer("count", th.zeros(shape, dtype=th.int64))
 
     @property
     def std(self) -> th.Tensor:
-        """() standard deviation by which values are scaled."""
+        """() or (N,) standard deviation by which values are scaled."""
         return self.var.sqrt().clamp_min(MIN_STD)
 
-    def forward(self, outputs: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
+    def forward(
+        self, outputs: th.Tensor, active: th.Tensor | None = None, agents: th.Tensor | None = None
+    ) -> th.Tensor:
         """
         De-normalise: ``v = mean + std * n`` for the critic's outputs n.
 
@@ -74,38 +79,42 @@ class ValueNormalizer(nn.Module):
 
         :param outputs: (B, ...) outputs of the critic
         :param active: (B, ...) bool, rows that take part; the values of others are exactly zero. All if None
+        :param agents: (B, ...) agents of the rows, for statistics of each agent
         :return: (B, ...) values on the scale of returns
         """
-        std = self.std
-        values = self.mean + std * outputs
+        mean, std = (value[agents] if value.ndim else value for value in (self.mean, self.std))
+        values = mean + std * outputs
         if values.requires_grad:
             factor = std**-2
             values.register_hook(lambda gradient: gradient * factor)
         return values if active is None else values * active
 
-    def update(self, returns: npt.NDArray[np.floating]) -> Rescaling:
+    def update(self, returns: npt.NDArray[np.floating], agents: npt.NDArray[np.integer] | None = None) -> Rescaling:
         """
         Update the statistics with more returns.
 
         :param returns: returns of any shape, on the raw scale
+        :param agents: their agents, in the same shape, for statistics of each agent
         :return: conversion of values under the old statistics
         :raises ValueError: for NaN or infinity
         """
         returns = np.asarray(returns, dtype=np.float64)
         if not np.isfinite(returns).all():
             raise ValueError("returns must be finite, got NaN or infinity; check the environment's rewards")
-        old_mean, old_std = float(self.mean), float(self.std)
-        if returns.size:
-            self._merge(float(returns.mean()), float(returns.var()), returns.size)
-        scale = float(self.std) / old_std
-        return Rescaling(scale, float(self.mean) - scale * old_mean)
+        old_mean, old_std = self.mean.double(), self.std.double()
+        for index in range(self.mean.numel()):
+            own = returns if self.mean.ndim == 0 else returns[agents == index]
+            if own.size:
+                self._merge(index, float(own.mean()), float(own.var()), own.size)
+        scale = self.std.double() / old_std
+        return Rescaling(scale, self.mean.double() - scale * old_mean)
 
-    def _merge(self, mean: float, var: float, count: int) -> None:
+    def _merge(self, index: int, mean: float, var: float, count: int) -> None:
         """Merge the mean and variance of two sets of values."""
-        n_old = int(self.count)
+        means, variances, counts = (values.view(-1) for values in (self.mean, self.var, self.count))
+        n_old, old_mean, old_var = int(counts[index]), float(means[index]), float(variances[index])
         share = count / (n_old + count)
-        old_mean, old_var = float(self.mean), float(self.var)
         between = share * (1.0 - share) * (mean - old_mean) ** 2 if n_old else 0.0
-        self.mean.fill_(old_mean + share * (mean - old_mean))
-        self.var.fill_(math.fsum([(1.0 - share) * old_var, share * var, between]))
-        self.count.fill_(n_old + count)
+        means[index] = old_mean + share * (mean - old_mean)
+        variances[index] = math.fsum([(1.0 - share) * old_var, share * var, between])
+        counts[index] = n_old + count

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
-from typing import Any, ClassVar, Final, NamedTuple, NoReturn
+from typing import Any, ClassVar, Final, Literal, NamedTuple, NoReturn
 
 import numpy.typing as npt
 import torch as th
@@ -36,6 +36,7 @@ from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import TeamParts
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, entry_of, pop_named
+from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.rows import ACTIVE_KEY, AGENT_KEY, STATE_KEY
 
 #: Action masks of MaskablePPO, (B, M).
@@ -99,8 +100,9 @@ class TeamPolicy(TeamRowsPolicy):
     :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for convolved
         pictures, whose intermediate results should fit the cache
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
-        ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. The policy's values,
-        ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in both cases
+        ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
+        and variance of each agent's own returns, for agents whose rewards differ in scale. The policy's values,
+        ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in all cases
     :param use_sde: must be False; present because SB3's algorithms pass it
     :param share_features_extractor: must be True: actor and critic always share the encoder
     :param features_extractor_class: encoder, built for the space of ``obs``
@@ -133,7 +135,7 @@ class TeamPolicy(TeamRowsPolicy):
         *,
         encode_once: bool | None = None,
         chunk_size: ChunkSize = "auto",
-        normalize_values: bool = False,
+        normalize_values: bool | Literal["agent"] = False,
         use_sde: bool = False,
         share_features_extractor: bool = True,
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
@@ -144,6 +146,7 @@ class TeamPolicy(TeamRowsPolicy):
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
         self._warned_of_minibatch = False
         self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
+        check_choice("normalize_values", normalize_values, (True, False, "agent"))
         if normalize_values and not self.normalizes_values:
             raise ValueError(
                 f"normalize_values=True needs TeamRolloutBuffer, which the algorithms of {type(self).__name__} do not "
@@ -180,7 +183,8 @@ class TeamPolicy(TeamRowsPolicy):
         self.value_net = self._make_critic()
         if self.ortho_init:
             orthogonal_init(self.value_net)
-        self.value_normalizer = ValueNormalizer() if self.normalize_values else None
+        n_scales = self.team_spaces.n_agents if self.normalize_values == "agent" else None
+        self.value_normalizer = ValueNormalizer(n_scales) if self.normalize_values else None
         learning_rate = lr_schedule(1)
         kwargs = _with_fused_steps(self.optimizer_class, self.optimizer_kwargs)
         self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **kwargs)  # type: ignore[call-arg]
@@ -397,7 +401,8 @@ class TeamPolicy(TeamRowsPolicy):
             obs.update_statistics(self.value_normalizer)
         elif self.training and outputs.requires_grad:
             outputs.register_hook(_refuse_to_train)
-        return self.value_normalizer(values, takes_part)
+        agents = self._agent(obs).unsqueeze(1) if self.normalize_values == "agent" else None
+        return self.value_normalizer(values, takes_part, agents)
 
     def _values_of_states(self, obs: PyTorchObs, critic: StateCritic) -> th.Tensor:
         """Return values (B,), with equal states encoded once."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -38,6 +38,9 @@ class NativeVecEnv(TeamVecEnv):
     :param stagger: whether episodes begun by :meth:`reset` end at different times: that of game ``e`` is shorter by
         ``e / E`` of its length, and its last info has ``"staggered"``
     """
+
+    #: All agents of a team receive the same reward.
+    shares_reward: ClassVar[bool] = True
 
     def __init__(
         self,

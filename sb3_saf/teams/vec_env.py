@@ -156,6 +156,16 @@ def _has_own(layer: VecEnv, name: str) -> bool:
     return name in vars(layer) or hasattr(type(layer), name)
 
 
+def shares_reward(venv: VecEnv) -> bool:
+    """
+    Return whether all agents of a team are known to receive the same reward.
+
+    Layers with an attribute ``shares_reward`` say so: ``SharedReward``, HECOGrid, suites whose unit is the mean.
+    """
+    found: list[Any] = [layer for layer in layers(venv) if _has_own(layer, "shares_reward")]
+    return any(layer.shares_reward for layer in found)
+
+
 def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     """
     Return N of a vector environment of flattened teams, checked against its number of rows.

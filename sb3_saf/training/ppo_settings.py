@@ -9,12 +9,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.teams.rows import TeamSpaces
-from sb3_saf.teams.vec_env import require_n_agents
+from sb3_saf.teams.vec_env import require_n_agents, shares_reward
 
 #: Settings of ``sb3_saf.train --size small`` that also apply to scripts.
 _TAKEN: Final = (
     *("learning_rate", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
-    "rollout_buffer_class",
+    *("rollout_buffer_class", "rollout_buffer_kwargs"),
 )
 #: The same for HECOGrid's games only.
 _TAKEN_OF_HECOGRID: Final = (*_TAKEN, "gamma")
@@ -30,6 +30,10 @@ def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str
     They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
     same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
     narrow heads, normalised values, its discount, and a learning rate that decreases to 0.
+
+    Where agents have rewards of their own (``team_reward="given"``, unless the suite gives all the team's), advantages
+    are normalised for each agent, and so are values if ``policy_kwargs`` has ``normalize_values``: agents that are paid
+    less learn as fast as those that are paid more.
 
     :param env: from ``make_team_env``, with any number of games
     :param algo: the method, a name of ``sb3_saf.train --algo`` that PPO trains. The settings of ``"saf"`` include its
@@ -60,6 +64,10 @@ def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str
     if encoder is not None:
         policy_kwargs["features_extractor_class"] = encoder
     policy_kwargs |= overrides.get("policy_kwargs") or {}
+    if shares_reward(env):
+        found.pop("rollout_buffer_kwargs", None)
+    elif policy_kwargs.get("normalize_values") is True:
+        policy_kwargs["normalize_values"] = "agent"
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
 
 

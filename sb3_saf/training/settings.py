@@ -267,7 +267,7 @@ def load_settings(
         if "batch_size" not in arguments:
             arguments.discard("n_minibatches")
         if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):
-            arguments.discard("rollout_buffer_class")
+            arguments -= {"rollout_buffer_class", "rollout_buffer_kwargs"}
         own = {key: value for key, value in own.items() if key in arguments}
     if given.get("batch_size") is not None:
         if given.get("n_minibatches") is not None:
