@@ -88,7 +88,7 @@ BAD = {
     ("run", "joint", "--retries", "-1"): "argument --retries: must be at least 0, got -1",
     ("run", "joint", "--env-kwargs", "coordination:2"): "coordination is what the experiment varies; leave it out of",
     ("run", "joint", "--env-kwargs", "n_agent:2"): "unknown parameter 'n_agent' (did you mean 'n_agents'?)",
-    ("run", "joint", "--hyperparams", "learning_rat:2"): "unknown setting 'learning_rat' (did you mean",
+    ("run", "joint", "--hyperparams", "learning_rat:2"): "unknown setting of PPO 'learning_rat' (did you mean",
     ("report", "joint", "-f", "nowhere"): "there is no folder nowhere; name another with -f, or run it first: ",
     ("report", "joint", "-f", "empty"): "empty has no results of 'joint'; run it first: ",
     ("run", "joint", "--size", "huge"): "argument --size: invalid choice",

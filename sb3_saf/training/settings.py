@@ -316,7 +316,7 @@ def _checked(entry: Mapping[str, Any], method: AlgorithmSpec, spec: AlgorithmSpe
     known = {**_OWN_KEYS, **algorithm_arguments(method.algorithm), **algorithm_arguments(spec.algorithm)}
     for key in entry:
         if key not in known:
-            raise ValueError(f"{source}: {unknown_name('setting', key, known)}")
+            raise ValueError(f"{source}: {unknown_name(f'setting of {spec.algorithm.__name__}', key, known)}")
     for key in ("env_kwargs", "policy_kwargs"):
         entry[key] = convert(key, entry.get(key) or {}, dict[str, Any])
     return entry
