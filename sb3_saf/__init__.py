@@ -9,19 +9,11 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import NoReturn
 
-from sb3_saf.export.actor import Actor
+from sb3_saf.export.act import Actor
 from sb3_saf.teams import package_version
 from sb3_saf.teams.errors import ExportError
 
-
-def _is_installed(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ImportError:  # blocked by the caller
-        return False
-
-
-if _is_installed("stable_baselines3"):
+if find_spec("stable_baselines3") is not None:
     from sb3_saf.buffers.replay import TeamReplayBuffer
     from sb3_saf.buffers.rollout import TeamRolloutBuffer
     from sb3_saf.callbacks.entropy import EntropySchedule
@@ -44,13 +36,13 @@ if _is_installed("stable_baselines3"):
         evaluate_policy,
         evaluate_team,
     )
-    from sb3_saf.export.weights import load_weights
+    from sb3_saf.export.weights import load_weights, save_weights
     from sb3_saf.export.writer import export_actors
     from sb3_saf.inspection.callback import InspectionCallback
     from sb3_saf.inspection.inspection import Inspection, inspect_team
     from sb3_saf.inspection.replay import replay
     from sb3_saf.make import make_team_env, make_vec_env
-    from sb3_saf.policies.extractors import (
+    from sb3_saf.networks.encoders import (
         LightEncoder,
         MLPEncoder,
         NatureEncoder,
@@ -135,4 +127,5 @@ __all__ = [
     "replay",
     "resumable_learn",
     "resume",
+    "save_weights",
 ]

@@ -18,7 +18,6 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from sb3_saf import IPPOPolicy, MAPPOPolicy, RandomPolicy, SAFPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.networks.distributions import masked_parameters
-from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.teams.rows import TeamSpaces
 from tests.team_venv import Array
 from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv, UnequalEnv
@@ -445,7 +444,7 @@ def test_a_mask_that_allows_everything_changes_nothing() -> None:
     obs = random_rows()
     obs["action_mask"][:] = 1
     parameters = policy.actor(policy.extract_features(obs))
-    unmasked = actor_distribution(policy.actor, policy.action_space, parameters)
+    unmasked = policy.actor.distribution(parameters)
     masked = policy.get_distribution(obs)
     th.testing.assert_close(cast(Any, masked.distribution).logits, cast(Any, unmasked.distribution).logits)
 

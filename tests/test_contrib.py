@@ -21,9 +21,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 import sb3_saf
 from sb3_saf import SAFLstmPolicy, evaluate_team, make_team_env
 from sb3_saf.networks.actor import PolicyPool
-from sb3_saf.networks.distributions import masked_parameters
+from sb3_saf.networks.distributions import distribution_of, masked_parameters, mixture_of
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
-from sb3_saf.policies.distributions import actor_distribution, distribution_of, mixture_of
 from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
 from sb3_saf.registration import DECLARATIONS
 from sb3_saf.teams.rows import TeamSpaces
@@ -332,9 +331,7 @@ def test_memory_against_an_independent_loop(family: str, kwargs: dict[str, Any])
         steps = gather_rows(sequences, slice(number * n_steps, (number + 1) * n_steps))  # type: ignore[arg-type]
         latent = lstm_by_hand(policy.lstm_actor, policy.features_extractor(steps["obs"]), starts[number])
         agents = th.full((n_steps,), agent)
-        expected = actor_distribution(policy.actor, policy.action_space, policy.actor(latent, agents)).log_prob(
-            th.zeros(n_steps).long()
-        )
+        expected = policy.actor.distribution(policy.actor(latent, agents)).log_prob(th.zeros(n_steps).long())
         th.testing.assert_close(log_prob.view(2, -1)[number], expected)
         known = [policy.features_extractor(team) for team in steps["team"]]  # z of each step's team
         if policy.value_net.team_states is None:

@@ -20,6 +20,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from safetensors.torch import load, save
+from sb3_saf.export.manifest import MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, DataFile, Manifest, checksum
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecNormalize
@@ -41,7 +42,6 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.export import files as export_files
-from sb3_saf.export.manifest import MANIFEST_FILE, ONNX_FILE, WEIGHTS_FILE, DataFile, Manifest, checksum
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.lone_agent import TRAINING, Absent
 from tests.test_policies import ACTIONS, equal_weights, make_model, make_policy

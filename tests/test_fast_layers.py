@@ -10,9 +10,9 @@ import torch as th
 from torch import nn
 
 from sb3_saf.networks import attention
+from sb3_saf.networks.distributions import LeanCategorical
 from sb3_saf.networks.layers import mlp, side_by_side
 from sb3_saf.networks.tanh import Tanh
-from sb3_saf.policies.distributions import LeanCategorical
 from sb3_saf.teams.errors import NonFiniteError
 
 

@@ -22,7 +22,6 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
 from sb3_saf.networks.layers import Linear, Rows
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.policies.distributions import actor_distribution
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import DECLARATIONS, register
 from sb3_saf.teams.rows import TeamSpaces
@@ -730,7 +729,7 @@ def test_actor_and_encoder_run_without_the_critic() -> None:
     missing = other.load_state_dict(kept, strict=False).missing_keys
     assert missing and all(name.startswith("value_net.") for name in missing)
     parameters = other.actor(other.features_extractor(obs["obs"]))
-    found = actor_distribution(other.actor, other.action_space, parameters)
+    found = other.actor.distribution(parameters)
     assert isinstance(found, CategoricalDistribution)
     th.testing.assert_close(found.distribution.probs, probabilities(policy, obs), rtol=0, atol=1e-6)
 

@@ -15,13 +15,12 @@ from torch import nn
 
 from sb3_saf.networks import distributions
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy, draw_policy
-from sb3_saf.networks.distributions import n_action_parameters
-from sb3_saf.policies.distributions import (
+from sb3_saf.networks.distributions import (
     PoolDistribution,
     SelectedDistribution,
-    actor_distribution,
     distribution_of,
     mixture_of,
+    n_action_parameters,
 )
 
 N_ROWS, N_POLICIES = 4, 3
@@ -253,7 +252,7 @@ def test_selection_by_signature_keys() -> None:
 @pytest.mark.parametrize("space", SPACES)
 def test_pool_of_mixture_is_the_mixture_of_what_it_evaluates(space: spaces.Space[Any]) -> None:
     pool, features = make_pool(space, "mixture"), th.randn(N_ROWS, 6)
-    found, expected = actor_distribution(pool, space, pool(features)), mixture_of(space, *pool.evaluate(features))
+    found, expected = pool.distribution(pool(features)), mixture_of(space, *pool.evaluate(features))
     actions = expected.sample()
     th.testing.assert_close(found.log_prob(actions), expected.log_prob(actions))
     assert th.equal(found.mode(), expected.mode())
@@ -269,7 +268,7 @@ def test_gumbel_is_one_policy_at_a_time_and_its_mode_the_favourites(space: space
     action, seen = policies[0].sample(), set()
     by_policy = th.stack([policy.log_prob(action) for policy in policies], dim=1)
     for _ in range(30):
-        distribution = actor_distribution(pool, space, parameters)
+        distribution = pool.distribution(parameters)
         assert isinstance(distribution, SelectedDistribution)
         assert th.equal(distribution.mode(), modes)
         matches = (distribution.log_prob(action).unsqueeze(1) - by_policy).abs() < 1e-6
@@ -286,7 +285,7 @@ def test_one_policy_is_sb3s_own_distribution(space: spaces.Space[Any]) -> None:
     with th.no_grad():
         for parameter in actor.parameters():
             nn.init.normal_(parameter)
-    found, plain = actor_distribution(actor, space, actor(features)), make_proba_distribution(space)
+    found, plain = actor.distribution(actor(features)), make_proba_distribution(space)
     assert isinstance(found, type(plain))
     assert isinstance(actor.head, ActionHead)
     outputs = actor.head.net(features)

@@ -34,7 +34,7 @@ from sb3_saf.envs.equal_spaces import EqualSpaces
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
 from sb3_saf.envs.space_reader import PartsSpace
 from sb3_saf.envs.team_reward import SharedReward
-from sb3_saf.policies.extractors import PaperCNN, PartsEncoder
+from sb3_saf.networks.encoders import PaperCNN, PartsEncoder
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam
 from sb3_saf.suites.registry import find_task, suites

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
+from sb3_saf.networks.encoders import Part, PartsSpace
 from sb3_saf.teams.rows import FIXED_SHAPE, Array, bounds_of
 
 
@@ -142,40 +143,6 @@ class SpaceReader:
             raise ValueError(f"{message}; make the space as wide as what the game gives")
         if self._notes is not None and not any(note.startswith("observation of") for note in self._notes):
             self._notes.append(message)
-
-
-class Part(NamedTuple):
-    """
-    Slice of a vector that holds one observation part.
-
-    :param start: first entry
-    :param stop: one after the last
-    :param picture: shape of the picture, None for scalars and vectors
-    """
-
-    start: int
-    stop: int
-    picture: tuple[int, ...] | None
-
-
-class PartsSpace(spaces.Box):
-    """
-    Pictures, scalars and vectors concatenated to one float32 vector. Encoders split it by ``parts``; pixels are 0 to
-    255.
-
-    :param flat: the vector, from ``gymnasium.spaces.flatten_space``
-    :param parts: the slices of the vector
-    """
-
-    def __init__(self, flat: spaces.Box, parts: tuple[Part, ...]) -> None:
-        super().__init__(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-        self.parts = parts
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether bounds and parts are equal."""
-        return isinstance(other, PartsSpace) and super().__eq__(other) and self.parts == other.parts
-
-    __hash__ = None  # type: ignore[assignment]  # as in every space with arrays
 
 
 class FlatReader(SpaceReader):

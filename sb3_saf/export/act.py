@@ -5,176 +5,322 @@ Act with an exported actor. Needs only Python, NumPy and onnxruntime.
 
 or, from a program beside this file:
 
-    from act import Memory, OnnxActor
-    actor = OnnxActor("folder of actor.json and actor.onnx")
+    from act import Actor
+    actor = Actor.load("folder of actor.onnx")
     action = actor.act(observation)
 
-An actor with memory takes ``memory=Memory()``, a new one for each episode; on the command line, the observations of
-such an actor are the steps of one episode.
+An actor with memory takes ``memory=actor.new_memory()``, a new one for each episode; on the command line, the
+observations of such an actor are the steps of one episode.
 
-Letters: K rows (a batch of observations), M choices of all action dimensions, H size of a memory.
+Letters: K rows (a batch of observations), M choices of all action dimensions, A actions.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import json
+from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[Any]
+# export_actors writes this code in place of its import.
+from sb3_saf.teams.conversion import pixels_to_codes
+
+Array: TypeAlias = npt.NDArray[Any]
 
 
 class Memory:
     """
-    Memory of an actor in an episode: hidden and cell state of its LSTM, (layers, K, H), initially zeros.
+    Memory of an actor in an episode: its states (K, ...) by name, zeros at first; :meth:`Actor.act` updates them.
 
     Make a new one for each episode.
     """
 
-    def __init__(self, hidden: Array | None = None, cell: Array | None = None):
-        self.hidden, self.cell = hidden, cell
-
-    def arrays(self, net: dict[str, Any], n_rows: int) -> tuple[Array, Array]:
-        """Return hidden and cell state, (layers, K, H) each; ``net`` is ``"memory"`` of ``actor.json``."""
-        shape = (net["n_layers"], n_rows, net["hidden_size"])
-        zeros = np.zeros(shape, np.float32)
-        hidden, cell = (zeros if part is None else part for part in (self.hidden, self.cell))
-        if hidden.shape != shape or cell.shape != shape:
-            raise ValueError(
-                f"this memory is of {hidden.shape[1]} observations at once, got {n_rows}; give each agent and each "
-                "game a memory of its own, and make a new one for each episode"
-            )
-        return hidden, cell
+    def __init__(self) -> None:
+        self.states: dict[str, Array] = {}
 
 
-def as_batch(observation: Any, space: dict[str, Any]) -> tuple[Array, bool]:
+class Actor:
     """
-    Convert observations to the network's layout.
+    One agent's part of a trained team, read from the files of ``sb3_saf.export_actors``.
 
-    :param observation: one own observation or a batch of them; pictures with channels first or last
-    :param space: the observation space, as in ``actor.json``
-    :return: (K, *shape) of the space's dtype, and whether ``observation`` was a batch
-    """
-    array, shape = np.asarray(observation), tuple(space["shape"])
-    if space.get("picture") and array.shape != shape and array.shape[1:] != shape and array.ndim >= 3:
-        array = np.moveaxis(array, -1, -3)
-    if array.shape != shape and array.shape[1:] != shape:
-        raise ValueError(
-            f"expected one own observation of shape {shape} or a batch of them, got shape {np.shape(observation)}"
-        )
-    is_batch = array.shape != shape
-    return np.ascontiguousarray(array if is_batch else array[np.newaxis], dtype=space["dtype"]), is_batch
+    It reads the agent's own observation only, and acts as the trained model's ``predict``. Nothing is unpickled, no
+    code is imported by a name from the files, and neither the training code nor the environment is needed.
 
+    Make one with :meth:`load`. An actor trained with action masks needs a mask in each call, and one with memory a new
+    memory for each episode::
 
-def as_masks(action_mask: Any, manifest: dict[str, Any], n_rows: int) -> Array | None:
-    """
-    Check action masks; ValueError if they are missing, not supported, of a wrong shape, or allow nothing.
+        actor = sb3_saf.Actor.load("actor", agent=3)
+        memory = actor.new_memory()  # at the start of each episode, where has_memory
+        action = actor.act(own_observation, action_mask=legal, memory=memory)
 
-    :param action_mask: (M,) for one observation, (K, M) for a batch; or None
-    :param manifest: ``"action"`` and ``"action_mask"`` as in ``actor.json``
-    :return: (K, M) bool, or None for none
-    """
-    wanted = manifest["action_mask"]
-    n_choices = sum(manifest["action"]["choices"])
-    if action_mask is None:
-        if wanted == "required":
-            raise ValueError(
-                f"this actor was trained to keep to masks: pass action_mask, {n_choices} zeros and ones per observation"
-            )
-        return None
-    if wanted == "none":
-        raise ValueError("this actor was trained without masks of actions, and does not know what to do with one")
-    mask = np.asarray(action_mask)
-    mask = mask[np.newaxis] if mask.ndim == 1 else mask
-    if mask.shape != (n_rows, n_choices) or not ((mask == 0) | (mask == 1)).all():
-        raise ValueError(
-            f"expected {n_choices} zeros and ones for each of {n_rows} observations as action_mask, got shape "
-            f"{np.shape(action_mask)}"
-        )
-    mask = mask.astype(bool)
-    if wanted == "required" and not mask.any(axis=1).all():
-        raise ValueError(f"expected at least one legal action in each action_mask, got {mask.astype(int).tolist()}")
-    return mask
-
-
-def feeds(session: Any, known: dict[str, Array], rng: np.random.Generator | None) -> dict[str, Array]:
-    """
-    Return a value for every input of the graph: known values, noise, masks that allow all actions, and zeros.
-
-    :param session: session of onnxruntime
-    :param known: inputs by name, including ``"observation"``
-    :param rng: generator of noise; its method is the prefix of the input's name, as in ``gumbel_policy`` or
-        ``normal_action``; None for zeros
-    """
-    rows, values = len(known["observation"]), dict(known)
-    for entry in session.get_inputs():
-        shape = [rows, *entry.shape[1:]]
-        if entry.name not in known and "_" in entry.name:
-            method = entry.name.partition("_")[0]
-            values[entry.name] = np.zeros(shape, np.float32)
-            if method == "action":
-                values[entry.name] = np.ones(shape, bool)
-            elif rng is not None:
-                draw = {"gumbel": rng.gumbel, "normal": rng.normal, "logistic": rng.logistic}[method]
-                values[entry.name] = draw(size=shape).astype(np.float32)
-        elif entry.name == "action" and entry.name not in known:
-            values[entry.name] = np.zeros(shape, np.int64 if entry.type == "tensor(int64)" else np.float32)
-    return values
-
-
-class OnnxActor:
-    """
-    Run ``actor.onnx``. The folder is trusted; ``sb3_saf.Actor`` checks it first.
-
-    :param folder: folder of ``actor.json`` and ``actor.onnx``
-    :param agent: index of the agent, if the actor depends on it
+    :param session: onnxruntime's session of the graph
+    :param description: spaces, agents and memory, from the metadata of the graph
+    :param agent: index of the agent in its team, if known
     """
 
-    def __init__(self, folder: str | Path, agent: int | None = None):
-        import onnxruntime
+    def __init__(self, session: Any, description: Mapping[str, Any], agent: int | None = None):
+        self.session, self.description, self.agent = session, description, agent
+        self._rng = np.random.default_rng()
+        atlas = description["observation"]["atlas"]
+        self._atlas = None
+        if atlas is not None:
+            self._atlas = np.frombuffer(base64.b64decode(atlas["pixels"]), np.uint8).reshape(atlas["shape"])
 
-        self.manifest: dict[str, Any] = json.loads((Path(folder) / "actor.json").read_text(encoding="utf-8"))
-        if self.manifest["reads_agent"] and agent is None:
-            raise ValueError("what is done depends on who acts: say which agent acts (agent=..., --agent)")
-        self.agent = agent
-        self.session = onnxruntime.InferenceSession(Path(folder) / "actor.onnx", providers=["CPUExecutionProvider"])
+    @classmethod
+    def load(cls, folder: str | PathLike[str], agent: int | str | None = None) -> Actor:
+        """
+        Read an export.
+
+        :param folder: written by ``sb3_saf.export_actors``
+        :param agent: index or name of the agent in its team; needed if the actor depends on it
+        :raises ValueError: if the files are missing or damaged, or the agent is unknown
+        """
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ImportError("Actor needs onnxruntime: pip install onnxruntime") from error
+        path = Path(folder) / "actor.onnx"
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            description = json.loads(session.get_modelmeta().custom_metadata_map["sb3_saf"])
+        except Exception as error:  # those of onnxruntime have no common class
+            raise ValueError(f"expected {path} to be written by sb3_saf.export_actors, got {error!r:.300}") from error
+        return cls(session, description, _index_of(agent, description))
+
+    @property
+    def n_agents(self) -> int:
+        """N, the size of the trained team."""
+        return int(self.description["n_agents"])
+
+    @property
+    def reads_agent(self) -> bool:
+        """Whether the actor depends on the agent's index."""
+        return bool(self.description["reads_agent"])
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the actor has memory."""
+        return bool(self.description["states"])
+
+    def new_memory(self) -> Memory:
+        """Make the empty memory for the start of an episode, which :meth:`act` updates."""
+        if not self.has_memory:
+            raise ValueError(f"{self.description['policy']} has no memory: leave memory out")
+        return Memory()
 
     def act(
         self,
         observation: Any,
-        rng: np.random.Generator | None = None,
+        deterministic: bool = True,
+        rng: int | np.random.Generator | None = None,
         action_mask: Any = None,
         memory: Memory | None = None,
     ) -> Array:
         """
-        Choose an action.
+        Choose an action, by default that of ``model.predict(observation, deterministic=True)``. The default of
+        ``predict`` itself is to sample.
 
-        :param observation: one own observation, or a batch
-        :param rng: generator for sampling; None takes the most likely action
-        :param action_mask: legal actions, if the actor was trained with masks
-        :param memory: memory of the episode, if the actor has one; it is updated
+        :param observation: one own observation of the environment (pictures with channels first or last), or a batch of
+            them with one more axis. An actor of tile codes also takes the game's pixels. A dict in PettingZoo's form,
+            ``{"observation": ..., "action_mask": ...}``, gives both
+        :param deterministic: whether to take the most likely action instead of sampling
+        :param rng: seed or NumPy generator for sampling; None continues from the last call
+        :param action_mask: (M,) zeros and ones, or one more axis for a batch: legal choices, in the form of the
+            training masks. Required if the training environment's observations had masks
+        :param memory: memory of the episode, from :meth:`new_memory`, if the actor has one; it is updated. For a batch
+            of K observations it holds K memories
+        :return: the action, or a batch of actions, as from ``predict``
+        :raises ValueError: for observations with a shape or dtype other than the observation space's, or not finite,
+            and for invalid masks or memories
         """
-        batch, is_batch = as_batch(observation, self.manifest["observation"])
-        known = {"observation": batch}
-        mask = as_masks(action_mask, self.manifest, len(batch))
-        if mask is not None:
-            known["action_mask"] = mask
-        if self.manifest["reads_agent"]:
-            known["agent"] = np.full(len(batch), self.agent)
-        names = ["most_likely" if rng is None or self.manifest["selection"] == "greedy" else "drawn"]
-        if self.manifest["memory"] is not None:
-            if memory is None:
-                raise ValueError("this actor has a memory: pass memory=Memory(), new at the start of each episode")
-            known["hidden"], known["cell"] = memory.arrays(self.manifest["memory"], len(batch))
-            names += ["next_hidden", "next_cell"]
-        actions, *states = self.session.run(names, feeds(self.session, known, rng))
-        if memory is not None and states:
-            memory.hidden, memory.cell = states
+        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        is_drawn = not deterministic and not self.description["greedy"]
+        names = ["drawn" if is_drawn else "most_likely", *(f"next_{name}" for name in self.description["states"])]
+        actions, *states = self._run(names, inputs, self._generator(rng) if is_drawn else None)
+        if memory is not None:
+            memory.states = dict(zip(self.description["states"], states, strict=True))
         return actions if is_batch else actions.squeeze(axis=0)
+
+    def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
+        """
+        Return the probability of every discrete action, (A,) or (K, A) for a batch.
+
+        Arguments as in :meth:`act`; the memory is not updated.
+        """
+        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        self._check_is_drawn()
+        if "log_probs" not in {output.name for output in self.session.get_outputs()}:
+            raise ValueError("only Discrete actions have a list of probabilities: use log_prob")
+        probabilities: Array = np.exp(self._run(["log_probs"], inputs)[0])
+        return probabilities if is_batch else probabilities[0]
+
+    def log_prob(self, observation: Any, action: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
+        """
+        Return the log-likelihood of actions under the mixture of the pool's policies, () or (K,) for a batch.
+
+        Arguments as in :meth:`act`; the memory is not updated.
+        """
+        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        self._check_is_drawn()
+        actions, choices = np.asarray(action), np.asarray(self.description["choices"])
+        actions = actions.reshape(len(inputs["observation"]), -1)
+        if choices.size and ((actions < 0) | (actions >= choices)).any():
+            raise ValueError(f"expected action of at least 0 and below {choices.tolist()}, got {actions.tolist()}")
+        (result,) = self._run(["log_prob"], inputs | {"action": actions})
+        return result if is_batch else result[0]
+
+    def _check_is_drawn(self) -> None:
+        if self.description["greedy"]:
+            raise ValueError(f"{self.description['policy']} takes the action of the highest value: nothing is drawn")
+
+    def _generator(self, rng: object) -> np.random.Generator:
+        if rng is None:
+            return self._rng
+        if isinstance(rng, bool) or not isinstance(rng, (int, np.integer, np.random.Generator)):
+            raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
+        return np.random.default_rng(rng)
+
+    def _run(self, names: list[str], inputs: dict[str, Array], rng: np.random.Generator | None = None) -> list[Array]:
+        """
+        Return outputs of the graph.
+
+        :param names: names of the outputs
+        :param inputs: inputs by name; others are zeros, and a mask allows everything
+        :param rng: draws noise, inputs that are called as its methods: ``gumbel_policy``, ``normal_action``
+        """
+        n_rows, feeds = len(inputs["observation"]), {}
+        types = {"tensor(int64)": np.int64, "tensor(bool)": np.bool_, "tensor(float)": np.float32}
+        for entry in self.session.get_inputs():
+            shape, (method, _, noise) = [n_rows, *entry.shape[1:]], entry.name.partition("_")
+            if entry.name in inputs:
+                value = inputs[entry.name]
+            elif entry.name == "action_mask":
+                value = np.ones(shape)
+            elif noise and rng is not None:
+                value = {"gumbel": rng.gumbel, "normal": rng.normal, "logistic": rng.logistic}[method](size=shape)
+            else:
+                value = np.zeros(shape)
+            feeds[entry.name] = value.astype(types.get(entry.type, value.dtype), copy=False)
+        outputs: list[Array] = self.session.run(names, feeds)
+        return outputs
+
+    def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[dict[str, Array], bool]:
+        """Return the checked inputs of the graph by name, and whether they are a batch."""
+        if isinstance(observation, Mapping) and set(observation) == {"observation", "action_mask"}:
+            action_mask = observation["action_mask"] if action_mask is None else action_mask
+            observation = observation["observation"]
+        batch, is_batch = self._batch(observation)
+        inputs = {"observation": batch, **self._states(memory, len(batch))}
+        mask = self._mask(action_mask, len(batch))
+        if mask is not None:
+            inputs["action_mask"] = mask
+        if self.reads_agent:
+            inputs["agent"] = np.full(len(batch), self.agent)
+        return inputs, is_batch
+
+    def _batch(self, observation: Any) -> tuple[Array, bool]:
+        """Return own observations (K, *shape) of the space's dtype, and whether they were a batch."""
+        space = self.description["observation"]
+        array, shape, dtype = np.asarray(observation), tuple(space["shape"]), np.dtype(space["dtype"])
+        if self._atlas is not None:
+            (_, tile, _, channels), (rows, columns) = self._atlas.shape, shape
+            sizes = rows * tile, columns * tile
+            if array.ndim in (3, 4) and array.shape[-3:] in ((*sizes, channels), (channels, *sizes)):
+                array = pixels_to_codes(array, self._atlas)
+        if not _fits(array, dtype):
+            raise ValueError(f"expected observation of {dtype}, got {array.dtype} that does not fit into it")
+        if space["picture"] and array.ndim >= 3 and shape not in (array.shape, array.shape[1:]):
+            array = np.moveaxis(array, -1, -3)
+        if shape not in (array.shape, array.shape[1:]):
+            raise ValueError(
+                f"expected one own observation of shape {shape} or a batch, got observation of shape "
+                f"{np.shape(observation)}"
+            )
+        is_batch = array.shape != shape
+        batch = np.ascontiguousarray(array if is_batch else array[np.newaxis], dtype=dtype)
+        if batch.dtype.kind == "f" and not np.isfinite(batch).all():
+            raise ValueError("observation has NaN or infinity; repair the environment or the sensor it comes from")
+        choices = space["choices"]
+        if choices is not None and ((batch < 0) | (batch >= np.asarray(choices))).any():
+            raise ValueError(f"expected observation of at least 0 and below {choices}, got {batch.tolist()}")
+        return batch, is_batch
+
+    def _mask(self, action_mask: Any, n_rows: int) -> Array | None:
+        """Return legal choices (K, M) bool; None for all."""
+        use, n_choices = self.description["action_mask"], sum(self.description["choices"])
+        if action_mask is None:
+            if use == "required":
+                raise ValueError(f"this actor needs action_mask, {n_choices} zeros and ones for each observation")
+            return None
+        if use == "none":
+            raise ValueError("this actor was trained without masks of actions: leave action_mask out")
+        mask = np.asarray(action_mask)
+        mask = mask[np.newaxis] if mask.ndim == 1 else mask
+        if mask.shape != (n_rows, n_choices) or not ((mask == 0) | (mask == 1)).all():
+            raise ValueError(
+                f"expected action_mask of {n_choices} zeros and ones for each of {n_rows} observations, got shape "
+                f"{np.shape(action_mask)}"
+            )
+        mask = mask.astype(bool)
+        if use == "required" and not mask.any(axis=1).all():
+            raise ValueError(f"expected at least one legal action in each action_mask, got {mask.astype(int).tolist()}")
+        return mask
+
+    def _states(self, memory: Memory | None, n_rows: int) -> dict[str, Array]:
+        """Return the states (K, ...) of a memory, zeros if it is new."""
+        if not self.has_memory and memory is not None:
+            self.new_memory()  # raises an error: the actor has no memory
+        if self.has_memory and not isinstance(memory, Memory):
+            raise ValueError(
+                f"this actor needs memory = actor.new_memory() at the start of each episode, got memory={memory!r}"
+            )
+        shapes: Mapping[str, list[int]] = self.description["states"]
+        states = (
+            memory.states
+            if memory is not None and memory.states
+            else {name: np.zeros((n_rows, *shape), np.float32) for name, shape in shapes.items()}
+        )
+        for state in states.values():
+            if len(state) != n_rows:
+                raise ValueError(
+                    f"expected memory of {n_rows} observations at once, got one of {len(state)}; give each agent and "
+                    "each game a memory of its own, and make a new one for each episode"
+                )
+        return states
+
+
+def _index_of(agent: object, description: Mapping[str, Any]) -> int | None:
+    """Return the index of an agent, given by index or name; None if it is not given and not needed."""
+    n_agents, names = description["n_agents"], description["agents"]
+    if agent is None:
+        if description["reads_agent"]:
+            raise ValueError(f"this actor needs agent=: what it does depends on who acts, agent=0 to {n_agents - 1}")
+        return None
+    if names is not None and agent in names:
+        return int(names.index(agent))
+    if isinstance(agent, bool) or not isinstance(agent, (int, np.integer)) or not 0 <= agent < n_agents:
+        or_name = "" if names is None else f" or one of {', '.join(map(repr, names))}"
+        raise ValueError(f"agent must be a whole number in 0..{n_agents - 1}{or_name}, got {agent!r}")
+    return int(agent)
+
+
+def _fits(array: Array, dtype: np.dtype[Any]) -> bool:
+    """Return whether conversion to ``dtype`` is valid: any number to float, otherwise without change of value."""
+    if array.dtype.kind not in "biuf":
+        return False
+    if dtype.kind == "f" or np.can_cast(array.dtype, dtype):
+        return True
+    with np.errstate(invalid="ignore"):
+        return bool((array.astype(dtype) == array).all())
 
 
 def main() -> None:
@@ -184,21 +330,22 @@ def main() -> None:
         "observation", help="a .npy file of one own observation, or of a batch (with a memory: of an episode's steps)"
     )
     parser.add_argument("--folder", default=Path(__file__).parent, help="the exported folder; this file's own")
-    parser.add_argument("--agent", type=int, help="which agent acts, where what is done depends on it")
+    parser.add_argument("--agent", help="index or name of the agent that acts, where the action depends on it")
     parser.add_argument("--action-mask", help="a .npy file with the legal actions of each observation")
     parser.add_argument("--sample", action="store_true", help="draw the action instead of taking the most likely one")
     parser.add_argument("--seed", type=int, help="seed of --sample")
     options = parser.parse_args()
-    actor = OnnxActor(options.folder, options.agent)
-    rng = np.random.default_rng(options.seed) if options.sample else None
+    agent = int(options.agent) if options.agent and options.agent.isdigit() else options.agent
+    actor = Actor.load(options.folder, agent)
+    rng = np.random.default_rng(options.seed)
     observations = np.load(options.observation, allow_pickle=False)
     masks = None if options.action_mask is None else np.load(options.action_mask, allow_pickle=False)
-    if actor.manifest["memory"] is None:
-        actions = actor.act(observations, rng, masks)
+    if not actor.has_memory:
+        actions = actor.act(observations, not options.sample, rng, masks)
     else:
-        steps, memory = as_batch(observations, actor.manifest["observation"])[0], Memory()
-        each = [None] * len(steps) if masks is None else masks
-        actions = np.stack([actor.act(own, rng, mask, memory) for own, mask in zip(steps, each, strict=True)])
+        memory, masks = actor.new_memory(), [None] * len(observations) if masks is None else masks
+        steps = zip(observations, masks, strict=True)
+        actions = np.stack([actor.act(own, not options.sample, rng, mask, memory) for own, mask in steps])
     print(json.dumps(actions.tolist()))
 
 

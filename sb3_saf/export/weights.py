@@ -1,4 +1,4 @@
-"""Loading of weights only from the zip file of a saved model."""
+"""Weights of a policy as safetensors, and out of the zip file of a saved model."""
 
 from __future__ import annotations
 
@@ -6,68 +6,99 @@ import io
 import zipfile
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch as th
+from safetensors.torch import load, save
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.export.network import check_tensors
 from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.files import atomic_file
 
-_ENTRY: Final = "policy.pth"
-#: Maximum bytes of a file of tensors in addition to the tensors.
-_OVERHEAD: Final = 1 << 22
+
+def save_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -> Path:
+    """
+    Write the policy's weights as safetensors, atomically; :func:`load_weights` reads them.
+
+    :param model: an algorithm or a policy
+    :param path: the file; ``.safetensors`` is appended if missing
+    :return: the file
+    """
+    path = Path(path)
+    path = path if path.suffix == ".safetensors" else path.with_name(f"{path.name}.safetensors")
+    policy: Any = getattr(model, "policy", model)
+    tensors = policy.state_dict()
+    names = set(_first_names(tensors).values())
+    content = save({name: tensor.contiguous() for name, tensor in tensors.items() if name in names})
+    with atomic_file(path) as file:
+        file.write(content)
+    return path
 
 
 def load_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -> None:
     """
-    Load the policy's weights of a model written by ``save``, without running code from the file.
+    Load the weights of a policy, without running code from the file.
 
     SB3's ``load`` unpickles the whole model, so an untrusted file can run arbitrary code. Here the caller makes the
-    model (with the same ``policy_kwargs``), and only tensors are read: ``torch.load`` with ``weights_only=True``, after
-    comparing names, shapes and types with the model's. The optimiser's state and the hyperparameters are not read.
+    model (with the same ``policy_kwargs``), and only tensors are read. The optimiser's state and the hyperparameters
+    are not read.
 
     :param model: an algorithm or a policy, changed only if the whole file matches
-    :param path: the zip file, with or without ``.zip``
+    :param path: the file of :func:`save_weights`, or the zip file of SB3's ``save``, with or without ``.zip``
     :raises ExportError: if the file is damaged, malformed, or of a differently built policy
     """
     policy: Any = getattr(model, "policy", model)
     own: dict[str, th.Tensor] = policy.state_dict()
-    limit = 2 * sum(tensor.numel() * tensor.element_size() for tensor in own.values()) + _OVERHEAD
     path = Path(path)
-    path = path if path.is_file() or path.suffix == ".zip" else path.with_name(f"{path.name}.zip")
-    tensors = read_weights(path, limit)
-    remedy = "; make the model with the policy and policy_kwargs it was trained with"
-    check_tensors(own, tensors, str(path), remedy)
+    path = path if path.is_file() or path.suffix in (".zip", ".safetensors") else path.with_name(f"{path.name}.zip")
+    tensors = read_weights(path)
+    if path.suffix == ".safetensors":  # each tensor is stored under the first of its names
+        tensors |= {name: tensors[first] for name, first in _first_names(own).items() if first in tensors}
+    fix = "; make the model with the policy and policy_kwargs it was trained with"
+    if missing := sorted(own.keys() - tensors.keys()):
+        raise ExportError(f"{path} lacks the tensor {missing[0]!r}{fix}")
+    if unknown := sorted(map(str, tensors.keys() - own.keys())):
+        raise ExportError(f"{path} has a tensor that the network does not have: {unknown[0][:80]!r}{fix}")
+    for name, expected in own.items():
+        tensor = tensors[name]
+        if not isinstance(tensor, th.Tensor) or (tensor.shape, tensor.dtype) != (expected.shape, expected.dtype):
+            is_tensor = isinstance(tensor, th.Tensor)
+            got = f"{tuple(tensor.shape)} and {tensor.dtype}" if is_tensor else type(tensor).__name__
+            raise ExportError(
+                f"{path}: expected {name!r} of shape {tuple(expected.shape)} and {expected.dtype}, got {got}{fix}"
+            )
+        if not bool(tensor.isfinite().all()):
+            raise ExportError(f"{path}: {name!r} has NaN or infinity")
     policy.load_state_dict(tensors)
 
 
-def read_weights(path: Path, limit: int = 1 << 31) -> dict[str, th.Tensor]:
-    """
-    Return the policy's weights in a model's file; only tensors are read.
+def _first_names(tensors: dict[str, th.Tensor]) -> dict[str, str]:
+    """Return for every tensor the first name of the same memory: modules may be shared."""
+    first: dict[tuple[Any, ...], str] = {}
+    return {
+        name: first.setdefault((tensor.data_ptr(), tensor.shape) if tensor.numel() else (name,), name)
+        for name, tensor in tensors.items()
+    }
 
-    :param limit: maximum bytes of the weights
-    :raises ExportError: if the file is damaged, malformed, or has other content
+
+def read_weights(path: Path) -> dict[str, th.Tensor]:
+    """
+    Return the weights in a file of safetensors or of a saved model; only tensors are read.
+
+    :param path: the file
+    :raises ExportError: if the file is missing, damaged, or has other content
     """
     if not path.is_file():
-        raise ExportError(f"expected a model saved by Stable-Baselines3, found no file {path}")
+        raise ExportError(f"expected a model saved by Stable-Baselines3 or its weights, found no file {path}")
     try:
-        with zipfile.ZipFile(path) as archive, archive.open(_ENTRY) as file:
-            data = file.read(limit + 1)  # limited while unpacking: the stated size may be wrong
-    except Exception as error:  # a damaged zip may raise many errors, including zlib's and struct's
-        raise ExportError(f"{path} is not a model saved by Stable-Baselines3: {error}") from error
-    if len(data) > limit:
-        raise ExportError(f"{_ENTRY} in {path} has more than {limit} bytes, too many for the model's weights")
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-            packed = any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist())
-        if packed or size > limit:
-            raise ValueError("it unpacks to more than it is")
+        if path.suffix == ".safetensors":
+            return load(path.read_bytes())
+        with zipfile.ZipFile(path) as archive:
+            data = archive.read("policy.pth")
         tensors = th.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # the unpickler's errors have no common class
-        raise ExportError(f"{_ENTRY} in {path} does not hold tensors alone: {str(error)[:200]}") from error
+    except Exception as error:  # zips, the unpickler and safetensors have no common class of errors
+        raise ExportError(f"{path} does not hold the tensors of a saved model: {str(error)[:200]}") from error
     if not isinstance(tensors, dict):
-        raise ExportError(f"{_ENTRY} in {path} must map names to tensors, got {type(tensors).__name__}")
+        raise ExportError(f"{path} must map names to tensors, got {type(tensors).__name__}")
     return tensors

@@ -1,82 +1,86 @@
-"""Export of a trained model to the files of an actor."""
+"""Export of a trained model's actors as an ONNX graph that chooses actions."""
 
 from __future__ import annotations
 
+import base64
 import copy
+import inspect
+import json
+import logging
+import re
 import warnings
-from importlib.resources import files
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from msgspec.structs import replace
-from safetensors.torch import save
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
-from sb3_saf.export.comparison import ExportablePolicy, check_network, some_inputs
-from sb3_saf.export.files import write_folder
-from sb3_saf.export.manifest import (
-    MANIFEST_FILE,
-    ONNX_FILE,
-    SCRIPT_FILE,
-    WEIGHTS_FILE,
-    Activation,
-    ActorNet,
-    DataFile,
-    EncoderName,
-    EncoderNet,
-    Manifest,
-    MemoryNet,
+from sb3_saf.export import act
+from sb3_saf.networks.actor import PolicyPool, PoolOutput, SinglePolicy
+from sb3_saf.networks.distributions import (
+    choices_of,
+    is_one_hot,
+    likeliest_action,
+    masked_parameters,
+    mixture_log_prob,
+    mixture_log_probs,
+    mixture_mode,
+    n_action_parameters,
+    policy_parameters,
 )
-from sb3_saf.export.network import ACTIVATIONS, ATLAS, AgentNetwork, RawEncoder, make_actor, make_encoder, make_memory
-from sb3_saf.networks.actor import ActionHead, PolicyPool, Selection, SinglePolicy
-from sb3_saf.networks.layers import AgentHeads
-from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec, spec_of
+from sb3_saf.networks.encoders import encoded
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
-from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
-from sb3_saf.teams import package_version
+from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.files import atomic_file, write_text
+
+#: Policies whose actors read only one agent's own observation, index, mask and memory.
+ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy
+Tensors: TypeAlias = dict[str, th.Tensor]
+
+_OPSET: Final = 18
+#: Maximum relative difference between the model's and the graph's numbers, and how many observations are compared.
+_TOLERANCE: Final = 1e-4
+_N_CHECKED: Final = 16
 
 
-def export_actors(
-    model: BaseAlgorithm | ExportablePolicy,
-    folder: str | PathLike[str],
-    onnx: bool = True,
-    overwrite: bool = False,
-) -> Path:
+def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLike[str]) -> Path:
     """
-    Write the actor of one agent: encoder, policies and their selection.
+    Write the actor of one agent: encoder, memory, policies and their selection.
 
-    ===================== ============================================================================
-    file                  content
-    ===================== ============================================================================
-    ``actor.json``        spaces, networks, versions and checksums
-    ``actor.safetensors`` the weights, and the pictures of tile codes
-    ``actor.onnx``        the same network as a graph, from raw observations to actions
-    ``act.py``            an example that needs only NumPy and onnxruntime
-    ===================== ============================================================================
+    ============== =================================================================================================
+    file           content
+    ============== =================================================================================================
+    ``actor.onnx`` the graph from raw observations to actions, and what describes it (spaces, agents, masks, pixels
+                   of tile codes) as metadata
+    ``act.py``     :class:`sb3_saf.Actor` as a program that needs only NumPy and onnxruntime
+    ============== =================================================================================================
 
     The critic is not exported, nor are VecNormalize's statistics, of which a warning tells. ``sb3_saf.Actor.load``
     reads the folder. Actors of models with action masks need a mask with each observation, those of models with memory
-    a memory (see :class:`~sb3_saf.Actor`). With a custom encoder or activation only the ONNX graph is written, without
-    ``actor.safetensors``. The folder is written atomically; an earlier export is replaced.
+    a memory (see :class:`~sb3_saf.Actor`). Files of an earlier export are replaced, each atomically.
 
     :param model: an algorithm with a SAF, MAPPO or IPPO policy, also recurrent or maskable; QPLEX without memory; or
         the policy itself
     :param folder: output folder
-    :param onnx: whether to write ``actor.onnx`` and ``act.py``, which needs ``pip install -e '.[export]'``
-    :param overwrite: whether to replace a folder that is not an export, with all its content
     :return: the folder
-    :raises ExportError: if the model has no such actor, the folder must not be replaced, or the exported network's
-        outputs differ from the model's
+    :raises ImportError: without ``pip install -e '.[export]'``
+    :raises ExportError: if the model has no such actor, or the graph's outputs differ from the model's
     """
+    try:
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401 - torch's exporter is built on it
+    except ImportError as error:
+        raise ImportError("export_actors needs onnx, onnxscript and onnxruntime: pip install -e '.[export]'") from error
     policy = _checked_policy(model)
     layer = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
     if layer is not None and layer.norm_obs:
@@ -86,47 +90,24 @@ def export_actors(
             UserWarning,
             stacklevel=2,
         )
-    described = _Described.of(policy)
-    network = described.network(policy)
-    inputs = some_inputs(policy, described.memory)
-    check_network(policy, network, inputs)
-    atlas = described.observation.atlas
-    data: dict[str, bytes] = {}
-    if described.encoder is not None and described.activation_is_known:
-        data[WEIGHTS_FILE] = save(_tensors(network, described.observation))
-    elif not onnx:
-        raise ExportError(
-            f"{type(policy.features_extractor).__name__} with {policy.activation_fn.__name__} can be exported as ONNX "
-            "only: leave onnx=True, or use an encoder of sb3_saf and an activation of torch.nn"
-        )
-    if onnx:
-        from sb3_saf.export.onnx_writer import onnx_bytes
-
-        has_masks = _action_mask(policy) != "none"
-        data[ONNX_FILE] = onnx_bytes(network, described.action, described.selection, inputs, has_masks, atlas)
-    manifest = described.manifest(policy, {name: DataFile.of(content) for name, content in data.items()})
-    data[MANIFEST_FILE] = manifest.to_json().encode("utf-8")
-    if onnx:
-        data[SCRIPT_FILE] = files("sb3_saf.export").joinpath(SCRIPT_FILE).read_bytes()
-    Manifest.from_json(data[MANIFEST_FILE])  # checks that it can be read again
+    network = ActingNetwork(policy)
+    inputs = network.some_inputs()
+    graph = _written(network, inputs, {"sb3_saf": json.dumps(_description(policy, network))})
+    _check(graph, network, policy, inputs)
     path = Path(folder)
-    write_folder(path, data, overwrite)
+    path.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path / "actor.onnx") as file:
+        file.write(graph)
+    write_text(path / "act.py", _script())
     return path
-
-
-def _tensors(network: AgentNetwork, observation: ObservationSpec) -> dict[str, th.Tensor]:
-    """Return the weights, and the pixels of tile codes."""
-    tensors = {name: tensor.contiguous() for name, tensor in network.tensors().items()}
-    return tensors if observation.atlas is None else tensors | {ATLAS: th.tensor(observation.atlas)}
 
 
 def _checked_policy(model: object) -> ExportablePolicy:
     policy = getattr(model, "policy", model)
     if not isinstance(policy, (TeamPolicy, QPLEXPolicy)):
         raise ExportError(
-            f"expected a model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got "
-            f"{type(policy).__name__}; policies of "
-            "Stable-Baselines3 itself read whole rows and have no actor of one agent"
+            f"expected model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got {type(policy).__name__}; "
+            "policies of Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
     if getattr(policy, "memory", None) is not None:
         raise ExportError(
@@ -135,165 +116,245 @@ def _checked_policy(model: object) -> ExportablePolicy:
         )
     if type(policy.actor) not in (SinglePolicy, PolicyPool):
         raise ExportError(f"expected the actor SinglePolicy or PolicyPool, got {type(policy.actor).__name__}")
+    for space in (policy.team_spaces.own, policy.action_space):
+        if np.any(getattr(space, "start", 0)):
+            raise ExportError(f"expected spaces counting from 0, got {space}")
     wrong = [name for name, tensor in policy.state_dict().items() if not bool(tensor.isfinite().all())]
     if wrong:
         raise ExportError(f"the model's {wrong[0]} has NaN or infinity: training went wrong before it was exported")
     return policy
 
 
-class _Described(NamedTuple):
-    """Parts of a policy as entries of a manifest."""
-
-    encoder: EncoderNet | None
-    memory: MemoryNet | None
-    actor: ActorNet
-    activation_is_known: bool
-    features_dim: int
-    selection: Selection | Literal["greedy"]
-    observation: ObservationSpec
-    action: SpaceSpec
-
-    @classmethod
-    def of(cls, policy: ExportablePolicy) -> _Described:
-        _check_counts_from_zero(policy.team_spaces.own, "observation")
-        _check_counts_from_zero(policy.action_space, "action")
-        return cls(
-            encoder=_describe_encoder(policy),
-            memory=_describe_memory(policy),
-            actor=_describe_actor(policy),
-            activation_is_known=ACTIVATIONS.get(policy.activation_fn.__name__) is policy.activation_fn,
-            features_dim=policy.features_dim,
-            selection=_selection(policy),
-            observation=observation_spec(policy.team_spaces.own),
-            action=spec_of(policy.action_space),
-        )
-
-    def network(self, policy: ExportablePolicy) -> AgentNetwork:
-        """Make the network with the policy's weights, on the CPU."""
-        encoder: nn.Module = _OwnExtractor(policy)
-        if self.encoder is not None:
-            inner = make_encoder(self.encoder, self.observation)
-            inner.load_state_dict(_inner_encoder(policy).state_dict(), strict=True)
-            encoder = RawEncoder(inner, self.observation.space, self.encoder.divide_by_255)
-        memory = make_memory(self.memory, self.features_dim)
-        if memory is not None:
-            assert isinstance(policy, TeamRecurrentPolicy)
-            memory.load_state_dict(policy.lstm_actor.state_dict(), strict=True)
-        latent_dim = self.features_dim if self.memory is None else self.memory.hidden_size
-        n_agents = policy.team_spaces.n_agents
-        actor = make_actor(self.actor, latent_dim, self.action, n_agents, policy.activation_fn)
-        actor.load_state_dict(policy.actor.state_dict(), strict=True)
-        return AgentNetwork(encoder, memory, actor).requires_grad_(False).eval()
-
-    def manifest(self, policy: ExportablePolicy, data: dict[str, DataFile]) -> Manifest:
-        """Make the manifest of some files."""
-        complete = WEIGHTS_FILE in data
-        return Manifest(
-            sb3_saf_version=package_version(),
-            policy=type(policy).__name__,
-            n_agents=policy.team_spaces.n_agents,
-            reads_agent=self.actor.reads_agent,
-            action_mask=_action_mask(policy),
-            selection=self.selection,
-            observation=self.observation.space,
-            action=self.action,
-            encoder=self.encoder if complete else None,
-            actor=self.actor if complete else None,
-            memory=self.memory,
-            files=cast("dict[Literal['actor.safetensors', 'actor.onnx'], DataFile]", data),
-        )
+def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, Any]:
+    """Return what :class:`sb3_saf.Actor` needs to know of a graph, as plain data."""
+    own, names = policy.team_spaces.own, policy.team_spaces.names
+    choices, pixels = None, None
+    if is_one_hot(own):
+        choices = np.reshape(choices_of(own), own.shape or ()).tolist()
+    if (atlas := getattr(own, "atlas", None)) is not None:
+        choices, pixels = len(atlas), {"shape": atlas.shape, "pixels": base64.b64encode(atlas.tobytes()).decode()}
+    masks = "optional" if isinstance(policy, TeamMaskablePolicy) else "none"
+    return {
+        "version": package_version(),
+        "policy": type(policy).__name__,
+        "n_agents": policy.team_spaces.n_agents,
+        "agents": list(names) if names and all(isinstance(name, (str, int)) for name in names) else None,
+        "reads_agent": policy.actor.reads_agent,
+        "action_mask": masks if policy.team_spaces.action_mask is None else "required",
+        "greedy": network.greedy,
+        "states": network.state_shapes,
+        "choices": choices_of(policy.action_space),
+        "observation": {
+            "shape": own.shape or (),
+            "dtype": str(own.dtype),
+            "choices": choices,
+            "picture": is_image_space(own),
+            "atlas": pixels,
+        },
+    }
 
 
-class _OwnExtractor(nn.Module):
-    """A user's features extractor on raw observations, for ONNX graphs only."""
+def _script() -> str:
+    """Return act.py with the code that it imports from this package."""
+    code = inspect.getsource(conversion)
+    code = code[code.index("\n\n\n") :].lstrip()  # without its imports
+    return re.sub(
+        r"from sb3_saf.teams.conversion import (\([^)]*\)|.*)\n", lambda _: f"\n\n{code}\n\n", inspect.getsource(act)
+    )
+
+
+# --- the network ------------------------------------------------------------------------------------------------------
+
+
+class LstmStep(nn.Module):
+    """
+    One step of an LSTM; the states of rows are (K, layers, H).
+
+    :param lstm: the LSTM
+    """
+
+    def __init__(self, lstm: nn.LSTM):
+        super().__init__()
+        self.lstm = lstm
+        shape = lstm.num_layers, lstm.hidden_size
+        self.state_shapes: dict[str, tuple[int, ...]] = {"hidden": shape, "cell": shape}
+
+    def forward(self, features: th.Tensor, states: list[th.Tensor]) -> tuple[th.Tensor, list[th.Tensor]]:
+        """Return outputs (K, H) of features (K, d), and the next states."""
+        hidden, cell = (state.transpose(0, 1).contiguous() for state in states)
+        outputs, after = self.lstm(features.unsqueeze(0), (hidden, cell))
+        return outputs.squeeze(0), [state.transpose(0, 1) for state in after]
+
+
+class ActingNetwork(nn.Module):
+    """
+    From raw own observations of an agent to its actions; random numbers are inputs.
+
+    Inputs, by name: ``observation`` (rows, *shape) of the observation space's dtype; ``agent`` (rows,) int64 if the
+    actor depends on it; ``action_mask`` (rows, M) bool if masks are supported; the memory's states (rows, ...); and
+    unless the network is greedy, ``action`` (rows, D), the argument of ``log_prob``, and the noise of ``drawn``:
+    ``gumbel_policy`` (rows, U) and ``normal_action``, ``logistic_action`` or ``gumbel_action``, named by distribution.
+
+    Outputs: ``most_likely`` (rows, *shape); ``drawn``, ``log_prob`` (rows,) and, for discrete actions, ``log_probs``
+    (rows, A), or of a greedy network ``values`` (rows, A); and ``next_`` with the name of each state.
+
+    :param policy: its encoder, memory and actor are copied to the CPU
+    """
+
+    low: th.Tensor
+    high: th.Tensor
 
     def __init__(self, policy: ExportablePolicy):
         super().__init__()
-        self.space: spaces.Space[Any] = policy.team_spaces.own
-        self.normalize_images = policy.normalize_images
-        self.extractor = copy.deepcopy(policy.features_extractor).cpu()
+        self.own, self.action_space = policy.team_spaces.own, policy.action_space
+        self.n_agents, self.normalize_images = policy.team_spaces.n_agents, policy.normalize_images
+        self.greedy = isinstance(policy, QPLEXPolicy)
+        self.has_masks = policy.team_spaces.action_mask is not None or isinstance(policy, TeamMaskablePolicy)
+        memory = LstmStep(policy.lstm_actor) if isinstance(policy, TeamRecurrentPolicy) else None
+        self.extractor, self.actor, self.memory = copy.deepcopy((policy.features_extractor, policy.actor, memory))
+        self.state_shapes = {} if self.memory is None else self.memory.state_shapes
+        if isinstance(self.action_space, spaces.Box):
+            self.register_buffer("low", th.as_tensor(self.action_space.low, dtype=th.float32))
+            self.register_buffer("high", th.as_tensor(self.action_space.high, dtype=th.float32))
+        self.requires_grad_(False).eval().cpu()
 
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Encode (K, *shape) raw own observations as (K, d)."""
-        return self.extractor(preprocess_obs(observations, self.space, self.normalize_images))
+    @property
+    def noise(self) -> str:
+        """NumPy's name of the noise that draws an action when added to parameters."""
+        if isinstance(self.action_space, spaces.Box):
+            return "normal"
+        return "logistic" if isinstance(self.action_space, spaces.MultiBinary) else "gumbel"
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the outputs."""
+        names = ["most_likely", "values"] if self.greedy else ["most_likely", "drawn", "log_prob"]
+        if not self.greedy and isinstance(self.action_space, spaces.Discrete):
+            names.append("log_probs")
+        return names + [f"next_{name}" for name in self.state_shapes]
+
+    def some_inputs(self) -> Tensors:
+        """Make random inputs without using the space's generator or torch's."""
+        space, generator = copy.deepcopy(self.own), th.Generator().manual_seed(0)
+        space.seed(0)
+        inputs = {"observation": th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))}
+        if self.actor.reads_agent:
+            inputs["agent"] = th.arange(_N_CHECKED) % self.n_agents
+        if self.has_masks:
+            inputs["action_mask"] = th.ones(_N_CHECKED, sum(choices_of(self.action_space)), dtype=th.bool)
+        for name, shape in self.state_shapes.items():
+            inputs[name] = th.randn(_N_CHECKED, *shape, generator=generator)
+        if not self.greedy:
+            n_policies = self.actor.n_policies if isinstance(self.actor, PolicyPool) else 1
+            n_parameters = n_action_parameters(self.action_space)
+            is_box = isinstance(self.action_space, spaces.Box)
+            n_dimensions = n_parameters // 2 if is_box else len(choices_of(self.action_space))
+            inputs["action"] = th.zeros(
+                _N_CHECKED, n_dimensions, dtype=th.int64 if is_one_hot(self.action_space) else th.float32
+            )
+            inputs["gumbel_policy"] = th.zeros(_N_CHECKED, n_policies)
+            inputs[f"{self.noise}_action"] = th.zeros(_N_CHECKED, n_dimensions if is_box else n_parameters)
+        return inputs
+
+    def forward(self, inputs: Tensors) -> tuple[th.Tensor, ...]:
+        """Return the outputs for inputs by name."""
+        return self.of_features(encoded(self.extractor, inputs["observation"], self.own, self.normalize_images), inputs)
+
+    def of_features(self, features: th.Tensor, inputs: Tensors) -> tuple[th.Tensor, ...]:
+        """Return the outputs for features (rows, d) of the observations, and the other inputs."""
+        states: list[th.Tensor] = []
+        if self.memory is not None:
+            features, states = self.memory(features, [inputs[name] for name in self.state_shapes])
+        output = self.actor.evaluate(features, inputs.get("agent"))
+        if "action_mask" in inputs:
+            output = output._replace(
+                actions=masked_parameters(self.action_space, output.actions, inputs["action_mask"])
+            )
+        favourite = policy_parameters(output.actions, output.log_weights.argmax(dim=1))
+        if self.greedy:
+            return favourite.argmax(dim=1), favourite, *states
+        is_mixture = isinstance(self.actor, PolicyPool) and self.actor.selection == "mixture"
+        likeliest = likeliest_action(self.action_space, favourite)
+        if is_mixture:
+            likeliest = mixture_mode(self.action_space, *output)
+        log_prob = mixture_log_prob(self.action_space, *output, inputs["action"])
+        log_probs = [mixture_log_probs(*output)] if isinstance(self.action_space, spaces.Discrete) else []
+        return self._in_space(likeliest), self._in_space(self._drawn(output, inputs)), log_prob, *log_probs, *states
+
+    def _drawn(self, output: PoolOutput, inputs: Tensors) -> th.Tensor:
+        """Sample (rows, D) as the argmax of parameters plus noise: first the policy, then its choices."""
+        policy = (output.log_weights + inputs["gumbel_policy"]).argmax(dim=1)
+        parameters, noise = policy_parameters(output.actions, policy), inputs[f"{self.noise}_action"]
+        if isinstance(self.action_space, spaces.Box):
+            mean, log_std = parameters.chunk(2, dim=1)
+            return mean + noise * log_std.exp()
+        if isinstance(self.action_space, spaces.MultiBinary):
+            return (parameters + noise > 0).to(parameters.dtype)
+        parts = th.split(parameters + noise, list(choices_of(self.action_space)), dim=1)
+        return th.stack([part.argmax(dim=1) for part in parts], dim=1)
+
+    def _in_space(self, actions: th.Tensor) -> th.Tensor:
+        """Convert actions (rows, D) to the space, (rows, *shape)."""
+        actions = actions.reshape(-1, *(self.action_space.shape or ()))
+        return th.minimum(th.maximum(actions, self.low), self.high) if hasattr(self, "low") else actions
 
 
-# --- describing -------------------------------------------------------------------------------------------------------
+# --- the graph --------------------------------------------------------------------------------------------------------
 
 
-def _selection(policy: ExportablePolicy) -> Selection | Literal["greedy"]:
-    if isinstance(policy, QPLEXPolicy):
-        return "greedy"
-    return policy.actor.selection if isinstance(policy.actor, PolicyPool) else "mixture"
+def _written(network: ActingNetwork, inputs: Tensors, metadata: dict[str, str]) -> bytes:
+    rows = th.export.Dim("rows", max=2**31 - 1)  # torch 2.7 fails without a limit
+    try:
+        with _quiet():
+            program = th.onnx.export(
+                network,
+                kwargs={"inputs": inputs},
+                input_names=list(inputs),
+                output_names=network.outputs,
+                opset_version=_OPSET,
+                dynamo=True,
+                dynamic_shapes={"inputs": {name: {0: rows} for name in inputs}},
+                external_data=False,
+                verbose=False,
+            )
+    except Exception as error:  # a user's encoder may raise anything
+        raise ExportError(f"the network cannot be written as ONNX: {error}") from error
+    assert program is not None
+    proto = program.model_proto
+    for key, value in metadata.items():
+        proto.metadata_props.add(key=key, value=value)
+    return proto.SerializeToString(deterministic=True)
 
 
-def _action_mask(policy: ExportablePolicy) -> Literal["none", "optional", "required"]:
-    """Return whether action masks are required, optional or not supported by the policy."""
-    if policy.team_spaces.action_mask is not None:
-        return "required"
-    return "optional" if isinstance(policy, TeamMaskablePolicy) else "none"
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the exporter's progress messages."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
 
 
-def _describe_memory(policy: ExportablePolicy) -> MemoryNet | None:
-    if not isinstance(policy, TeamRecurrentPolicy):
-        return None
-    lstm = policy.lstm_actor
-    if lstm.bidirectional or lstm.proj_size or lstm.batch_first:
-        raise ExportError(
-            f"expected an LSTM that goes forward, lstm_kwargs of bias and dropout at most, got {policy.lstm_kwargs}"
-        )
-    return MemoryNet(lstm.hidden_size, lstm.num_layers, lstm.bias)
+def _check(graph: bytes, network: ActingNetwork, policy: ExportablePolicy, inputs: Tensors) -> None:
+    """Run the graph and compare its numbers with the model's; ExportError if they differ by more than rounding."""
+    import onnxruntime
 
-
-def _inner_encoder(policy: ExportablePolicy) -> nn.Module:
-    extractor = policy.features_extractor
-    return extractor.encoder if type(extractor) is ObservationEncoder else extractor
-
-
-def _describe_encoder(policy: ExportablePolicy) -> EncoderNet | None:
-    """Describe the encoder; None for classes of users, subclasses included."""
-    encoder, features_dim = _inner_encoder(policy), policy.features_dim
-    divide = bool(policy.normalize_images and spec_of(policy.team_spaces.own).picture)
-    if type(encoder) not in (PaperCNN, NatureEncoder, MLPEncoder, LightEncoder):
-        return None
-    net = EncoderNet(cast(EncoderName, type(encoder).__name__), features_dim, divide)
-    if isinstance(encoder, MLPEncoder):
-        return replace(net, hidden=_hidden(encoder.net)[0])
-    if isinstance(encoder, LightEncoder):
-        return replace(
-            net,
-            tile_size=int(encoder.tile_size),
-            embedding_dim=encoder.embed.out_features,
-            hidden=_hidden(encoder.net)[0],
-            one_hot_codes=encoder.one_hot_codes,
-        )
-    return net
-
-
-def _describe_actor(policy: ExportablePolicy) -> ActorNet:
-    actor = policy.actor
-    head = next(module for module in actor.modules() if isinstance(module, ActionHead))
-    name: Literal["AgentPolicies", "PolicyPool", "SinglePolicy"] = "SinglePolicy"
-    n_policies, latent_dim = 1, 1
-    projection: tuple[int, ...] = ()
-    if isinstance(actor, PolicyPool):
-        name, n_policies, latent_dim = "PolicyPool", actor.n_policies, actor.signature_keys.shape[1]
-        projection = _hidden(actor.query_net)
-    elif isinstance(actor, SinglePolicy) and isinstance(actor.head, AgentHeads):
-        name = "AgentPolicies"
-    activation = cast(Activation, policy.activation_fn.__name__)
-    identity = actor.n_identities > 0
-    return ActorNet(name, _hidden(head.net), activation, n_policies, latent_dim, projection, identity)
-
-
-def _hidden(net: nn.Sequential) -> tuple[int, ...]:
-    """Return the sizes of the hidden layers of an MLP."""
-    return tuple(layer.out_features for layer in net if isinstance(layer, nn.Linear))[:-1]
-
-
-def _check_counts_from_zero(space: AnySpace, what: str) -> None:
-    if np.any(getattr(space, "start", 0)):
-        raise ExportError(
-            f"expected the {what} space Box, Discrete, MultiDiscrete (of one axis) or MultiBinary, counting from 0, "
-            f"got {space}"
-        )
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    found = session.run(network.outputs, {name: tensor.numpy() for name, tensor in inputs.items()})
+    was_training = policy.training
+    policy.set_training_mode(False)
+    with th.no_grad():
+        features = policy.extract_features(inputs["observation"].to(policy.device)).cpu()
+        expected = network.of_features(features, inputs)
+    policy.set_training_mode(was_training)
+    for name, one, other in zip(network.outputs, found, expected, strict=True):
+        is_number = other.is_floating_point()  # choices may differ where two are equally good
+        if is_number and not np.allclose(one, other.numpy(), rtol=_TOLERANCE, atol=_TOLERANCE):
+            raise ExportError(
+                f"the graph's {name} is not the model's: {type(policy).__name__} does more than its encoder and actor"
+            )

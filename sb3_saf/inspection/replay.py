@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.evaluation import play
-from sb3_saf.export.actor import Actor
+from sb3_saf.export.act import Actor
 from sb3_saf.inspection.figures import png
 from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, record_episodes
 from sb3_saf.teams.checks import check_count
@@ -216,7 +216,7 @@ def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
 
 def _play_actor(actor: Actor, env: VecEnv, episodes: int, seed: int, deterministic: bool) -> list[_Episode]:
     """Play one episode of each game with an exported actor, on own observations and masks."""
-    if actor.has_memory or actor.manifest.reads_agent:
+    if actor.has_memory or actor.reads_agent:
         raise ValueError(
             "expected an exported actor without memory and heads per agent to replay; replay the model that it "
             "was exported from"

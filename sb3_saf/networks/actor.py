@@ -12,14 +12,24 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
-from sb3_saf.networks.distributions import mixture_log_probs, n_action_parameters, policy_parameters
+from sb3_saf.networks.distributions import (
+    SelectedDistribution,
+    distribution_of,
+    masked_parameters,
+    mixture_log_probs,
+    mixture_of,
+    n_action_outputs,
+    n_action_parameters,
+    policy_parameters,
+)
 from sb3_saf.networks.layers import AgentHeads, mlp, side_by_side
-from sb3_saf.networks.spaces import AnySpace, spec_of
 
 #: Orthogonal gain of the last layer: initial policies are close to uniform.
 ACTION_GAIN = 0.01
@@ -56,15 +66,14 @@ class ActionHead(nn.Module):
     def __init__(
         self,
         features_dim: int,
-        action_space: AnySpace,
+        action_space: spaces.Space[Any],
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
         log_std_init: float,
     ):
         super().__init__()
-        space = spec_of(action_space)
-        n_outputs = space.n_outputs
-        if space.kind == "box":
+        n_outputs = n_action_outputs(action_space)
+        if isinstance(action_space, spaces.Box):
             self.log_std = nn.Parameter(th.full((n_outputs,), log_std_init))
         else:
             self.register_parameter("log_std", None)
@@ -90,9 +99,9 @@ class ActorNetwork(nn.Module, ABC):
     :param n_identities: N if the network reads the agent's index as a one-hot vector beside the features; else 0
     """
 
-    def __init__(self, action_space: AnySpace, reads_agent: bool, n_identities: int = 0):
+    def __init__(self, action_space: spaces.Space[Any], reads_agent: bool, n_identities: int = 0):
         super().__init__()
-        self.space = spec_of(action_space)
+        self.action_space = action_space
         self.reads_agent = reads_agent
         self.n_identities = n_identities
 
@@ -141,6 +150,17 @@ class ActorNetwork(nn.Module, ABC):
         """
         return self(features, agent)
 
+    def distribution(self, parameters: th.Tensor, masks: th.Tensor | None = None) -> Distribution:
+        """
+        Make the distribution of the network's output.
+
+        :param parameters: (B, P') of :meth:`forward`, or with masks of :meth:`unmixed`
+        :param masks: (B, M) bool, allowed choices; None if all are
+        """
+        if masks is not None:
+            parameters = masked_parameters(self.action_space, parameters, masks)
+        return distribution_of(self.action_space, parameters)
+
 
 class SinglePolicy(ActorNetwork):
     """
@@ -158,7 +178,7 @@ class SinglePolicy(ActorNetwork):
     def __init__(
         self,
         features_dim: int,
-        action_space: AnySpace,
+        action_space: spaces.Space[Any],
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
         log_std_init: float = 0.0,
@@ -215,7 +235,7 @@ class PolicyPool(ActorNetwork):
     def __init__(
         self,
         features_dim: int,
-        action_space: AnySpace,
+        action_space: spaces.Space[Any],
         hidden: Sequence[int],
         activation_fn: type[nn.Module],
         n_policies: int,
@@ -242,7 +262,7 @@ class PolicyPool(ActorNetwork):
         policies = [cast(ActionHead, policy) for policy in self.policies]
         (queries,), actions = side_by_side([[self.query_net], [policy.net for policy in policies]], features)
         logits = self.signature_keys @ queries.t() * self.signature_keys.shape[1] ** -0.5
-        if self.space.kind == "box":
+        if isinstance(self.action_space, spaces.Box):
             log_stds = th.stack([cast(nn.Parameter, policy.log_std) for policy in policies])
             actions = th.cat([actions, log_stds.unsqueeze(1).expand_as(actions)], dim=2)
         return PoolOutput(logits.log_softmax(dim=0).t(), actions.transpose(0, 1))
@@ -271,12 +291,28 @@ class PolicyPool(ActorNetwork):
         :param parameters: (B, U + U P)
         """
         log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
-        return PoolOutput(log_weights, flat.reshape(-1, self.n_policies, n_action_parameters(self.space)))
+        return PoolOutput(log_weights, flat.reshape(-1, self.n_policies, n_action_parameters(self.action_space)))
+
+    def distribution(self, parameters: th.Tensor, masks: th.Tensor | None = None) -> Distribution:
+        """See :class:`ActorNetwork`."""
+        if masks is None and self.is_categorical_mixture:
+            return distribution_of(self.action_space, parameters)
+        log_weights, actions = self.split(parameters)
+        if masks is not None:
+            # Masked before mixing, so that masks do not change the selection of policies.
+            actions = masked_parameters(self.action_space, actions, masks)
+        if self.selection == "mixture":
+            return mixture_of(self.action_space, log_weights, actions)
+        favourite = policy_parameters(actions, log_weights.argmax(dim=1))
+        return SelectedDistribution(
+            drawn=distribution_of(self.action_space, draw_policy(log_weights, actions)),
+            favourite=distribution_of(self.action_space, favourite),
+        )
 
     @property
     def is_categorical_mixture(self) -> bool:
         """Whether the mixture is a single categorical, which is then computed before rows are gathered."""
-        return self.selection == "mixture" and self.space.kind == "discrete"
+        return self.selection == "mixture" and isinstance(self.action_space, spaces.Discrete)
 
 
 def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:

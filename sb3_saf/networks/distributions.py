@@ -1,5 +1,6 @@
 """
-Action distributions of single policies and of pools of policies, in pure torch: likelihoods, masks, samples, modes.
+Action distributions of single policies and of pools of policies: likelihoods, masks, samples, modes, as SB3's
+distributions.
 
 A policy's parameters are one vector per row: logits (Discrete, MultiDiscrete, MultiBinary), or means and then log
 standard deviations (Box). A pool is given by log weights (B, U), normalised, and the parameters of all its policies
@@ -10,15 +11,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from math import prod
-from typing import Final
+from math import isnan, prod
+from typing import Any, ClassVar, Final, cast
 
 import torch as th
-from torch.distributions import Bernoulli, Categorical, Distribution, Normal
+from gymnasium import spaces
+from stable_baselines3.common.distributions import (
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    Distribution,
+    kl_divergence,
+    make_proba_distribution,
+)
+from torch import nn
+from torch.distributions import Bernoulli, Categorical, Normal, register_kl
+from torch.distributions import Distribution as TorchDistribution
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from sb3_saf.networks.spaces import AnySpace, SpaceSpec, spec_of
+from sb3_saf.teams.errors import NonFiniteError
 
 #: Maximum number of joint actions for which a pool's entropy and most likely action are enumerated.
 MAX_ENUMERATED_ACTIONS: Final = 4096
@@ -28,18 +39,44 @@ _ENUMERATED_AT_ONCE: Final = 1 << 22
 _FORBIDDEN: Final = -1e8
 
 
-def n_action_parameters(action_space: AnySpace) -> int:
+def choices_of(action_space: spaces.Space[Any]) -> tuple[int, ...]:
     """
-    Count P, the parameters of one policy's distribution.
+    Return the number of choices of each action dimension, of which a Box has none.
 
-    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param action_space: Discrete, MultiDiscrete (of one axis), MultiBinary or Box
     :raises ValueError: for any other space
     """
-    space = spec_of(action_space)
-    return space.n_outputs * (2 if space.kind == "box" else 1)
+    if isinstance(action_space, spaces.Box):
+        return ()
+    if isinstance(action_space, spaces.Discrete):
+        return (int(action_space.n),)
+    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) == 1:
+        return tuple(action_space.nvec.tolist())
+    if isinstance(action_space, spaces.MultiBinary):
+        return (2,) * prod(action_space.shape)
+    raise ValueError(
+        f"expected a Discrete, MultiDiscrete (of one axis), MultiBinary or Box space, got {action_space}; flatten it "
+        "in a wrapper of the environment"
+    )
 
 
-def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.Tensor) -> th.Tensor:
+def n_action_outputs(action_space: spaces.Space[Any]) -> int:
+    """Count the outputs of a policy's last layer; see :func:`choices_of`."""
+    choices = choices_of(action_space)
+    return sum(choices) if is_one_hot(action_space) else prod(action_space.shape or ())
+
+
+def n_action_parameters(action_space: spaces.Space[Any]) -> int:
+    """Count P, the parameters of one policy's distribution; see :func:`choices_of`."""
+    return n_action_outputs(action_space) * (2 if isinstance(action_space, spaces.Box) else 1)
+
+
+def is_one_hot(action_space: spaces.Space[Any]) -> bool:
+    """Return whether each action dimension has a logit for every choice."""
+    return isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete))
+
+
+def masked_parameters(action_space: spaces.Space[Any], parameters: th.Tensor, masks: th.Tensor) -> th.Tensor:
     """
     Mask illegal choices in the parameters of policies.
 
@@ -52,19 +89,19 @@ def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.T
     :return: as ``parameters``
     :raises ValueError: if the masks have a wrong shape, or the action space is a Box
     """
-    space = spec_of(action_space)
-    if space.kind == "box":
+    choices = choices_of(action_space)
+    if isinstance(action_space, spaces.Box):
         raise ValueError(f"continuous actions cannot be masked, got {action_space}")
-    if masks.shape != (parameters.shape[0], sum(space.choices)):
+    if masks.shape != (parameters.shape[0], sum(choices)):
         raise ValueError(
-            f"expected action masks of shape {(parameters.shape[0], sum(space.choices))}, one flag for each choice of "
+            f"expected action masks of shape {(parameters.shape[0], sum(choices))}, one flag for each choice of "
             f"{action_space}, got {tuple(masks.shape)}; let the environment's action_masks give that"
         )
-    if space.kind == "multi_binary":
+    if isinstance(action_space, spaces.MultiBinary):
         off, on = masks.unflatten(1, (-1, 2)).unbind(dim=2)
         kept, otherwise = off & on, _FORBIDDEN * (off.to(parameters.dtype) - on.to(parameters.dtype))
     else:
-        some = [part.any(dim=1, keepdim=True).expand_as(part) for part in th.split(masks, list(space.choices), dim=1)]
+        some = [part.any(dim=1, keepdim=True).expand_as(part) for part in th.split(masks, list(choices), dim=1)]
         kept, otherwise = masks, _FORBIDDEN * th.cat(some, dim=1).to(parameters.dtype)
     if parameters.dim() == 3:
         kept, otherwise = kept.unsqueeze(1), otherwise.unsqueeze(1)
@@ -74,23 +111,7 @@ def masked_parameters(action_space: AnySpace, parameters: th.Tensor, masks: th.T
 # --- one policy -------------------------------------------------------------------------------------------------------
 
 
-def sample_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
-    """
-    Draw an action of one policy per row, with the same random numbers as SB3's distributions.
-
-    :param action_space: the action space
-    :param parameters: (B, P)
-    :return: (B, D)
-    """
-    space = spec_of(action_space)
-    factors = _factors(space, parameters)
-    if space.is_one_hot:
-        return th.stack([factor.sample() for factor in factors], dim=1)
-    (joint,) = factors
-    return joint.rsample() if space.kind == "box" else joint.sample()
-
-
-def likeliest_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor:
+def likeliest_action(action_space: spaces.Space[Any], parameters: th.Tensor) -> th.Tensor:
     """
     Return the most likely action of one policy per row.
 
@@ -98,15 +119,14 @@ def likeliest_action(action_space: AnySpace, parameters: th.Tensor) -> th.Tensor
     :param parameters: (B, P)
     :return: (B, D)
     """
-    space = spec_of(action_space)
-    if space.kind == "box":
+    if isinstance(action_space, spaces.Box):
         return parameters.chunk(2, dim=-1)[0]
-    if space.kind == "multi_binary":
+    if isinstance(action_space, spaces.MultiBinary):
         return parameters.sigmoid().round()
-    return th.stack([part.softmax(dim=1).argmax(dim=1) for part in _split(space, parameters)], dim=1)
+    return th.stack([part.softmax(dim=1).argmax(dim=1) for part in _split(action_space, parameters)], dim=1)
 
 
-def policy_log_probs(action_space: AnySpace, parameters: th.Tensor, actions: th.Tensor) -> th.Tensor:
+def policy_log_probs(action_space: spaces.Space[Any], parameters: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """
     Compute log-likelihoods under every policy of a pool.
 
@@ -115,31 +135,92 @@ def policy_log_probs(action_space: AnySpace, parameters: th.Tensor, actions: th.
     :param actions: (B, D)
     :return: (B, U)
     """
-    space = spec_of(action_space)
     actions = actions.reshape(parameters.shape[0], 1, -1)
-    if not space.is_one_hot:
-        (joint,) = _factors(space, parameters)
-        return joint.log_prob(actions).sum(dim=2)
+    if isinstance(action_space, spaces.Box):
+        mean, log_std = parameters.chunk(2, dim=-1)
+        return Normal(mean, log_std.exp(), validate_args=False).log_prob(actions).sum(dim=2)
+    if isinstance(action_space, spaces.MultiBinary):
+        return Bernoulli(logits=parameters, validate_args=False).log_prob(actions).sum(dim=2)
     log_probs = [
         (logits - logits.logsumexp(dim=2, keepdim=True)).gather(2, action.expand(-1, parameters.shape[1], 1))
-        for logits, action in zip(_split(space, parameters), actions.long().split(1, dim=2), strict=True)
+        for logits, action in zip(_split(action_space, parameters), actions.long().split(1, dim=2), strict=True)
     ]
     return th.cat(log_probs, dim=2).sum(dim=2)
 
 
-def _factors(space: SpaceSpec, parameters: th.Tensor) -> list[Distribution]:
-    """Return torch's distributions: one for all dimensions (Box, MultiBinary), or one for each."""
-    if space.kind == "box":
-        mean, log_std = parameters.chunk(2, dim=-1)
-        return [Normal(mean, log_std.exp(), validate_args=False)]
-    if space.kind == "multi_binary":
-        return [Bernoulli(logits=parameters, validate_args=False)]
-    return [Categorical(logits=part, validate_args=False) for part in _split(space, parameters)]
-
-
-def _split(space: SpaceSpec, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
+def _split(action_space: spaces.Space[Any], parameters: th.Tensor) -> tuple[th.Tensor, ...]:
     """Return the logits of each action dimension."""
-    return th.split(parameters, list(space.choices), dim=-1)
+    return th.split(parameters, list(choices_of(action_space)), dim=-1)
+
+
+def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> Distribution:
+    """
+    Make SB3's distribution of a single policy.
+
+    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param parameters: (B, P)
+    """
+    if isinstance(action_space, spaces.Discrete):
+        return LeanCategorical(int(action_space.n)).proba_distribution(parameters)
+    distribution: Any = make_proba_distribution(action_space)
+    if isinstance(distribution, DiagGaussianDistribution):
+        mean, log_std = parameters.chunk(2, dim=1)
+        distribution.proba_distribution(mean, log_std)
+    else:
+        distribution.proba_distribution(action_logits=parameters)
+    return cast(Distribution, distribution)
+
+
+class LeanCategorical(CategoricalDistribution):
+    """
+    SB3's distribution of Discrete actions, with equal results in a third of the time: PyTorch's is created on access.
+
+    :param action_dim: number of actions, A
+    """
+
+    log_probs: th.Tensor
+
+    def proba_distribution(self, action_logits: th.Tensor) -> LeanCategorical:
+        """Set the parameters, logits (B, A)."""
+        # With rows last in memory, inner loops run over many rows instead of few actions.
+        return self.of_log_probs(action_logits.t().contiguous().log_softmax(dim=0).t())
+
+    def of_log_probs(self, log_probs: th.Tensor) -> LeanCategorical:
+        """Set the parameters, normalised log-probabilities (B, A)."""
+        self.log_probs = log_probs
+        return self
+
+    @property
+    def distribution(self) -> Categorical:  # type: ignore[override]  # SB3's attribute
+        """PyTorch's distribution, for TRPO's KL divergence."""
+        return Categorical(logits=self.log_probs, validate_args=False)
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """Return log-likelihoods (B,) of actions (B,)."""
+        return self.log_probs.gather(1, actions.long().reshape(-1, 1)).squeeze(1)
+
+    def entropy(self) -> th.Tensor:
+        """Return entropies (B,)."""
+        return -(self.log_probs.exp() * self.log_probs).sum(dim=1)
+
+    def sample(self) -> th.Tensor:
+        """
+        Sample actions (B,), those of ``torch.multinomial`` from the same random numbers.
+
+        :raises NonFiniteError: for NaN
+        """
+        probabilities = self.log_probs.exp()
+        if isnan(probabilities.sum().item()):
+            raise NonFiniteError(
+                "the probabilities of actions are NaN: the policy's parameters, or its observations, are; check the "
+                "observations' range, lower the learning rate, or set max_grad_norm"
+            )
+        # The first of A exponential clocks with rates p: action a with probability p_a.
+        return (probabilities / th.empty_like(probabilities).exponential_()).argmax(dim=1)
+
+    def mode(self) -> th.Tensor:
+        """Return the most likely actions (B,)."""
+        return self.log_probs.argmax(dim=1)
 
 
 # --- a pool of policies -----------------------------------------------------------------------------------------------
@@ -171,7 +252,7 @@ def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
 
 
 def mixture_log_prob(
-    action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor, actions: th.Tensor
+    action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor, actions: th.Tensor
 ) -> th.Tensor:
     """
     Return the exact log-likelihood of a mixture: log sum_u w_u pi_u(a).
@@ -185,7 +266,7 @@ def mixture_log_prob(
     return (log_weights + policy_log_probs(action_space, parameters, actions)).logsumexp(dim=1)
 
 
-def mixture_sample(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+def mixture_sample(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
     """
     Draw a policy by its weight, then its action.
 
@@ -195,16 +276,16 @@ def mixture_sample(action_space: AnySpace, log_weights: th.Tensor, parameters: t
     :return: (B, D)
     """
     drawn = th.multinomial(log_weights.exp(), 1).squeeze(1)
-    return sample_action(action_space, policy_parameters(parameters, drawn))
+    return distribution_of(action_space, policy_parameters(parameters, drawn)).sample()
 
 
-def is_enumerable(action_space: AnySpace) -> bool:
+def is_enumerable(action_space: spaces.Space[Any]) -> bool:
     """Return whether a mixture's entropy and most likely action are computed by enumerating joint actions."""
-    space = spec_of(action_space)
-    return space.kind != "box" and prod(space.choices) <= MAX_ENUMERATED_ACTIONS
+    choices = choices_of(action_space)
+    return bool(choices) and prod(choices) <= MAX_ENUMERATED_ACTIONS
 
 
-def mixture_mode(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+def mixture_mode(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
     """
     Return a mixture's most likely action, or that of its likeliest policy if actions cannot be enumerated.
 
@@ -213,16 +294,15 @@ def mixture_mode(action_space: AnySpace, log_weights: th.Tensor, parameters: th.
     :param parameters: (B, U, P)
     :return: (B, D)
     """
-    space = spec_of(action_space)
-    if not is_enumerable(space):
-        return likeliest_action(space, policy_parameters(parameters, log_weights.argmax(dim=1)))
-    best = _over_joint_actions(space, log_weights, parameters, _argmax)
-    joint_actions = th.tensor(list(product(*map(range, space.choices))), device=best.device)
+    if not is_enumerable(action_space):
+        return likeliest_action(action_space, policy_parameters(parameters, log_weights.argmax(dim=1)))
+    best = _over_joint_actions(action_space, log_weights, parameters, lambda joint: joint.argmax(dim=1))
+    joint_actions = th.tensor(list(product(*map(range, choices_of(action_space)))), device=best.device)
     # SB3's MultiBinary actions are floats.
-    return joint_actions[best].to(parameters.dtype if space.kind == "multi_binary" else th.int64)
+    return joint_actions[best].to(parameters.dtype if isinstance(action_space, spaces.MultiBinary) else th.int64)
 
 
-def mixture_entropy(action_space: AnySpace, log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor | None:
+def mixture_entropy(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor | None:
     """
     Return the entropy of a mixture by enumeration; None if actions cannot be enumerated.
 
@@ -231,43 +311,189 @@ def mixture_entropy(action_space: AnySpace, log_weights: th.Tensor, parameters: 
     :param parameters: (B, U, P)
     :return: (B,) or None
     """
-    space = spec_of(action_space)
-    return _over_joint_actions(space, log_weights, parameters, _entropy) if is_enumerable(space) else None
+    if not is_enumerable(action_space):
+        return None
+    return _over_joint_actions(action_space, log_weights, parameters, lambda joint: -(joint.exp() * joint).sum(dim=1))
 
 
 def _over_joint_actions(
-    space: SpaceSpec, log_weights: th.Tensor, parameters: th.Tensor, reduce: Callable[[th.Tensor], th.Tensor]
+    action_space: spaces.Space[Any],
+    log_weights: th.Tensor,
+    parameters: th.Tensor,
+    reduce: Callable[[th.Tensor], th.Tensor],
 ) -> th.Tensor:
     """Apply a function (rows, J) -> (rows,) to the mixture's joint log-probabilities, in chunks of bounded memory."""
 
     def part(log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        joint = _joint_log_probs(space, parameters)
+        joint = _joint_log_probs(action_space, parameters)
         return reduce((log_weights.unsqueeze(2) + joint).logsumexp(dim=1))
 
     if th.compiler.is_compiling():
         return part(log_weights, parameters)
-    rows_at_once = max(1, _ENUMERATED_AT_ONCE // (log_weights.shape[1] * prod(space.choices)))
+    rows_at_once = max(1, _ENUMERATED_AT_ONCE // (log_weights.shape[1] * prod(choices_of(action_space))))
     parts = list(zip(th.split(log_weights, rows_at_once), th.split(parameters, rows_at_once), strict=True))
     if len(parts) == 1:
         return part(*parts[0])
     return th.cat([checkpoint(part, *arguments, use_reentrant=False) for arguments in parts])
 
 
-def _joint_log_probs(space: SpaceSpec, parameters: th.Tensor) -> th.Tensor:
+def _joint_log_probs(action_space: spaces.Space[Any], parameters: th.Tensor) -> th.Tensor:
     """Return log-probabilities (B, U, J) of every joint action under every policy, last action dimension fastest."""
-    if space.kind == "multi_binary":
+    if isinstance(action_space, spaces.MultiBinary):
         factors = list(th.stack([F.logsigmoid(-parameters), F.logsigmoid(parameters)], dim=3).unbind(dim=2))
     else:
-        factors = [logits.log_softmax(dim=2) for logits in _split(space, parameters)]
+        factors = [logits.log_softmax(dim=2) for logits in _split(action_space, parameters)]
     joint = factors[0]
     for factor in factors[1:]:
         joint = (joint.unsqueeze(3) + factor.unsqueeze(2)).flatten(2)
     return joint
 
 
-def _entropy(log_probs: th.Tensor) -> th.Tensor:
-    return -(log_probs.exp() * log_probs).sum(dim=1)
+# --- pools as distributions of SB3 -----------------------------------------------------------------------------------
 
 
-def _argmax(log_probs: th.Tensor) -> th.Tensor:
-    return log_probs.argmax(dim=1)
+def mixture_of(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> Distribution:
+    """
+    Make the exact mixture of a pool of policies: pi(a|o) = sum_u w_u(o) pi_u(a|o).
+
+    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param log_weights: (B, U), normalised
+    :param parameters: (B, U, P)
+    """
+    if isinstance(action_space, spaces.Discrete):
+        return LeanCategorical(int(action_space.n)).of_log_probs(mixture_log_probs(log_weights, parameters))
+    return PoolDistribution(action_space).proba_distribution(log_weights, parameters)
+
+
+class _FromPool(Distribution):
+    """Methods of SB3's ``Distribution`` that pools share."""
+
+    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
+        """Raise an error: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
+        raise NotImplementedError("the parameters of a pool's distribution come from sb3_saf.networks.actor.PolicyPool")
+
+    def actions_from_params(self, *args: Any, deterministic: bool = False, **kwargs: Any) -> th.Tensor:
+        """Set the parameters (see ``proba_distribution``) and act."""
+        self.proba_distribution(*args, **kwargs)
+        return self.get_actions(deterministic=deterministic)
+
+    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
+        """Set the parameters (see ``proba_distribution``), sample, and return the sample and its log-likelihood."""
+        actions = self.actions_from_params(*args, **kwargs)
+        return actions, self.log_prob(actions)
+
+
+class PoolDistribution(_FromPool):
+    """
+    Mixture of a pool of policies over actions of several dimensions.
+
+    ``log_prob`` is exact. ``entropy`` and ``mode`` are exact for at most ``MAX_ENUMERATED_ACTIONS`` joint actions. For
+    more, and for Box actions, the entropy is None (no closed form; SB3 then estimates it by -log_prob), and the mode is
+    that of the likeliest policy.
+
+    :param action_space: MultiDiscrete, MultiBinary or Box
+    """
+
+    log_weights: th.Tensor
+    parameters: th.Tensor
+
+    def __init__(self, action_space: spaces.Space[Any]):
+        super().__init__()
+        self.action_space = action_space
+
+    def proba_distribution(self, log_weights: th.Tensor, parameters: th.Tensor) -> PoolDistribution:
+        """Set normalised log weights (B, U) and parameters (B, U, P)."""
+        self.log_weights, self.parameters = log_weights, parameters
+        return self
+
+    @property
+    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # SB3's attribute
+        """Joint distribution of policy and action, for TRPO's KL divergence."""
+        return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """Return log-likelihoods (B,) of actions (B, D)."""
+        return mixture_log_prob(self.action_space, self.log_weights, self.parameters, actions)
+
+    def entropy(self) -> th.Tensor | None:
+        """Return exact entropies (B,) by enumeration, or None."""
+        return mixture_entropy(self.action_space, self.log_weights, self.parameters)
+
+    def sample(self) -> th.Tensor:
+        """Draw a policy, then its action: (B, D)."""
+        return mixture_sample(self.action_space, self.log_weights, self.parameters)
+
+    def mode(self) -> th.Tensor:
+        """Return the most likely joint action (B, D), or the likeliest policy's mode if they cannot be enumerated."""
+        return mixture_mode(self.action_space, self.log_weights, self.parameters)
+
+
+class PolicyAndAction(TorchDistribution):
+    """
+    Joint distribution of the drawn policy and its action, with KL(w || w') + sum_u w_u KL(pi_u || pi'_u).
+
+    This is an upper bound of the KL divergence of the mixtures, which has no closed form, and zero for equal pools:
+    TRPO's trust region on it also bounds the mixtures.
+
+    :param log_weights: (B, U), normalised
+    :param policies: distribution of B * U rows, those of a mixture's policies consecutive
+    """
+
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, log_weights: th.Tensor, policies: Distribution):
+        super().__init__(log_weights.shape[:1], validate_args=False)
+        self.log_weights = log_weights
+        self.policies = policies
+
+
+@register_kl(PolicyAndAction, PolicyAndAction)
+def _divergence(one: PolicyAndAction, other: PolicyAndAction) -> th.Tensor:
+    """Return the divergence (B,), see :class:`PolicyAndAction`."""
+    weights = one.log_weights.exp()
+    # kl_divergence returns one number per row, or one per action dimension.
+    of_actions = kl_divergence(one.policies, other.policies).reshape(*weights.shape, -1).sum(dim=2)
+    return (weights * (one.log_weights - other.log_weights + of_actions)).sum(dim=1)
+
+
+class SelectedDistribution(_FromPool):
+    """
+    Distribution of the drawn policy; deterministic actions are those of the favourite policy.
+
+    :param drawn: distribution of the policy drawn for each row
+    :param favourite: distribution of the policy with the highest selection logit of each row
+    """
+
+    def __init__(self, drawn: Distribution, favourite: Distribution):
+        super().__init__()
+        self.drawn = drawn
+        self.favourite = favourite
+
+    @property
+    def distribution(self) -> TorchDistribution:  # type: ignore[override]  # SB3's attribute
+        """Raise an error: TRPO would compare policies drawn at different times."""
+        raise ValueError(
+            "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
+            "(TRPO's KL divergence) says nothing; use selection='mixture'"
+        )
+
+    def proba_distribution(self, *args: Any, **kwargs: Any) -> SelectedDistribution:
+        """Set the parameters of the drawn policy."""
+        self.drawn.proba_distribution(*args, **kwargs)
+        return self
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """Return log-likelihoods (B,) under the drawn policy."""
+        return self.drawn.log_prob(actions)
+
+    def entropy(self) -> th.Tensor | None:
+        """Return entropies (B,) of the drawn policy."""
+        return self.drawn.entropy()
+
+    def sample(self) -> th.Tensor:
+        """Sample from the drawn policy."""
+        return self.drawn.sample()
+
+    def mode(self) -> th.Tensor:
+        """Return the most likely action of the favourite policy."""
+        return self.favourite.mode()

@@ -1,54 +1,169 @@
 """
-Encoders: networks for one agent's own observation. Letters: K observations, C channels, H x W pixels, t pixels
-per tile, d features.
+Encoders of one agent's own observation, as SB3 features extractors. Letters: K observations, C channels, H x W pixels,
+t pixels per tile, d features.
 
-Each takes raw observations (uint8 pictures, tile codes, indices) as well as results of :func:`preprocess` (floats in
-[0, 1], one-hot vectors). *Tile codes* are integers with an atlas (n_codes, t, t, C) of the pixels of every code; they
-become pixels on the device of the network. Encoders of tile codes and of the same pictures have the same weights and
-features. Policies use them through ``sb3_saf.policies.extractors``, exported actors directly.
+Each takes raw observations (uint8 pictures, tile codes, indices) as well as results of SB3's ``preprocess_obs`` (floats
+in [0, 1], one-hot vectors). *Tile codes* are integers with an atlas (n_codes, t, t, C) of the pixels of every code.
+Encoders of tile codes and of the same pictures have the same weights and features. On the CPU, encoders of tile codes
+look up the tiles' contributions to their first layer instead of making pixels (``sb3_saf.networks.tile_sums``): the
+same features, up to the order of summation.
 """
 
 from __future__ import annotations
 
-from math import prod
-from typing import Final, Literal
+import warnings
+from collections.abc import Callable
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
 from sb3_saf.networks.layers import HIDDEN_GAIN, Linear, mlp
-from sb3_saf.networks.spaces import AnySpace, ObservationSpec, SpaceSpec, observation_spec
+from sb3_saf.networks.tile_sums import (
+    Places,
+    places_of_convolution,
+    places_of_linear,
+    rectified_sums,
+    table_of_convolution,
+    used_codes,
+)
 
-#: Smallest side of a picture for NatureCNN's convolutions.
+#: Smallest side of a picture for the paper's encoder, and for NatureCNN's convolutions.
+PAPER_PIXELS: Final = 8
 NATURE_PIXELS: Final = 36
+#: Smallest side of a picture that SB3 does not take for one: of two axes, or of floats.
+_UNMARKED_PIXELS: Final = 16
+#: Maximum pixels for which the paper's encoder is the default; beyond, it has more than 7 million weights.
+_PAPERS_PIXELS: Final = 64 * 64
+#: Numbers of pixels and weights above which a warning about slow training is issued.
+_MANY_PIXELS: Final = 128 * 128
+_MANY_WEIGHTS: Final = 10_000_000
+#: MLPs scale integers whose largest value is above the first limit; above the second, bounds say nothing.
+_WIDE: Final = 16
+_UNBOUNDED: Final = 1 << 16
 #: Value of one-hot codes, so that their norm is close to that of a tile's pixels.
 _ONE_HOT_SCALE: Final = 2.0
 
 
-def preprocess(observations: th.Tensor, space: SpaceSpec, normalize_images: bool = True) -> th.Tensor:
+class Picture(NamedTuple):
     """
-    Convert raw observations to floats, as SB3 does before it calls a features extractor.
+    Pictures of an observation space.
 
+    :param shape: C, H, W
+    :param layout: order of the axes; ``"plane"`` has height and width only, ``"codes"`` are tile codes
+    :param divisor: scales observations to [0, 1] after SB3's preprocessing
+    """
+
+    shape: tuple[int, int, int]
+    layout: Literal["codes", "plane", "channels_first", "channels_last"]
+    divisor: float
+
+
+def picture_of(space: spaces.Space[Any], asked: bool = False) -> Picture | None:
+    """
+    Describe the pictures of an observation space; None if it has none.
+
+    Pictures are tile codes, what SB3 takes for an image (uint8 of three axes, 0 to 255), and other Boxes of 0 to 255 or
+    of floats of 0 to 1 with two axes, or with three axes of which the smallest, the channels, is first or last.
+
+    :param space: space of own observations
+    :param asked: whether every Box of three axes counts as a picture
+    :raises ValueError: for a wrong atlas
+    """
+    if not isinstance(space, spaces.Box):
+        return None
+    shape = space.shape
+    if hasattr(space, "atlas"):
+        _, tile, _, channels = checked_atlas(space).shape
+        return Picture((channels, shape[0] * tile, shape[1] * tile), "codes", 1)
+    layout: Literal["plane", "channels_first", "channels_last"]
+    if len(shape) == 2:
+        layout, sizes = "plane", (1, *shape)
+    elif len(shape) == 3 and shape[0] == min(shape):
+        layout, sizes = "channels_first", shape
+    elif len(shape) == 3:
+        layout, sizes = "channels_last", (shape[2], *shape[:2])
+    else:
+        return None
+    if is_image_space(space):
+        return Picture(sizes, layout, 1)
+    bounds = space.low.min(), space.high.max()
+    of_bytes = bounds == (0, 255)
+    of_shares = bounds == (0, 1) and np.issubdtype(space.dtype, np.floating)
+    if (of_bytes or of_shares) and sizes[0] < min(sizes[1:]) and min(sizes[1:]) >= _UNMARKED_PIXELS:
+        return Picture(sizes, layout, 255 if of_bytes else 1)
+    return Picture(sizes, layout, 1) if asked and len(shape) == 3 else None
+
+
+def checked_atlas(space: Any) -> npt.NDArray[np.uint8]:
+    """Return the atlas of a space of tile codes, (n_codes, t, t, C); ValueError if it does not fit."""
+    atlas = np.asarray(space.atlas)
+    square = atlas.ndim == 4 and atlas.shape[1] == atlas.shape[2]
+    if not square or atlas.dtype != np.uint8 or len(space.shape) != 2 or int(space.high.max()) >= len(atlas):
+        raise ValueError(
+            "expected tile codes of shape (rows, columns) with an atlas (n_codes, tile, tile, channels) of uint8 that "
+            f"has every code, got {space} with an atlas of shape {atlas.shape} and dtype {atlas.dtype}"
+        )
+    return atlas
+
+
+class Part(NamedTuple):
+    """
+    Slice of a vector that holds one part of an observation.
+
+    :param start: first entry
+    :param stop: one after the last
+    :param picture: shape of the picture, None for scalars and vectors
+    """
+
+    start: int
+    stop: int
+    picture: tuple[int, ...] | None
+
+
+class PartsSpace(spaces.Box):
+    """
+    Pictures, scalars and vectors concatenated to one float32 vector. Encoders split it by ``parts``; pixels are 0 to
+    255.
+
+    :param flat: the vector, from ``gymnasium.spaces.flatten_space``
+    :param parts: the slices of the vector
+    """
+
+    def __init__(self, flat: spaces.Box, parts: tuple[Part, ...]) -> None:
+        super().__init__(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+        self.parts = parts
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether bounds and parts are equal."""
+        return isinstance(other, PartsSpace) and super().__eq__(other) and self.parts == other.parts
+
+    __hash__ = None  # type: ignore[assignment]  # as in every space with arrays
+
+
+class Encoder(BaseFeaturesExtractor):
+    """Base of the encoders that also take raw observations: tile codes reach them as integers."""
+
+
+def encoded(
+    module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any], normalize_images: bool
+) -> th.Tensor:
+    """
+    Apply an encoder to observations as SB3 preprocesses them; tile codes stay integers where it takes them.
+
+    :param module: (K, *shape), or one-hot vectors, to (K, ...)
     :param observations: (K, *shape)
     :param space: space of one observation
-    :param normalize_images: whether pictures of bytes are scaled to [0, 1]
-    :return: (K, *shape) float, or (K, n) one-hot vectors of Discrete and MultiDiscrete
+    :param normalize_images: whether SB3 divides images by 255
     """
-    if space.is_one_hot:
-        columns = observations.reshape(-1, len(space.choices)).long()
-        hot = [columns[:, i : i + 1] == th.arange(n, device=columns.device) for i, n in enumerate(space.choices)]
-        return th.cat(hot, dim=1).float()
-    floats = observations.float()
-    return floats / 255.0 if space.picture and normalize_images else floats
-
-
-class Encoder(nn.Module):
-    """Base of all encoders."""
-
-    def __init__(self) -> None:
-        # Not super(): in SB3's extractors that inherit from this class, the next class needs arguments.
-        nn.Module.__init__(self)
+    if isinstance(module, Encoder) and hasattr(space, "atlas"):
+        return module(observations)
+    return module(preprocess_obs(observations, space, normalize_images))
 
 
 class PixelInput(nn.Module):
@@ -57,48 +172,51 @@ class PixelInput(nn.Module):
 
     The result is a channels-first tensor with channels-last memory, for which convolutions are fastest.
 
-    :param observation: a Box of shape (C, H, W) or (H, W, C), or of tile codes (rows, columns)
+    :param space: see :func:`picture_of`
     """
 
     atlas: th.Tensor
 
-    def __init__(self, observation: ObservationSpec | AnySpace):
+    def __init__(self, space: spaces.Space[Any]):
         super().__init__()
-        space, atlas = observation_spec(observation)
-        self.layout: Literal["codes", "channels_first", "channels_last"]
-        if atlas is not None:
-            self.layout = "codes"
-            # Not part of the state dict: the atlas belongs to the space, and the weights also fit pictures. from_numpy,
-            # because it holds data even if networks are made on the device "meta".
-            self.register_buffer("atlas", th.from_numpy(np.array(atlas)).float() / 255.0, persistent=False)
-        elif space.kind != "box" or len(space.shape) != 3:
+        picture = picture_of(space, asked=True)
+        if picture is None:
             raise ValueError(
-                f"expected pictures, a Box of three axes, or tile codes with an atlas, got {space}; "
-                "use MLPEncoder or a features_extractor_class of your own"
+                "expected pictures, a Box of three axes or of two from 0 to 255, or tile codes with an atlas, got "
+                f"{space}; use MLPEncoder or a features_extractor_class of your own"
             )
-        else:
-            self.layout = "channels_first" if space.shape == space.picture_shape else "channels_last"
-        self.shape = space.picture_shape
+        self.shape, self.layout, self.divisor = picture
+        if self.layout == "codes":
+            # Not part of the state dict: the atlas belongs to the space, and the weights also fit pictures.
+            self.register_buffer("atlas", th.from_numpy(checked_atlas(space).copy()).float() / 255.0, persistent=False)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
         Return pictures.
 
-        :param observations: (K, C, H, W), (K, H, W, C) or codes (K, rows, columns); integers are in 0..255
+        :param observations: (K, C, H, W), (K, H, W, C), (K, H, W) or codes (K, rows, columns); integers are in 0..255
         :return: (K, C, H, W) float
         """
         if self.layout == "codes":
             tiles = self.atlas[observations.long()]  # (K, rows, columns, t, t, C)
             pictures = tiles.transpose(2, 3).reshape(-1, *self.shape[1:], self.shape[0])
             return pictures.permute(0, 3, 1, 2)
-        pictures = observations if observations.is_floating_point() else observations.float() / 255.0
-        if self.layout == "channels_last":
+        pictures = observations if observations.is_floating_point() else observations.float() / (255.0 / self.divisor)
+        if self.divisor != 1:
+            pictures = pictures / self.divisor
+        if self.layout == "plane":
+            pictures = pictures.unsqueeze(1)
+        elif self.layout == "channels_last":
             pictures = pictures.permute(0, 3, 1, 2)
         return pictures.contiguous(memory_format=th.channels_last)
 
     def tiles(self, codes: th.Tensor) -> th.Tensor:
         """Return pictures (U, C, t, t) of single tiles with codes (U,)."""
         return self.atlas[codes].permute(0, 3, 1, 2)
+
+    def looks_up(self, observations: th.Tensor) -> bool:
+        """Return whether a first layer looks tiles up: of codes on the CPU. On other devices products are cheaper."""
+        return self.layout == "codes" and observations.device.type == "cpu" and not th.compiler.is_compiling()
 
 
 class _FlattenPictures(nn.Flatten):
@@ -121,16 +239,16 @@ class PaperCNN(Encoder):
 
     A 28 x 28 x 3 view gives 2,304 numbers after the convolutions, and the encoder has 1,233,056 parameters.
 
-    :param observation: pictures (either layout) or tile codes
+    :param observation_space: pictures (any layout) or tile codes
     :param features_dim: size of the features
     """
 
-    def __init__(self, observation: ObservationSpec | AnySpace, features_dim: int = 64):
-        super().__init__()
-        self.pixels = PixelInput(observation)
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        super().__init__(observation_space, features_dim)
+        self.pixels = PixelInput(observation_space)
         channels, height, width = self.pixels.shape
-        out_height, out_width = _after_convolutions(height), _after_convolutions(width)
-        if min(out_height, out_width) < 1:
+        out_height, out_width = (((size - 4) // 2 + 1 - 3) // 2 + 1 for size in (height, width))
+        if min(height, width) < PAPER_PIXELS:
             raise ValueError(
                 f"PaperCNN needs pictures of at least 8 x 8 pixels, got {height} x {width}; use "
                 "features_extractor_class=sb3_saf.MLPEncoder or sb3_saf.LightEncoder, or larger pictures"
@@ -145,14 +263,19 @@ class PaperCNN(Encoder):
             nn.ReLU(inplace=True),
             Linear(512, features_dim, gain=HIDDEN_GAIN),
         )
+        self._places: Places | None = None
+        if self.pixels.layout == "codes" and (tile := self.pixels.atlas.shape[1]) % 2 == 0:
+            self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape) as (K, features_dim)."""
-        return self.net(self.pixels(observations))
-
-
-def _after_convolutions(size: int) -> int:
-    return ((size - 4) // 2 + 1 - 3) // 2 + 1 if size >= 4 else 0
+        if self._places is None or not self.pixels.looks_up(observations):
+            return self.net(self.pixels(observations))
+        first = self.net[0]
+        assert isinstance(first, nn.Conv2d) and first.bias is not None
+        used = used_codes(observations.flatten(1))
+        table = table_of_convolution(self.pixels.tiles(used.codes), first.weight, stride=2)
+        return self.net[2:](rectified_sums(used.views, table, first.bias, self._places))
 
 
 class NatureEncoder(Encoder):
@@ -163,47 +286,24 @@ class NatureEncoder(Encoder):
     Its strides are larger than the paper's and no wide layer follows: at 84 x 84 x 3 it has 0.3 million weights instead
     of ``PaperCNN``'s 13 million, and is six times faster; at 280 x 480 it has 7 million instead of 269 million.
 
-    :param observation: pictures (either layout) or tile codes, 36 x 36 pixels or more
+    :param observation_space: pictures (any layout) or tile codes, 36 x 36 pixels or more
     :param features_dim: size of the features
     """
 
-    def __init__(self, observation: ObservationSpec | AnySpace, features_dim: int = 64):
-        super().__init__()
-        self.pixels = PixelInput(observation)
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        super().__init__(observation_space, features_dim)
+        self.pixels = PixelInput(observation_space)
         _, height, width = self.pixels.shape
         if min(height, width) < NATURE_PIXELS:
             raise ValueError(
                 f"NatureEncoder needs pictures of at least {NATURE_PIXELS} x {NATURE_PIXELS} pixels, got {height} x "
                 f"{width}; use features_extractor_class=sb3_saf.PaperCNN"
             )
-        self.nature = _NatureCNN(self.pixels.shape, features_dim)
+        self.nature = NatureCNN(spaces.Box(0, 255, self.pixels.shape, np.uint8), features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape) as (K, features_dim)."""
         return self.nature(self.pixels(observations))
-
-
-class _NatureCNN(nn.Module):
-    """SB3's ``NatureCNN`` without SB3: the same parameter names and initial weights."""
-
-    def __init__(self, shape: tuple[int, int, int], features_dim: int):
-        super().__init__()
-        channels, height, width = shape
-        out = [(((size - 8) // 4 + 1 - 4) // 2 + 1 - 3) + 1 for size in (height, width)]
-        self.cnn = nn.Sequential(
-            nn.Conv2d(channels, 32, kernel_size=8, stride=4),
-            nn.ReLU(),
-            nn.Conv2d(32, 64, kernel_size=4, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(64, 64, kernel_size=3, stride=1),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
-        self.linear = nn.Sequential(nn.Linear(64 * prod(out), features_dim), nn.ReLU())
-
-    def forward(self, pictures: th.Tensor) -> th.Tensor:
-        """Encode pictures (K, C, H, W) as (K, d)."""
-        return self.linear(self.cnn(pictures))
 
 
 class LightEncoder(Encoder):
@@ -215,7 +315,7 @@ class LightEncoder(Encoder):
     Tiles with similar pixels have similar embeddings. With zones that is a disadvantage: an orange agent's actions
     differ from a red one's. ``one_hot_codes`` separates them.
 
-    :param observation: pictures (either layout) or tile codes
+    :param observation_space: pictures (any layout) or tile codes
     :param features_dim: size of the features
     :param tile_size: t, pixels per tile of pictures; tile codes have their own
     :param embedding_dim: size of a tile's embedding
@@ -229,17 +329,18 @@ class LightEncoder(Encoder):
 
     def __init__(
         self,
-        observation: ObservationSpec | AnySpace,
+        observation_space: spaces.Space[Any],
         features_dim: int = 64,
         tile_size: int = 4,
         embedding_dim: int = 16,
         hidden: int = 128,
         one_hot_codes: bool | None = None,
     ):
-        super().__init__()
-        self.pixels = PixelInput(observation)
-        self.one_hot_codes = self.pixels.layout == "codes" if one_hot_codes is None else one_hot_codes
-        self.tile_size = self.pixels.atlas.shape[1] if self.pixels.layout == "codes" else tile_size
+        super().__init__(observation_space, features_dim)
+        self.pixels = PixelInput(observation_space)
+        has_codes = self.pixels.layout == "codes"
+        self.one_hot_codes = has_codes if one_hot_codes is None else one_hot_codes
+        self.tile_size = self.pixels.atlas.shape[1] if has_codes else tile_size
         channels, height, width = self.pixels.shape
         if height % self.tile_size or width % self.tile_size:
             raise ValueError(
@@ -249,9 +350,13 @@ class LightEncoder(Encoder):
             )
         self.n_tiles = height * width // self.tile_size**2
         n_inputs = self.tile_size**2 * channels
-        if self.pixels.layout == "codes":
-            self.register_buffer("tile_inputs", self._inputs_of_codes(self.one_hot_codes), persistent=False)
-            n_inputs = self.tile_inputs.shape[1]
+        if has_codes:
+            inputs = self.pixels.atlas.flatten(1)
+            if self.one_hot_codes:
+                one_hot = th.from_numpy(np.eye(len(inputs), dtype=np.float32))
+                inputs = th.cat([inputs, _ONE_HOT_SCALE * one_hot], dim=1)
+            self.register_buffer("tile_inputs", inputs, persistent=False)
+            n_inputs = inputs.shape[1]
         elif self.one_hot_codes:
             raise ValueError(
                 'one_hot_codes=True needs tile codes, as make_team_env(..., observation="tiles") gives them (a Box of '
@@ -259,49 +364,167 @@ class LightEncoder(Encoder):
             )
         self.embed = Linear(n_inputs, embedding_dim, gain=HIDDEN_GAIN)
         self.net = mlp([self.n_tiles * embedding_dim, hidden, features_dim], nn.ReLU, output_gain=HIDDEN_GAIN)
+        self._places = places_of_linear(self.n_tiles)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape) as (K, features_dim)."""
+        if self.pixels.looks_up(observations):
+            return self.net[2:](self._first_layer(observations))
         if self.pixels.layout == "codes":
-            by_code = self.embed(self.tile_inputs)
-            tiles = nn.functional.embedding(observations.long().flatten(1), by_code)
+            tiles = nn.functional.embedding(observations.long().flatten(1), self.embed(self.tile_inputs))
         else:
-            tiles = self.embed(self._cut(self.pixels(observations)))
+            channels, height, width = self.pixels.shape
+            t = self.tile_size
+            cut = self.pixels(observations).reshape(-1, channels, height // t, t, width // t, t)
+            # Pixels in the order of an atlas: (K, tiles, t * t * C).
+            tiles = self.embed(cut.permute(0, 2, 4, 3, 5, 1).reshape(-1, self.n_tiles, t * t * channels))
         return self.net(tiles.flatten(1))
 
-    def _inputs_of_codes(self, one_hot: bool) -> th.Tensor:
-        """Return the embedding's inputs of every tile, (n_codes, inputs)."""
-        pixels = self.pixels.atlas.flatten(1)
-        return (
-            th.cat([pixels, _ONE_HOT_SCALE * th.from_numpy(np.eye(len(pixels), dtype=np.float32))], dim=1)
-            if one_hot
-            else pixels
-        )
-
-    def _cut(self, pictures: th.Tensor) -> th.Tensor:
-        """Cut pictures (K, C, H, W) into tiles (K, tiles, t * t * C), with pixels in the order of an atlas."""
-        channels, height, width = self.pixels.shape
-        t = self.tile_size
-        tiles = pictures.reshape(-1, channels, height // t, t, width // t, t).permute(0, 2, 4, 3, 5, 1)
-        return tiles.reshape(-1, self.n_tiles, t * t * channels)
+    def _first_layer(self, codes: th.Tensor) -> th.Tensor:
+        """Apply the first linear layer and its ReLU: codes (K, rows, columns) to (K, hidden)."""
+        first = self.net[0]
+        assert isinstance(first, nn.Linear)
+        used = used_codes(codes.flatten(1))
+        embedded = self.embed(self.tile_inputs[used.codes])
+        # Weights are (hidden, T * e); contributions of a code at each of the T places are (U, T, hidden).
+        by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
+        table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
+        return rectified_sums(used.views, table, first.bias, self._places)
 
 
 class MLPEncoder(Encoder):
     """
-    Encoder for vectors: linear 128, tanh, linear ``features_dim``. Integer spaces are read as one-hot vectors.
+    Encoder for vectors: linear 128, tanh, linear ``features_dim``. Integer spaces are read as one-hot vectors; Boxes of
+    integers beyond 16, such as bytes or distances, are divided by their largest value.
 
-    :param observation: Box (flattened), Discrete, MultiDiscrete or MultiBinary
+    :param observation_space: Box (flattened), Discrete, MultiDiscrete or MultiBinary
     :param features_dim: size of the features
     :param hidden: size of the hidden layer
     """
 
-    def __init__(self, observation: ObservationSpec | AnySpace, features_dim: int = 64, hidden: int = 128):
-        super().__init__()
-        self.space = observation_spec(observation).space
-        self.net = mlp([self.space.n_inputs, hidden, features_dim], nn.Tanh, output_gain=HIDDEN_GAIN)
+    divisor: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64, hidden: int = 128):
+        super().__init__(observation_space, features_dim)
+        if isinstance(observation_space, spaces.MultiDiscrete) and len(observation_space.shape) != 1:
+            raise ValueError(f"expected MultiDiscrete of one axis, got {observation_space}; flatten it in a wrapper")
+        self.space = observation_space
+        self.net = mlp([int(get_flattened_obs_dim(observation_space)), hidden, features_dim], nn.Tanh, HIDDEN_GAIN)
+        divisor = _divisor_of(observation_space)
+        self.is_scaled = divisor is not None
+        if divisor is not None:
+            self.register_buffer("divisor", th.from_numpy(divisor), persistent=False)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, *shape), raw or preprocessed, as (K, features_dim)."""
         if not observations.is_floating_point():
-            observations = preprocess(observations, self.space, normalize_images=False)
-        return self.net(observations.flatten(1))
+            observations = preprocess_obs(observations, self.space)  # type: ignore[assignment]
+        return self.net((observations / self.divisor if self.is_scaled else observations).flatten(1))
+
+
+def _divisor_of(space: spaces.Space[Any]) -> npt.NDArray[np.float32] | None:
+    """Return what scales a Box of wide integers or bytes to [-1, 1], in its shape; None for other spaces."""
+    if not isinstance(space, spaces.Box) or hasattr(space, "atlas") or is_image_space(space):
+        return None
+    largest = np.maximum(np.abs(space.low.astype(np.float64)), np.abs(space.high.astype(np.float64)))
+    of_bytes = (space.low == 0) & (space.high == 255)
+    is_wide = (largest > _WIDE) & (largest <= _UNBOUNDED) & (np.issubdtype(space.dtype, np.integer) | of_bytes)
+    return np.where(is_wide, largest, 1).astype(np.float32) if is_wide.any() else None
+
+
+class PartsEncoder(Encoder):
+    """
+    Encoder for pictures together with scalars and vectors: one encoder per picture (an MLP below 8 pixels), one
+    :class:`MLPEncoder` for the rest, then linear ``features_dim`` and ReLU.
+
+    :param observation_space: a :class:`PartsSpace`, which ``make_team_env`` makes of Dicts
+    :param features_dim: size of the features, of each encoder and of the output
+    :raises ValueError: for any other space
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        if not isinstance(observation_space, PartsSpace):
+            raise ValueError(f"expected pictures beside vectors in one PartsSpace, got {observation_space}")
+        super().__init__(observation_space, features_dim)
+        self.parts = observation_space.parts
+        pictures = [spaces.Box(0, 255, part.picture, np.uint8) for part in self.parts if part.picture is not None]
+        self.pictures = nn.ModuleList(_picture_encoder_class(space)(space, features_dim) for space in pictures)
+        rest = [i for part in self.parts if part.picture is None for i in range(part.start, part.stop)]
+        bounds = observation_space.low[rest], observation_space.high[rest]
+        self.rest = MLPEncoder(spaces.Box(*bounds, dtype=np.float32), features_dim) if rest else None
+        n_encoders = len(pictures) + bool(rest)
+        self.join = nn.Sequential(nn.Linear(n_encoders * features_dim, features_dim), nn.ReLU())
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Encode observations (K, n) as (K, features_dim)."""
+        slices = [observations[:, part.start : part.stop] for part in self.parts]
+        pictures = [
+            slice_.reshape(-1, *part.picture) / 255.0
+            for slice_, part in zip(slices, self.parts, strict=True)
+            if part.picture is not None
+        ]
+        features = [encoder(pixels) for encoder, pixels in zip(self.pictures, pictures, strict=True)]
+        if self.rest is not None:
+            vectors = [slice_ for slice_, part in zip(slices, self.parts, strict=True) if part.picture is None]
+            features.append(self.rest(th.cat(vectors, dim=1)))
+        return self.join(th.cat(features, dim=1))
+
+
+class ObservationEncoder(Encoder):
+    """
+    The default encoder, chosen by space.
+
+    Pictures and tile codes: :class:`PaperCNN`, or :class:`NatureEncoder` for more than 64 x 64 pixels; pictures beside
+    vectors: :class:`PartsEncoder`; other spaces: :class:`MLPEncoder`. Boxes of 0 to 255 and of floats of 0 to 1 count
+    as pictures if they have two axes, or two and one of channels, of at least 16 pixels; uint8 of three axes always.
+    Warns about pictures so large that training is slow with any encoder.
+
+    :param observation_space: one agent's own observation space
+    :param features_dim: size of the features
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
+        super().__init__(observation_space, features_dim)
+        self.encoder: BaseFeaturesExtractor = _encoder_class(observation_space)(observation_space, features_dim)
+        if not isinstance(self.encoder, (MLPEncoder, PartsEncoder)):
+            _warn_if_large(self.encoder, observation_space)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Encode observations (K, *shape) as (K, features_dim)."""
+        return self.encoder(observations)
+
+
+def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:
+    if isinstance(observation_space, PartsSpace):
+        return PartsEncoder
+    picture = picture_of(observation_space)
+    if picture is None:
+        return MLPEncoder
+    _, height, width = picture.shape
+    is_small = height * width <= _PAPERS_PIXELS or min(height, width) < NATURE_PIXELS
+    return PaperCNN if is_small else NatureEncoder
+
+
+def _picture_encoder_class(space: spaces.Box) -> type[BaseFeaturesExtractor]:
+    """As :func:`_encoder_class`, but an MLP for pictures too small for convolutions."""
+    picture = picture_of(space)
+    assert picture is not None
+    return MLPEncoder if min(picture.shape[1:]) < PAPER_PIXELS else _encoder_class(space)
+
+
+def _warn_if_large(encoder: BaseFeaturesExtractor, space: spaces.Space[Any]) -> None:
+    picture = picture_of(space)
+    assert picture is not None
+    _, height, width = picture.shape
+    n_weights = sum(parameter.numel() for parameter in encoder.parameters())
+    if height * width <= _MANY_PIXELS and n_weights <= _MANY_WEIGHTS:
+        return
+    warnings.warn(
+        f"observations of {space} have {height} x {width} pixels, for which {type(encoder).__name__} has "
+        f"{n_weights:,} weights and is slow. Shrink them in the environment (supersuit.resize_v1(env, 84, 84), "
+        'supersuit.color_reduction_v0(env, "B")), or choose another encoder, policy_kwargs={"features_extractor_class":'
+        ' ...}: sb3_saf.LightEncoder with features_extractor_kwargs={"tile_size": ...} for pictures made of tiles, or '
+        "one of your own",
+        UserWarning,
+        stacklevel=3,
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from math import prod
-from typing import Any, Final, NamedTuple, cast
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,6 @@ from numba import njit
 from sb3_saf.networks.layers import InOrder, Rows, gather
 
 _WORD: Final = 8  # bytes in a machine word
-#: Bytes of temporary words per step of the device path; limits memory, does not change the result.
-_HASH_CHUNK_BYTES: Final = 1 << 26
 
 
 class UniqueRows(NamedTuple):
@@ -40,24 +38,16 @@ def unique_rows(x: th.Tensor) -> UniqueRows:
     Find the unique rows of a batch, compared by their bytes: merged rows are bitwise equal. 0.0 and -0.0 count as
     different, which only costs time.
 
-    :param x: (B, ...) any dtype, any device
-    :return: K indices and their inverse, on the device of ``x``
+    :param x: (B, ...) any dtype, on the CPU
+    :return: K indices and their inverse
     """
-    x = x.detach()
-    if x.device.type == "cpu":
-        return _unique_on_cpu(_bytes_of_rows(x))
-    return _unique_on_device(_bytes_of_rows(x))
-
-
-def every_row(x: th.Tensor) -> UniqueRows:
-    """
-    Treat every row as unique, without a search.
-
-    :param x: (B, ...)
-    :return: index and inverse 0..B-1
-    """
-    rows = th.arange(len(x), device=x.device)
-    return UniqueRows(rows, rows)
+    words = np.require(_bytes_of_rows(x.detach()).numpy(), requirements="A").view(np.uint64)
+    index = np.empty(len(words), dtype=np.int64)
+    inverse = np.empty(len(words), dtype=np.int64)
+    # At most half full, for short probing; a power of two, so that a bit mask replaces the modulo.
+    table = np.full(1 << max(2, 2 * len(words) - 1).bit_length(), -1, dtype=np.int32)
+    count = _find_unique(words, table, np.empty(len(words), dtype=np.uint64), index, inverse)
+    return UniqueRows(th.from_numpy(index[:count].copy()), th.from_numpy(inverse))
 
 
 class EncodedRows(NamedTuple):
@@ -175,13 +165,24 @@ class RowEncoder:
     Encoder of the own observations of a batch.
 
     :param encode: (K, *shape) observations to (K, d) features
-    :param once: whether equal observations are encoded once; False encodes every row, with the same result
+    :param once: whether equal observations are encoded once; False encodes every row, with the same result, and so do
+        other devices than the CPU, on which encoding costs less than the search
     """
 
     def __init__(self, encode: Callable[[th.Tensor], th.Tensor], once: bool = True):
         self.encode = encode
         self.once = once
-        self.find = unique_rows if once else every_row
+
+    def find(self, x: th.Tensor) -> UniqueRows:
+        """
+        Find the unique rows of a batch, or all where each is encoded.
+
+        :param x: (B, ...)
+        """
+        if self.once and x.device.type == "cpu":
+            return unique_rows(x)
+        rows = th.arange(len(x), device=x.device)
+        return UniqueRows(rows, rows)
 
     def rows(self, observations: th.Tensor) -> EncodedRows:
         """
@@ -189,7 +190,7 @@ class RowEncoder:
 
         :param observations: (B, *shape)
         """
-        if not self.once:
+        if not self.once or observations.device.type != "cpu":
             return EncodedRows(observations, self.encode(observations), InOrder((len(observations),)))
         found = self.find(observations)
         unique = observations[found.index]
@@ -239,7 +240,7 @@ class RowEncoder:
         return gather(of_pairs, pairs.inverse)
 
 
-# --- equality of rows -------------------------------------------------------------------------------------------------
+# --- unique rows, in one pass with an open-addressing hash table ----------------------------------------------------
 
 
 def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
@@ -252,19 +253,6 @@ def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
         return th.nn.functional.pad(flat, (0, missing))
     # Words must be aligned in the storage, which a slice of bytes may not be.
     return flat.clone() if flat.storage_offset() % _WORD else flat
-
-
-# --- CPU: one pass with an open-addressing hash table -----------------------------------------------------------------
-
-
-def _unique_on_cpu(rows: th.Tensor) -> UniqueRows:
-    words = np.require(rows.numpy(), requirements="A").view(np.uint64)
-    index = np.empty(len(words), dtype=np.int64)
-    inverse = np.empty(len(words), dtype=np.int64)
-    # At most half full, for short probing; a power of two, so that a bit mask replaces the modulo.
-    table = np.full(1 << max(2, 2 * len(words) - 1).bit_length(), -1, dtype=np.int32)
-    count = _find_unique(words, table, np.empty(len(words), dtype=np.uint64), index, inverse)
-    return UniqueRows(th.from_numpy(index[:count].copy()), th.from_numpy(inverse))
 
 
 @njit(cache=True, nogil=True)
@@ -346,51 +334,3 @@ def _find_unique(
                 break
             slot = (slot + np.uint64(1)) & mask
     return count
-
-
-# --- other devices: 64-bit hashes, sorted, then every row compared with the first of its group ----------------------
-
-
-def _unique_on_device(rows: th.Tensor) -> UniqueRows:
-    """Find unique rows on any device, the CPU included."""
-    words = rows.view(th.int64)
-    proposal = _in_order_of_appearance(*th.unique(_hash_words(words), return_inverse=True))
-    if _confirmed(words, proposal):
-        return proposal
-    # Hash collision (probability about B^2 / 2^65): sort whole rows instead.
-    return _in_order_of_appearance(*th.unique(words, dim=0, return_inverse=True))
-
-
-def _hash_words(words: th.Tensor) -> th.Tensor:
-    """Return int64 hashes (B,) of words (B, W): a sum of mixed words, modulo 2^64."""
-    generator = np.random.default_rng(0x5AF)
-    low, high = np.iinfo(np.int64).min, np.iinfo(np.int64).max
-    factors = generator.integers(low, high, size=(2, words.shape[1]), dtype=np.int64) | 1
-    first, second = th.as_tensor(factors, device=words.device)
-    rows_at_once = max(1, _HASH_CHUNK_BYTES // (words.shape[1] * _WORD))
-    hashes = [_mix(_mix(part * first) * second).sum(dim=1) for part in th.split(words, rows_at_once)]
-    return _mix(th.cat(hashes)) if hashes else words.new_empty(0)
-
-
-def _mix(x: th.Tensor) -> th.Tensor:
-    return x ^ (x >> 32)
-
-
-def _in_order_of_appearance(values: th.Tensor, inverse: th.Tensor) -> UniqueRows:
-    """Renumber the sorted groups of ``th.unique`` by their first member."""
-    inverse = inverse.reshape(-1)
-    rows = th.arange(len(inverse), device=inverse.device)
-    first = rows.new_full((len(values),), len(inverse)).scatter_reduce(0, inverse, rows, "amin")
-    index, order = first.sort()
-    rank = th.empty_like(order)
-    rank[order] = th.arange(len(order), device=order.device)
-    return UniqueRows(index, rank[inverse])
-
-
-def _confirmed(words: th.Tensor, proposal: UniqueRows) -> bool:
-    rows_at_once = max(1, _HASH_CHUNK_BYTES // (words.shape[1] * _WORD))
-    stands_for = proposal.index[proposal.inverse]
-    same: Any = words.new_ones((), dtype=th.bool)
-    for part, other in zip(th.split(words, rows_at_once), th.split(stands_for, rows_at_once), strict=True):
-        same = same & (part == words[other]).all()
-    return bool(same)

@@ -112,7 +112,7 @@ def used_codes(views: th.Tensor) -> UsedCodes:
 
     :param views: (K, T) codes of any type on the CPU
     """
-    array = views.long().numpy()
+    array = (views.long() if views.is_floating_point() else views).numpy()
     seen = np.zeros(int(array.max()) + 1 if array.size else 0, dtype=np.bool_)
     _mark(array, seen)
     codes = np.flatnonzero(seen)

@@ -29,11 +29,10 @@ from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.distributions import masked_parameters
+from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, joined_rows, joined_teams
 from sb3_saf.networks.value_normalizer import ValueNormalizer
-from sb3_saf.policies.distributions import actor_distribution
-from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import TeamParts
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, entry_of, pop_named
 from sb3_saf.teams.checks import check_choice
@@ -356,7 +355,7 @@ class TeamPolicy(TeamRowsPolicy):
     def _distribution_of(self, apply: Callable[[Head], th.Tensor], masks: th.Tensor | None) -> Distribution:
         """Return the actor's distribution; ``apply`` calls a head for all rows, masks apply to every policy."""
         parameters = apply(self.actor if masks is None else self.actor.unmixed)
-        return actor_distribution(self.actor, self.action_space, parameters, masks)
+        return self.actor.distribution(parameters, masks)
 
     def _values(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
         """Return values (B, 1)."""

@@ -22,9 +22,9 @@ from sb3_saf.networks.critic import (
     TeamCritic,
     TeamStates,
 )
+from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import NetworkSpec, Rows, gather
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
-from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.parts import (
     AlgorithmSpec,
     CriticInput,

@@ -10,16 +10,15 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_saf.buffers.rollout import TeamMinibatch
+from sb3_saf.networks.encoders import encoded
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
-from sb3_saf.networks.spaces import pixels_to_codes
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.conversion import AgentConversion
+from sb3_saf.teams.conversion import AgentConversion, pixels_to_codes
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -402,13 +401,12 @@ class TeamRowsPolicy(BasePolicy):
     def _in_chunks(
         self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
     ) -> th.Tensor:
-        """Return outputs (K, ...) of a module for preprocessed observations (K, *shape)."""
+        """Return outputs (K, ...) of a module for observations (K, *shape), as SB3 preprocesses them."""
         size = self._chunk_size_of(module, len(observations)) if observations.device.type == "cpu" else None
         if size is None or len(observations) <= size:
-            return module(preprocess_obs(observations, space, self.normalize_images))
+            return encoded(module, observations, space, self.normalize_images)
         parts = th.split(observations, size)
-        results = [module(preprocess_obs(part, space, self.normalize_images)) for part in parts]
-        return th.cat(results)
+        return th.cat([encoded(module, part, space, self.normalize_images) for part in parts])
 
     def _chunk_size_of(self, module: object, n_observations: int) -> int | None:
         if self.chunk_size != "auto":

@@ -17,8 +17,8 @@ from torch import nn
 
 from sb3_saf.buffers.replay import TeamSteps
 from sb3_saf.networks.actor import ActorNetwork
+from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
-from sb3_saf.policies.extractors import ObservationEncoder
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, pop_named
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer

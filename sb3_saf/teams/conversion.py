@@ -3,16 +3,16 @@ One agent's observations, action masks and actions: from the form of the game to
 
 A conversion is plain data, known when the environment is made. It travels in the observation space
 (:class:`~sb3_saf.teams.rows.AgentSpace`), hence with every saved model, so that a model acts on what the game itself
-gives. Neither Gymnasium nor torch is imported to use one.
+gives, and with every exported actor. To use one needs NumPy only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from math import prod
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -25,7 +25,8 @@ Key: TypeAlias = str | int
 _ACTION_MASK = "action_mask"
 
 
-class Leaf(msgspec.Struct, frozen=True):
+@dataclass(frozen=True)
+class Leaf:
     """
     One array of a game's observation, or its action.
 
@@ -99,7 +100,8 @@ class Leaf(msgspec.Struct, frozen=True):
         return np.concatenate(codes)
 
 
-class AgentConversion(msgspec.Struct, frozen=True):
+@dataclass(frozen=True)
+class AgentConversion:
     """
     The conversion of one agent.
 
@@ -171,7 +173,7 @@ class AgentConversion(msgspec.Struct, frozen=True):
     def with_channels_first(self) -> AgentConversion:
         """Return the conversion for rows whose pictures have channels first, (H, W, C) -> (C, H, W)."""
         height, width, channels = self.shape
-        return msgspec.structs.replace(self, shape=(channels, height, width), channels_last=True)
+        return replace(self, shape=(channels, height, width), channels_last=True)
 
     def split(self, observation: Any) -> tuple[Any, Any]:
         """Return an observation of the game without its mask, and the mask; None if it has none."""
@@ -293,3 +295,38 @@ def _leaves(space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Iterator[Le
             yield from _leaves(part, (*path, key))
     else:
         yield Leaf.of(space, path)
+
+
+def pixels_to_codes(pictures: Array, atlas: Array) -> Array:
+    """
+    Convert pictures to tile codes, exactly.
+
+    With them an agent trained on tile codes can act on the game's pixels. Of several codes with equal pixels the first
+    is returned; for networks that read the pixels of codes these are equivalent.
+
+    :param pictures: (..., rows * t, columns * t, C) uint8, or channels first
+    :param atlas: (n_codes, t, t, C) uint8 pixels of every code
+    :return: (..., rows, columns) int64
+    :raises ValueError: if a picture has a tile that the atlas lacks
+    """
+    pictures, (n_codes, tile, _, channels) = np.asarray(pictures), atlas.shape
+    if pictures.ndim >= 3 and pictures.shape[-1] != channels and pictures.shape[-3] == channels:
+        pictures = np.moveaxis(pictures, -3, -1)
+    if pictures.ndim < 3 or pictures.dtype != np.uint8 or pictures.shape[-1] != channels:
+        raise ValueError(f"expected uint8 pictures of {channels} channels, got {pictures.dtype} of {pictures.shape}")
+    *batch, height, width, _ = pictures.shape
+    if height % tile or width % tile:
+        raise ValueError(f"expected pictures of whole tiles of {tile} pixels, got {height} x {width}")
+    cut = pictures.reshape(*batch, height // tile, tile, width // tile, tile, channels).swapaxes(-4, -3)
+    known: dict[bytes, int] = {}
+    for code in range(n_codes):
+        known.setdefault(atlas[code].tobytes(), code)
+    tiles = np.ascontiguousarray(cut).reshape(-1, tile * tile * channels)
+    codes = [known.get(pixels.tobytes(), -1) for pixels in tiles]
+    if -1 in codes:
+        column, row = codes.index(-1) % (width // tile), codes.index(-1) // (width // tile) % (height // tile)
+        raise ValueError(
+            f"the tile in row {row}, column {column} is none of the {n_codes} tiles that this agent was trained on; "
+            "give it pictures of the same game, drawn with the same colours and tile size"
+        )
+    return np.array(codes, dtype=np.int64).reshape(*batch, height // tile, width // tile)

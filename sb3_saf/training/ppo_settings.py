@@ -72,7 +72,7 @@ def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str
 
 
 def _encoder_of(env: VecEnv) -> type[Any] | None:
-    from sb3_saf.policies.extractors import LightEncoder
+    from sb3_saf.networks.encoders import LightEncoder
 
     own: spaces.Space[Any] = TeamSpaces.from_observation_space(env.observation_space).own
     return LightEncoder if hasattr(own, "atlas") else None

@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from sb3_saf.export.actor import Actor
+from sb3_saf.export.act import Actor
 from sb3_saf.inspection.replay import replay
 from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.teams.errors import ExportError

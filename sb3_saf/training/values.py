@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_saf.buffers.rollout import TeamRolloutBuffer
-from sb3_saf.policies.extractors import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
+from sb3_saf.networks.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
 from sb3_saf.teams.checks import unknown_name
 
 #: Classes by name for each key that takes a class. Names are looked up here only; nothing is imported or evaluated.
