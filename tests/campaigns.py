@@ -91,8 +91,6 @@ CAMPAIGNS: Final = (
         1_000,
         "CHECKPOINT_DAMAGES={n}",
     ),
-    _mutated("exports", "mutated_exports tests/test_export.py", 1_000),
-    _mutated("models", "mutated_models tests/test_export.py", 1_000),
     _mutated("settings, levels and states, each", "mutated tests/test_mutations.py", 1_000),
     Campaign(
         "odd configurations under NUMBA_BOUNDSCHECK",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 
 from sb3_saf import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
-from sb3_saf.networks.encoders import PixelInput
-from sb3_saf.policies import extractors
+from sb3_saf.networks.encoders import Part, PartsSpace, PixelInput
 from tests.toy_teams import PICTURE, CodeSpace, samples
 
 CHANNELS_LAST = spaces.Box(0, 255, (12, 12, 3), np.uint8)
@@ -160,7 +160,7 @@ def test_one_hot_codes_tell_tiles_apart_that_look_alike(monkeypatch: pytest.Monk
     assert th.equal(*plain(views))
     first, second = looked_up = one_hot(views)
     assert (first - second).abs().max() > 0.01
-    monkeypatch.setattr(extractors, "looks_up", lambda *_: False)
+    monkeypatch.setattr(PixelInput, "looks_up", lambda *_: False)
     th.testing.assert_close(one_hot(views), looked_up, rtol=0, atol=1e-5)
 
 
@@ -180,6 +180,8 @@ def test_one_hot_codes_need_codes() -> None:
         spaces.Discrete(5),
         spaces.MultiDiscrete([2, 3]),
         spaces.MultiBinary(4),
+        spaces.Box(0, 255, (20, 16), np.uint8),
+        spaces.Box(0, 255, (3,), np.uint8),
     ],
 )
 def test_raw_observations_and_what_sb3_makes_of_them_give_the_same(space: spaces.Space[Any]) -> None:
@@ -200,11 +202,81 @@ def test_vectors_go_through_a_small_tanh_network() -> None:
     th.testing.assert_close(encoder(th.tensor([0, 1, 2])), expected)
 
 
-def test_default_encoder_is_chosen_by_space() -> None:
-    assert isinstance(ObservationEncoder(PICTURE).encoder, PaperCNN)
-    assert isinstance(ObservationEncoder(CodeSpace()).encoder, PaperCNN)
-    for space in (spaces.Box(0, 30, (7, 7, 3), np.float32), spaces.Box(0, 255, (9,), np.uint8), spaces.Discrete(2)):
-        assert isinstance(ObservationEncoder(space).encoder, MLPEncoder)
+SHARES = partial(spaces.Box, 0.0, 1.0, dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (PICTURE, PaperCNN),
+        (CodeSpace(), PaperCNN),
+        (spaces.Box(0, 255, (84, 84), np.uint8), NatureEncoder),
+        (spaces.Box(0, 255, (28, 28), np.uint8), PaperCNN),
+        (spaces.Box(0, 255, (40, 40, 3), np.float32), PaperCNN),
+        (spaces.Box(0, 255, (84, 84), np.int64), NatureEncoder),
+        (SHARES((4, 84, 84)), NatureEncoder),
+        (SHARES((16, 20)), PaperCNN),
+        (SHARES((10, 8)), MLPEncoder),  # rather ten things with eight properties
+        (spaces.Box(0, 255, (7, 7), np.uint8), MLPEncoder),
+        (spaces.Box(0, 30, (20, 20, 3), np.float32), MLPEncoder),
+        (spaces.Box(0, 1, (20, 20), np.int8), MLPEncoder),
+        (spaces.Box(0, 255, (9,), np.uint8), MLPEncoder),
+        (spaces.Discrete(2), MLPEncoder),
+    ],
+)
+def test_default_encoder_is_chosen_by_space(space: spaces.Space[Any], expected: type) -> None:
+    encoder = ObservationEncoder(space)
+    assert type(encoder.encoder) is expected
+    assert encoder(th.tensor(samples(space, 2))).shape == (2, 64)
+
+
+def outputs(encoder: BaseFeaturesExtractor, observations: np.ndarray, space: spaces.Space[Any]) -> th.Tensor:
+    """Return the features of observations as policies have them."""
+    prepared = preprocess_obs(th.as_tensor(observations), space)
+    assert isinstance(prepared, th.Tensor)
+    return encoder(prepared)
+
+
+@pytest.mark.parametrize(
+    ("space", "of_bytes"),
+    [
+        (spaces.Box(0, 255, (20, 16), np.uint8), lambda x: x[:, 0]),
+        (spaces.Box(0, 255, (20, 16), np.float32), lambda x: x[:, 0].astype(np.float32)),
+        (SHARES((20, 16)), lambda x: x[:, 0].astype(np.float32) / 255),
+        (SHARES((1, 20, 16)), lambda x: x.astype(np.float32) / 255),
+        (spaces.Box(0, 255, (20, 16, 1), np.float64), lambda x: x.transpose(0, 2, 3, 1).astype(np.float64)),
+    ],
+)
+def test_pictures_of_every_form_are_scaled_alike(
+    space: spaces.Space[Any], of_bytes: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    plain = spaces.Box(0, 255, (1, 20, 16), np.uint8)
+    encoder, expected = ObservationEncoder(space), ObservationEncoder(plain)
+    encoder.load_state_dict(expected.state_dict())
+    pictures = samples(plain, 5)
+    th.testing.assert_close(
+        outputs(encoder, of_bytes(pictures), space), outputs(expected, pictures, plain), rtol=0, atol=1e-5
+    )
+
+
+def test_wide_integers_are_scaled() -> None:
+    low, high = np.array([0, -500, 0, 0]), np.array([255, 1000, 16, 2**40])
+    wide, vector = spaces.Box(low, high, dtype=np.int64), spaces.Box(-1, 1, (4,), np.float32)
+    encoder, expected = ObservationEncoder(wide), ObservationEncoder(vector)
+    encoder.load_state_dict(expected.state_dict())
+    x = np.array([[51, -250, 3, 7], [255, 1000, 16, 0]])
+    scaled = (x / [255, 1000, 1, 1]).astype(np.float32)
+    th.testing.assert_close(outputs(encoder, x, wide), expected(th.tensor(scaled)), rtol=0, atol=1e-6)
+    narrow = ObservationEncoder(spaces.Box(0, 9, (4,), np.int64))
+    narrow.load_state_dict(expected.state_dict())
+    assert th.equal(narrow(th.tensor(x)), expected(th.tensor(x).float()))
+
+
+def test_bytes_beside_a_picture_are_scaled() -> None:
+    bounds = np.zeros(50), np.array([255] * 48 + [255, 1])
+    space = PartsSpace(spaces.Box(*bounds, dtype=np.float64), (Part(0, 48, (4, 4, 3)), Part(48, 50, None)))
+    encoder: Any = ObservationEncoder(space)
+    assert encoder.encoder.rest.divisor.tolist() == [255, 1]
 
 
 def test_bad_spaces_are_refused() -> None:
@@ -212,5 +284,5 @@ def test_bad_spaces_are_refused() -> None:
     small.atlas = small.atlas[:10]
     with pytest.raises(ValueError, match=r"an atlas \(n_codes, tile, tile, channels\).*has every code, got"):
         PaperCNN(small)
-    with pytest.raises(ValueError, match="expected pictures, a Box of three axes, or tile codes with an atlas, got"):
+    with pytest.raises(ValueError, match=r"expected pictures, .* or tile codes with an atlas, got Discrete"):
         PaperCNN(spaces.Discrete(3))

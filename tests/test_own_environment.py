@@ -9,9 +9,19 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import supersuit
+from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from sb3_saf import QPLEX, GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
+from sb3_saf import (
+    QPLEX,
+    GameStepsCallback,
+    RandomPolicy,
+    TeamRolloutBuffer,
+    evaluate_team,
+    make_team_env,
+    ppo_settings,
+)
 from sb3_saf.training.settings import load_settings
 from tests.toy_envs import CounterEnv, TellingEnv
 
@@ -274,3 +284,62 @@ def _played(env: Any) -> None:
     venv = make_team_env(env, n_envs=2, seed=0)
     venv.reset()
     venv.step(np.zeros(venv.num_envs, dtype=int))
+
+
+# --- large images -----------------------------------------------------------------------------------------------------
+
+
+class Stripes(CounterEnv):
+    """Two agents each see stripes in one of four directions in a large image, and are paid for naming it."""
+
+    def __init__(self) -> None:
+        super().__init__(n_agents=2, max_cycles=8)
+        self.rng = np.random.default_rng(0)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Box(0, 255, (120, 160, 3), np.uint8)
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Discrete(4)
+
+    def _pictures(self) -> dict[str, np.ndarray]:
+        self.directions = {agent: int(self.rng.integers(4)) for agent in self.possible_agents}
+        y, x = np.mgrid[:120, :160]
+        return {
+            agent: np.where(((y, x, y + x, y - x)[direction] + self.rng.integers(24)) // 12 % 2, 200, 100)
+            .astype(np.uint8)[:, :, np.newaxis]
+            .repeat(3, axis=2)
+            for agent, direction in self.directions.items()
+        }
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.rng = np.random.default_rng(seed)
+        return self._pictures(), super().reset(seed, options)[1]
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        rewards = {agent: float(actions[agent] == self.directions[agent]) for agent in actions}
+        _, _, *rest = super().step(actions)
+        return self._pictures(), rewards, *rest
+
+
+def test_the_advice_for_large_images_learns() -> None:
+    def game() -> Any:
+        return supersuit.resize_v1(supersuit.color_reduction_v0(Stripes(), "B"), 84, 84)
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*render_mode", UserWarning, "pettingzoo")
+        env = make_team_env(game, n_envs=4, seed=0)
+    model = PPO(
+        "IPPOPolicy",
+        env,
+        8e-4,
+        n_steps=16,
+        batch_size=32,
+        n_epochs=4,
+        gamma=0.0,
+        seed=0,
+        device="cpu",
+        rollout_buffer_class=TeamRolloutBuffer,
+    )
+    model.learn(1152)
+    assert evaluate_team(model, env, 10, deterministic=True).mean / 16 > 0.9

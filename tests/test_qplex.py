@@ -365,28 +365,24 @@ def test_evaluation_callback(tmp_path: Path) -> None:
 # --- export -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("policy", "kwargs", "onnx"),
-    [("QPLEXPolicy", {}, False), ("QPLEXPoolPolicy", {}, True), ("QPLEXPolicy", {"heads": "per_agent"}, False)],
-)
-def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], onnx: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("policy", "kwargs"), [("QPLEXPoolPolicy", {}), ("QPLEXPolicy", {"heads": "per_agent"})])
+def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], tmp_path: Path) -> None:
     env = make_team_env("TeamSupport", n_envs=4, n_agents=3, grid_size=9, n_treasures=3)
     model = make_model(env, policy, policy_kwargs={"features_extractor_class": LightEncoder} | kwargs).learn(60 * 3)
     # Heads must differ: a short training leaves their values close to zero.
     for parameter in model.policy.actor.parameters():
         parameter.data.add_(th.randn_like(parameter) * 0.3)
-    export_actors(model, tmp_path / "actor", onnx=onnx)
+    export_actors(model, tmp_path / "actor")
     obs = env.reset()
-    for runtime in ("torch", "onnx") if onnx else ("torch",):
-        for agent in range(3):
-            actor = Actor.load(tmp_path / "actor", agent=agent, runtime=runtime)
-            own = obs["obs"][agent::3]
-            expected = model.predict({"obs": own, "agent": np.full(4, agent)}, deterministic=True)[0]
-            assert np.array_equal(actor.act(own), expected)
-            assert np.array_equal(actor.act(own, deterministic=False), expected)
-            assert actor.act(own[0]) == expected[0]
-            with pytest.raises(ValueError, match="takes the best"):
-                actor.probabilities(own)
+    for agent in range(3):
+        actor = Actor.load(tmp_path / "actor", agent=agent)
+        own = obs["obs"][agent::3]
+        expected = model.predict({"obs": own, "agent": np.full(4, agent)}, deterministic=True)[0]
+        assert np.array_equal(actor.act(own), expected)
+        assert np.array_equal(actor.act(own, deterministic=False), expected)
+        assert actor.act(own[0]) == expected[0]
+        with pytest.raises(ValueError, match="highest value: nothing is drawn"):
+            actor.probabilities(own)
 
 
 def test_a_policy_of_ppo_is_refused_with_those_that_fit() -> None:
@@ -396,7 +392,7 @@ def test_a_policy_of_ppo_is_refused_with_those_that_fit() -> None:
 
 def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"its memory reads the agent's last action, too; act with model\.predict"):
-        export_actors(make_model(policy="QPLEXLstmPolicy"), tmp_path / "actor", onnx=False)
+        export_actors(make_model(policy="QPLEXLstmPolicy"), tmp_path / "actor")
 
 
 def test_exported_actors_keep_to_masks(tmp_path: Path) -> None:
@@ -404,7 +400,7 @@ def test_exported_actors_keep_to_masks(tmp_path: Path) -> None:
     with th.no_grad():
         for parameter in model.policy.actor.parameters():
             parameter.add_(th.randn_like(parameter))
-    actor = Actor.load(export_actors(model, tmp_path / "actor", onnx=False))
+    actor = Actor.load(export_actors(model, tmp_path / "actor"))
     rng = np.random.default_rng(0)
     own = model.get_env().reset()["obs"]  # type: ignore[union-attr, call-overload]
     chosen = set()

@@ -101,7 +101,7 @@ def test_methods_without_parts(policy: str, tmp_path: Path) -> None:
 
 
 def test_exported_actors_and_models_side_by_side(model: PPO, tmp_path: Path) -> None:
-    sb3_saf.export_actors(model, tmp_path / "actor", onnx=False)
+    sb3_saf.export_actors(model, tmp_path / "actor")
     players: dict[str, Any] = {"model": model, "<b>actor</b>": sb3_saf.Actor.load(tmp_path / "actor")}
     page = replay(players, make_env(), tmp_path / "page.html", deterministic=True)
     first, second = data_of(page)["runs"]
@@ -198,7 +198,7 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
         (["--model", "nowhere.zip"], "--model nowhere.zip is not there"),
         (["--model", "nowhere.zip", "--env", "Nothing-v0"], "--model nowhere.zip is not there"),
         (["--model", __file__, "--size", "huge"], "unknown size 'huge'"),
-        (["--model", __file__], "is not a model saved by Stable-Baselines3"),
+        (["--model", __file__], "does not hold the tensors of a saved model"),
     ],
 )
 def test_wrong_commands(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,9 +32,8 @@ from sb3_saf import (
 )
 from sb3_saf.envs.equal_spaces import EqualSpaces
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
-from sb3_saf.envs.space_reader import PartsSpace
 from sb3_saf.envs.team_reward import SharedReward
-from sb3_saf.networks.encoders import PaperCNN, PartsEncoder
+from sb3_saf.networks.encoders import PaperCNN, PartsEncoder, PartsSpace
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam
 from sb3_saf.suites.registry import find_task, suites
@@ -223,7 +222,7 @@ def test_a_struck_run_goes_on_bit_for_bit_and_its_team_is_exported_and_inspected
         assert th.equal(weights, again.policy.state_dict()[name]), name
     assert (tmp_path / "a" / "monitor.csv").read_text().splitlines()[1:]
 
-    export_actors(whole, tmp_path / "actor", onnx=False)
+    export_actors(whole, tmp_path / "actor")
     env = make_team_env(env_id, n_envs=2, seed=7)
     rows: Any = env.reset()
     own = [rows["obs"][row] for row in range(env.n_agents)]

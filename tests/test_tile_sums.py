@@ -11,6 +11,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_saf import LightEncoder, PaperCNN, make_vec_env
+from sb3_saf.networks.encoders import PixelInput
 from sb3_saf.networks.layers import mlp
 from sb3_saf.networks.tanh import Tanh
 from sb3_saf.networks.tile_sums import (
@@ -21,7 +22,6 @@ from sb3_saf.networks.tile_sums import (
     table_of_convolution,
     used_codes,
 )
-from sb3_saf.policies import extractors
 
 N_CODES = 11
 
@@ -93,7 +93,7 @@ def test_encoders_by_looking_up_and_by_pixels(
     encoder = encoder_class(space)
     results = []
     for looks_up in (True, False):
-        monkeypatch.setattr(extractors, "looks_up", lambda pixels, observations, answer=looks_up: answer)
+        monkeypatch.setattr(PixelInput, "looks_up", lambda pixels, observations, answer=looks_up: answer)
         encoder.zero_grad()
         features = encoder(codes)
         features.square().sum().backward()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,20 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_saf.networks import row_encoder
-from sb3_saf.networks.row_encoder import RowEncoder, UniqueRows, every_row, unique_rows
-
-Finder = Callable[[th.Tensor], UniqueRows]
-
-
-def on_cpu(x: th.Tensor) -> UniqueRows:
-    return row_encoder._unique_on_cpu(row_encoder._bytes_of_rows(x))
-
-
-def on_device(x: th.Tensor) -> UniqueRows:
-    return row_encoder._unique_on_device(row_encoder._bytes_of_rows(x))
-
-
-FINDERS = pytest.mark.parametrize("find", [on_cpu, on_device])
+from sb3_saf.networks.row_encoder import RowEncoder, UniqueRows, unique_rows
 
 
 def reference(x: th.Tensor) -> tuple[list[int], list[int]]:
@@ -52,7 +38,6 @@ def assert_matches_reference(x: th.Tensor, found: UniqueRows) -> None:
 DTYPES = [th.uint8, th.int64, th.float32, th.float64, th.bool, th.bfloat16]
 
 
-@FINDERS
 @given(
     n_rows=st.integers(1, 60),
     shape=st.sampled_from([(), (1,), (3,), (7, 7), (2, 4), (33,)]),
@@ -61,49 +46,39 @@ DTYPES = [th.uint8, th.int64, th.float32, th.float64, th.bool, th.bfloat16]
     seed=st.integers(0, 2**31),
 )
 def test_agrees_with_a_dict_of_bytes(
-    find: Finder, n_rows: int, shape: tuple[int, ...], dtype: th.dtype, n_values: int, seed: int
+    n_rows: int, shape: tuple[int, ...], dtype: th.dtype, n_values: int, seed: int
 ) -> None:
     generator = th.Generator().manual_seed(seed)
     pool = th.randint(0, 100, (n_values, *shape), generator=generator).to(dtype)
     x = pool[th.randint(n_values, (n_rows,), generator=generator)]
-    assert_matches_reference(x, find(x))
+    assert_matches_reference(x, unique_rows(x))
 
 
-@FINDERS
 @pytest.mark.parametrize("position", range(0, 41, 5))
-def test_one_differing_byte_is_seen_wherever_it_is(find: Finder, position: int) -> None:
+def test_one_differing_byte_is_seen_wherever_it_is(position: int) -> None:
     x = th.zeros(3, 41, dtype=th.uint8)
     x[1, position] = 128
-    found = find(x)
+    found = unique_rows(x)
     assert found.index.tolist() == [0, 1]
     assert found.inverse.tolist() == [0, 1, 0]
 
 
-@FINDERS
-def test_edges(find: Finder) -> None:
-    assert [part.tolist() for part in find(th.zeros(0, 3))] == [[], []]
-    assert [part.tolist() for part in find(th.zeros(2, 0))] == [[0], [0, 0]]
-    assert find(th.tensor([[0.0], [-0.0], [0.0]])).inverse.tolist() == [0, 1, 0]
-    assert find(th.tensor([[float("nan")], [float("nan")]])).inverse.tolist() == [0, 0]
+def test_edges() -> None:
+    assert [part.tolist() for part in unique_rows(th.zeros(0, 3))] == [[], []]
+    assert [part.tolist() for part in unique_rows(th.zeros(2, 0))] == [[0], [0, 0]]
+    assert unique_rows(th.tensor([[0.0], [-0.0], [0.0]])).inverse.tolist() == [0, 1, 0]
+    assert unique_rows(th.tensor([[float("nan")], [float("nan")]])).inverse.tolist() == [0, 0]
     transposed = th.arange(12).view(3, 4).t() // 6
-    assert_matches_reference(transposed, find(transposed))
+    assert_matches_reference(transposed, unique_rows(transposed))
     unaligned = th.randint(0, 2, (67,), dtype=th.uint8)[3:].view(8, 8)
-    assert_matches_reference(unaligned, find(unaligned))
+    assert_matches_reference(unaligned, unique_rows(unaligned))
 
 
 def test_exact_although_every_hash_collides(monkeypatch: pytest.MonkeyPatch) -> None:
     x = th.randint(0, 4, (60, 2))
     monkeypatch.setattr(row_encoder, "_hash_row", lambda words, row: np.uint64(7))
     monkeypatch.setattr(row_encoder, "_find_unique", row_encoder._find_unique.py_func)
-    assert_matches_reference(x, on_cpu(x))
-    monkeypatch.setattr(row_encoder, "_hash_words", lambda words: words.new_zeros(len(words)))
-    assert_matches_reference(x, on_device(x))
-
-
-def test_hashes_are_computed_in_parts_of_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    x = th.randint(0, 4, (60, 2))
-    monkeypatch.setattr(row_encoder, "_HASH_CHUNK_BYTES", 100)
-    assert_matches_reference(x, on_device(x))
+    assert_matches_reference(x, unique_rows(x))
 
 
 def test_input_is_left_alone_and_may_need_gradients() -> None:
@@ -115,11 +90,6 @@ def test_input_is_left_alone_and_may_need_gradients() -> None:
     assert x.grad is not None and x.grad.sum() == 60
 
 
-def test_every_row_takes_each_row_for_a_unique_one() -> None:
-    found = every_row(th.zeros(3, 2))
-    assert found.index.tolist() == found.inverse.tolist() == [0, 1, 2]
-
-
 class Counter:
     """An encoder that records its inputs."""
 
@@ -129,6 +99,15 @@ class Counter:
     def __call__(self, observations: th.Tensor) -> th.Tensor:
         self.calls.append(observations)
         return observations.float().flatten(1) * 2.0
+
+
+@pytest.mark.parametrize(("once", "device"), [(False, "cpu"), (True, "meta")])
+def test_without_a_search_every_row_is_encoded(once: bool, device: str) -> None:
+    counter = Counter()
+    x = th.zeros(3, 2, device=device)
+    encoder = RowEncoder(counter, once)
+    assert encoder.rows(x).of_rows().shape == (3, 2) and counter.calls[0] is x
+    assert [len(part) for part in encoder.find(x)] == [3, 3]
 
 
 #: Three rows of two teams that see 1, 2 and 3, 1; and the team of each row.

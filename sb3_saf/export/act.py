@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import copy
 import json
 from collections.abc import Mapping
 from os import PathLike
@@ -29,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 # export_actors writes this code in place of its import.
-from sb3_saf.teams.conversion import pixels_to_codes
+from sb3_saf.teams.conversion import AgentConversion, pixels_to_codes
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -38,11 +39,12 @@ class Memory:
     """
     Memory of an actor in an episode: its states (K, ...) by name, zeros at first; :meth:`Actor.act` updates them.
 
-    Make a new one for each episode.
+    Make a new one for each episode. Observations by agent have a memory each, in ``agents``.
     """
 
     def __init__(self) -> None:
         self.states: dict[str, Array] = {}
+        self.agents: dict[Any, Memory] = {}
 
 
 class Actor:
@@ -67,6 +69,8 @@ class Actor:
     def __init__(self, session: Any, description: Mapping[str, Any], agent: int | None = None):
         self.session, self.description, self.agent = session, description, agent
         self._rng = np.random.default_rng()
+        conversions = description["conversions"]
+        self._conversions = None if conversions is None else [AgentConversion.from_plain(one) for one in conversions]
         atlas = description["observation"]["atlas"]
         self._atlas = None
         if atlas is not None:
@@ -78,7 +82,8 @@ class Actor:
         Read an export.
 
         :param folder: written by ``sb3_saf.export_actors``
-        :param agent: index or name of the agent in its team; needed if the actor depends on it
+        :param agent: index or name of the agent in its team; needed if the actor depends on it, except for observations
+            by agent
         :raises ValueError: if the files are missing or damaged, or the agent is unknown
         """
         try:
@@ -124,31 +129,79 @@ class Actor:
         rng: int | np.random.Generator | None = None,
         action_mask: Any = None,
         memory: Memory | None = None,
-    ) -> Array:
+    ) -> Any:
         """
         Choose an action, by default that of ``model.predict(observation, deterministic=True)``. The default of
         ``predict`` itself is to sample.
 
-        :param observation: one own observation of the environment (pictures with channels first or last), or a batch of
-            them with one more axis. An actor of tile codes also takes the game's pixels. A dict in PettingZoo's form,
-            ``{"observation": ..., "action_mask": ...}``, gives both
+        :param observation: what the game gives: the agent's own observation, with or without its action mask, or
+            ``{agent: observation}``, alone or as ``(observations, infos)``. Dicts, Tuples and unequal spaces become
+            rows as in training, and actions are those of the game. Or own observations of rows, one or a batch. An
+            actor of tile codes also takes the game's pixels
         :param deterministic: whether to take the most likely action instead of sampling
         :param rng: seed or NumPy generator for sampling; None continues from the last call
-        :param action_mask: (M,) zeros and ones, or one more axis for a batch: legal choices, in the form of the
-            training masks. Required if the training environment's observations had masks
+        :param action_mask: (M,) zeros and ones, one more axis for a batch, or by agent: legal choices, in the form of
+            the training masks. Required if the training environment's observations had masks
         :param memory: memory of the episode, from :meth:`new_memory`, if the actor has one; it is updated. For a batch
             of K observations it holds K memories
-        :return: the action, or a batch of actions, as from ``predict``
+        :return: the action, or a batch of actions, as from ``predict``; ``{agent: action}`` for observations by agent
         :raises ValueError: for observations with a shape or dtype other than the observation space's, or not finite,
             and for invalid masks or memories
         """
+        team = self._by_agent(observation, action_mask)
+        if team is not None:
+            generator = None if deterministic else self._generator(rng)
+            memories = None if memory is None else memory.agents
+            return {
+                agent: self._of(agent).act(
+                    own,
+                    deterministic,
+                    generator,
+                    mask,
+                    None if memories is None else memories.setdefault(agent, Memory()),
+                )
+                for agent, (own, mask) in team.items()
+            }
+        conversion = self._conversion_of(observation)
         inputs, is_batch = self._inputs(observation, action_mask, memory)
         is_drawn = not deterministic and not self.description["greedy"]
         names = ["drawn" if is_drawn else "most_likely", *(f"next_{name}" for name in self.description["states"])]
         actions, *states = self._run(names, inputs, self._generator(rng) if is_drawn else None)
         if memory is not None:
             memory.states = dict(zip(self.description["states"], states, strict=True))
+        if conversion is not None:
+            return conversion.game_action(actions[0])
         return actions if is_batch else actions.squeeze(axis=0)
+
+    def _by_agent(self, observation: Any, action_mask: Any) -> dict[Any, tuple[Any, Any]] | None:
+        """Return observation and mask by agent; None for the observations of one agent."""
+        infos: Mapping[Any, Any] = {}
+        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], Mapping):
+            observation, infos = observation
+        names = self.description["agents"]
+        if names is None or not isinstance(observation, Mapping) or not observation or set(observation) - set(names):
+            return None
+        masks = {agent: (infos.get(agent) or {}).get("action_mask") for agent in observation}
+        masks |= {} if action_mask is None else dict(action_mask)
+        return {agent: (own, masks[agent]) for agent, own in observation.items()}
+
+    def _of(self, agent: object) -> Actor:
+        """Return the actor of another agent of the team."""
+        other = copy.copy(self)
+        other.agent = _index_of(agent, self.description)
+        return other
+
+    def _conversion_of(self, observation: Any) -> AgentConversion | None:
+        """Return the conversion of an observation from the form of the game; None for rows."""
+        if self._conversions is None:
+            return None
+        known = self._conversions if self.agent is None else [self._conversions[self.agent]]
+        fitting = [one for one in known if one.fits(observation)]
+        if not fitting or all(one == fitting[0] for one in fitting):
+            return fitting[0] if fitting else None
+        if np.shape(observation) == tuple(self.description["observation"]["shape"]):
+            return None
+        raise ValueError("expected agent= of Actor.load: several kinds of agents have observations of this form")
 
     def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
@@ -215,15 +268,23 @@ class Actor:
 
     def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[dict[str, Array], bool]:
         """Return the checked inputs of the graph by name, and whether they are a batch."""
-        if isinstance(observation, Mapping) and set(observation) == {"observation", "action_mask"}:
-            action_mask = observation["action_mask"] if action_mask is None else action_mask
-            observation = observation["observation"]
+        conversion, mask_of_observation = self._conversion_of(observation), None
+        if conversion is not None:
+            observation, mask_of_observation = conversion.split(observation)
+            observation = conversion.own(observation)
+        elif isinstance(observation, Mapping) and set(observation) == {"observation", "action_mask"}:
+            observation, mask_of_observation = observation["observation"], observation["action_mask"]
+        action_mask = mask_of_observation if action_mask is None else action_mask
+        if conversion is not None and (action_mask is not None or self.description["action_mask"] == "required"):
+            action_mask = conversion.mask(action_mask)
         batch, is_batch = self._batch(observation)
         inputs = {"observation": batch, **self._states(memory, len(batch))}
         mask = self._mask(action_mask, len(batch))
         if mask is not None:
             inputs["action_mask"] = mask
         if self.reads_agent:
+            if self.agent is None:
+                raise ValueError(f"this actor needs agent= of Actor.load, 0 to {self.n_agents - 1}: it reads who acts")
             inputs["agent"] = np.full(len(batch), self.agent)
         return inputs, is_batch
 
@@ -299,11 +360,9 @@ class Actor:
 
 
 def _index_of(agent: object, description: Mapping[str, Any]) -> int | None:
-    """Return the index of an agent, given by index or name; None if it is not given and not needed."""
+    """Return the index of an agent, given by index or name; None for None."""
     n_agents, names = description["n_agents"], description["agents"]
     if agent is None:
-        if description["reads_agent"]:
-            raise ValueError(f"this actor needs agent=: what it does depends on who acts, agent=0 to {n_agents - 1}")
         return None
     if names is not None and agent in names:
         return int(names.index(agent))

@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -127,7 +128,7 @@ def _checked_policy(model: object) -> ExportablePolicy:
 
 def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, Any]:
     """Return what :class:`sb3_saf.Actor` needs to know of a graph, as plain data."""
-    own, names = policy.team_spaces.own, policy.team_spaces.names
+    own, names, conversions = policy.team_spaces.own, policy.team_spaces.names, policy.team_spaces.conversions
     choices, pixels = None, None
     if is_one_hot(own):
         choices = np.reshape(choices_of(own), own.shape or ()).tolist()
@@ -144,6 +145,7 @@ def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, 
         "greedy": network.greedy,
         "states": network.state_shapes,
         "choices": choices_of(policy.action_space),
+        "conversions": None if conversions is None else [asdict(one) for one in conversions],
         "observation": {
             "shape": own.shape or (),
             "dtype": str(own.dtype),
@@ -156,11 +158,9 @@ def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, 
 
 def _script() -> str:
     """Return act.py with the code that it imports from this package."""
-    code = inspect.getsource(conversion)
-    code = code[code.index("\n\n\n") :].lstrip()  # without its imports
-    return re.sub(
-        r"from sb3_saf.teams.conversion import (\([^)]*\)|.*)\n", lambda _: f"\n\n{code}\n\n", inspect.getsource(act)
-    )
+    _, _, code = inspect.getsource(conversion).partition("from __future__ import annotations\n")
+    line = r"from sb3_saf.teams.conversion import .*\n"
+    return re.sub(line, lambda _: f"{code.strip()}\n\n\n", inspect.getsource(act))
 
 
 # --- the network ------------------------------------------------------------------------------------------------------

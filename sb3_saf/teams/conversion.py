@@ -170,6 +170,13 @@ class AgentConversion:
             needs_mask=needs_mask,
         )
 
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> AgentConversion:
+        """Return a conversion from what JSON gives back of ``dataclasses.asdict``."""
+        entries = _with_tuples(plain)
+        leaves = tuple(Leaf(**leaf) for leaf in entries["leaves"])
+        return cls(**{**entries, "leaves": leaves, "action": Leaf(**entries["action"])})
+
     def with_channels_first(self) -> AgentConversion:
         """Return the conversion for rows whose pictures have channels first, (H, W, C) -> (C, H, W)."""
         height, width, channels = self.shape
@@ -283,6 +290,13 @@ def conversions_of(
         action_space = env.action_space(agent)
         conversions.append(AgentConversion.of(observed, action_space, own, row_actions, key, needs_mask or bool(key)))
     return tuple(conversions)
+
+
+def _with_tuples(value: Any) -> Any:
+    """Return nested containers with tuples in place of lists."""
+    if isinstance(value, Mapping):
+        return {key: _with_tuples(item) for key, item in value.items()}
+    return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def _leaves(space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Iterator[Leaf]:
