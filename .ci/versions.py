@@ -92,7 +92,9 @@ def install(end: str, folder: Path, interpreter: str) -> Path:
     python = folder / "bin" / "python"
     pins = folder / "constraints.txt"
     pins.write_text(constraints(), encoding="utf-8")
-    wanted = [f"{name}=={bound}" for name, bound in lower_bounds().items()] if end == "oldest" else list(LIBRARIES)
+    requirements = (
+        [f"{name}=={bound}" for name, bound in lower_bounds().items()] if end == "oldest" else list(LIBRARIES)
+    )
     upgrade = [] if end == "oldest" else ["--upgrade"]
     command: list[str | Path] = [
         python,
@@ -105,7 +107,7 @@ def install(end: str, folder: Path, interpreter: str) -> Path:
         pins,
         "-e",
         f".[{EXTRAS}]",
-        *wanted,
+        *requirements,
     ]
     subprocess.run(command, cwd=ROOT, check=True)
     return python

@@ -70,7 +70,7 @@ def medians(programs: dict[Any, Callable[[], int]], rounds: int) -> dict[Any, fl
             start = time.process_time()
             count = work()
             rates[name].append(count / (time.process_time() - start))
-    return {name: float(np.median(found[1:])) for name, found in rates.items()}
+    return {name: float(np.median(values[1:])) for name, values in rates.items()}
 
 
 def encoder_table(rounds: int) -> None:

@@ -37,13 +37,13 @@ def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
     """Return the trained teams of an experiment's folder; ``setting`` is e.g. TeamSupport-c2-h1."""
     for model in sorted(results.folder.glob(f"cells/{setting}/*/*/model.zip")):
         folder, method, seed = model.parts[-4:-1]
-        found = _SETTING.fullmatch(folder)
-        if found is None:
+        match = _SETTING.fullmatch(folder)
+        if match is None:
             raise ValueError(f"expected a folder such as TeamSupport-c2-h1, got {folder}")
-        level = Level.of(coordination=int(found["c"]), heterogeneity=int(found["h"]))
-        if found["n"]:
-            level = Level.of(**level.env_kwargs, n_agents=int(found["n"]))
-        yield Cell(method, f"{check_task(found['task'])}-v0", level, int(seed.removeprefix("seed-")))
+        level = Level.of(coordination=int(match["c"]), heterogeneity=int(match["h"]))
+        if match["n"]:
+            level = Level.of(**level.env_kwargs, n_agents=int(match["n"]))
+        yield Cell(method, f"{check_task(match['task'])}-v0", level, int(seed.removeprefix("seed-")))
 
 
 def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
@@ -100,11 +100,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="keep everything here")
     options = parser.parse_args()
     th.set_num_threads(1)
-    found: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
+    numbers: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
     results = Results(options.folder)
     for cell in cells(results, options.only):
-        found[cell.task, cell.level.slug, cell.method].append(look(cell, results, options.episodes))
-    if not found:
+        numbers[cell.task, cell.level.slug, cell.method].append(look(cell, results, options.episodes))
+    if not numbers:
         parser.exit(
             1,
             f"no trained team under {options.folder / 'cells' / options.only}: expected the folder of an experiment "
@@ -112,7 +112,7 @@ def main() -> None:
         )
     means = {
         key: {name: float(np.mean([one[name] for one in looks if name in one])) for name in looks[0]}
-        for key, looks in found.items()
+        for key, looks in numbers.items()
     }
     if options.json is not None:
         options.json.write_text(json.dumps({" ".join(key): value for key, value in means.items()}, indent=1))

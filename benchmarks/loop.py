@@ -226,14 +226,14 @@ class _Watch:
         return Cost(self._best["collect_rollouts"], self._best["train"], self.model.n_steps, self._n_rows)
 
 
-def print_table(title: str, found: Mapping[str, Cost]) -> None:
+def print_table(title: str, costs_by_name: Mapping[str, Cost]) -> None:
     """Print Markdown."""
-    first = next(iter(found))
+    first = next(iter(costs_by_name))
     print(f"\n{title}\n\n| program | step, ms | update, us a row | agent-steps/s | whole loop, x {first} |")
     print("| --- | --- | --- | --- | --- |")
-    for name, cost in found.items():
+    for name, cost in costs_by_name.items():
         step, update = 1e3 * cost.rollout / cost.n_steps, 1e6 * cost.update / cost.n_rows
-        ratio = cost.whole / found[first].whole
+        ratio = cost.whole / costs_by_name[first].whole
         print(f"| {name} | {step:.2f} | {update:.1f} | {1 / cost.whole:,.0f} | {ratio:.2f} |", flush=True)
 
 
@@ -243,8 +243,10 @@ def print_growth(rounds: int) -> None:
     print("| --- | --- | --- |")
     for n_agents in GROWTH:
         models = {algo: small_model(algo, n_agents) for algo in ("saf", "mappo")}
-        found = costs(models, rounds)
-        print(f"| {n_agents} | " + " | ".join(f"{1e6 * cost.whole:.0f}" for cost in found.values()) + " |", flush=True)
+        by_algo = costs(models, rounds)
+        print(
+            f"| {n_agents} | " + " | ".join(f"{1e6 * cost.whole:.0f}" for cost in by_algo.values()) + " |", flush=True
+        )
 
 
 def main() -> None:
@@ -254,15 +256,15 @@ def main() -> None:
     parser.add_argument("--games", nargs="+", type=int, default=list(N_STEPS), choices=list(N_STEPS), help="of free")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
-    wanted = options.only or ("free", "small", "growth")
+    tables = options.only or ("free", "small", "growth")
     th.set_num_threads(1)
-    if "free" in wanted:
+    if "free" in tables:
         for n_games in options.games:
             print_table(f"{n_games} free games x {N_AGENTS} agents", costs(free_models(n_games), options.rounds))
-    if "small" in wanted:
+    if "small" in tables:
         models = {algo.upper(): small_model(algo) for algo in ("ippo", "mappo", "saf")}
         print_table("HECOGrid TeamSupport, size small", costs(models, options.rounds))
-    if "growth" in wanted:
+    if "growth" in tables:
         print_growth(options.rounds)
 
 

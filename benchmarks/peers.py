@@ -142,8 +142,8 @@ def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
     jax.block_until_ready(jax.jit(program.make_train(config))(jax.random.PRNGKey(seed)))
 
     def last(name: str) -> float:
-        found = [float(one[name].mean()) for one in logged[-max(1, len(logged) // _LAST) :]]
-        return sum(found) / len(found)
+        values = [float(one[name].mean()) for one in logged[-max(1, len(logged) // _LAST) :]]
+        return sum(values) / len(values)
 
     value = last("returned_episode_returns" if "returned_episode_returns" in logged[-1] else "returns")
     commit = _commit(clone)
@@ -185,8 +185,8 @@ def train_epymarl(peer: Peer, seed: int, clone: Path) -> Outcome:
         if done.returncode:
             raise RuntimeError(done.stderr.strip().splitlines()[-1])
     files = Path(clone, "results", "sacred").rglob("info.json")  # always written there, one folder for each run
-    found = json.loads(max(files, key=os.path.getmtime).read_text(encoding="utf-8"))
-    value = found["test_return_mean"][-1]
+    results = json.loads(max(files, key=os.path.getmtime).read_text(encoding="utf-8"))
+    value = results["test_return_mean"][-1]
     value = value["value"] if isinstance(value, dict) else value
     source = f"src/main.py at {_commit(clone)}, config {peer.algorithm}; 100 episodes, most likely actions"
     return Outcome(float(value), None, source)
@@ -254,8 +254,8 @@ def print_rates(clone: Path, python: str) -> None:
         done = subprocess.run(words, capture_output=True, text=True)
         if done.returncode:
             sys.exit(f"JaxMARL's program: {(done.stderr or 'failed').strip().splitlines()[-1]}")
-        found = loop.costs(loop.suite_models(_RATE_TASK, n_games), rounds=3)
-        rates = [float(done.stdout.split()[-1]) * loop.N_AGENTS, *(1 / cost.whole for cost in found.values())]
+        costs = loop.costs(loop.suite_models(_RATE_TASK, n_games), rounds=3)
+        rates = [float(done.stdout.split()[-1]) * loop.N_AGENTS, *(1 / cost.whole for cost in costs.values())]
         print(f"| {n_games} | " + " | ".join(f"{rate:,.0f}" for rate in rates) + " |", flush=True)
 
 

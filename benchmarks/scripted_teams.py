@@ -117,9 +117,9 @@ class FullSight:
 
     def _field_of_goal(self, number: int, sight: Sight) -> Costs:
         """Compute the cost to go to the group's treasure, which stays the same until it is collected."""
-        goal, taken = self.goals.pop(number, None), set(self.goals.values())
+        goal, others = self.goals.pop(number, None), set(self.goals.values())
         if goal is None or not sight.treasures[goal]:
-            cells: list[Cell] = [(x, y) for x, y in np.argwhere(sight.treasures).tolist() if (x, y) not in taken]
+            cells: list[Cell] = [(x, y) for x, y in np.argwhere(sight.treasures).tolist() if (x, y) not in others]
             goal = min(cells, key=lambda cell: self._arrival(number, sight, cell), default=None)
         if goal is None:
             return cost_to_go(sight.passable, sight.costs_of([]))
@@ -142,14 +142,14 @@ class OwnViews:
 
     def __call__(self, batch: GameBatch) -> Commands:
         """Return the commands of all agents, (N,)."""
-        sight, seen = Sight(batch), batch.fields_of_view()
-        return np.array([self._command(agent, sight, seen[agent]) for agent in range(len(seen))], dtype=np.int64)
+        sight, view = Sight(batch), batch.fields_of_view()
+        return np.array([self._command(agent, sight, view[agent]) for agent in range(len(view))], dtype=np.int64)
 
-    def _command(self, agent: int, sight: Sight, seen: Cells) -> Command:
+    def _command(self, agent: int, sight: Sight, view: Cells) -> Command:
         position = sight.position[agent]
-        others = {(x, y) for x, y in sight.position.tolist() if seen[x, y]} - {tuple(position.tolist())}
-        passable = sight.passable | ~seen
-        costs = self._costs(agent, sight, seen, others)
+        others = {(x, y) for x, y in sight.position.tolist() if view[x, y]} - {tuple(position.tolist())}
+        passable = sight.passable | ~view
+        costs = self._costs(agent, sight, view, others)
         self.leaves[agent] -= self.leaves[agent] > 0
         if np.isfinite(costs).any():
             command = sight.command(agent, cost_to_go(passable, costs))
@@ -164,12 +164,12 @@ class OwnViews:
         straight = ahead and self.rng.random() >= TURN
         return Command.FORWARD if straight else Command(int(self.rng.integers(Command.FORWARD)))
 
-    def _costs(self, agent: int, sight: Sight, seen: Cells, others: set[Cell]) -> Costs:
+    def _costs(self, agent: int, sight: Sight, view: Cells, others: set[Cell]) -> Costs:
         """Return the costs of ending at keys or else treasures, (W, W); those without agents nearby cost more."""
         if sight.needs_key[agent]:
-            return np.where(sight.keys & seen, 0.0, np.inf)
-        costs = np.full(seen.shape, np.inf)
-        for cell in np.argwhere(sight.treasures & seen & (self.leaves[agent] == 0)):
+            return np.where(sight.keys & view, 0.0, np.inf)
+        costs = np.full(view.shape, np.inf)
+        for cell in np.argwhere(sight.treasures & view & (self.leaves[agent] == 0)):
             company = sum(bool(max(abs(cell - other)) <= self.radius) for other in others)
             costs[tuple(cell)] = 0 if company >= self.c - 1 else DETOUR
         return costs

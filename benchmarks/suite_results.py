@@ -90,15 +90,15 @@ def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFram
     except ValueError:
         return [task.env_id, f"{task.game_steps:,}", *[_NOT_RUN] * (len(methods) + 2), beside]
     by_method = {method: tests[tests["method"] == method] for method in ("random", *methods)}
-    found = [_figures(rows) if task.takes(method) else _BOX for method, rows in by_method.items()]
+    figures = [_figures(rows) if task.takes(method) else _BOX for method, rows in by_method.items()]
     spent = [_seconds(rows["processor_seconds"]) for method, rows in by_method.items() if method != "random"]
-    return [task.env_id, f"{tests['game_steps'].max():,}", *found, " / ".join(spent), beside]
+    return [task.env_id, f"{tests['game_steps'].max():,}", *figures, " / ".join(spent), beside]
 
 
 def _others(rows: pd.DataFrame) -> Iterator[str]:
-    for (program, game_steps), found in rows.groupby(["program", "game_steps"]):
-        spent = found["processor_seconds"].mean()
-        figures = _figures(found.rename(columns={"return": "return_mean", "won": "success_rate"}))
+    for (program, game_steps), trainings in rows.groupby(["program", "game_steps"]):
+        spent = trainings["processor_seconds"].mean()
+        figures = _figures(trainings.rename(columns={"return": "return_mean", "won": "success_rate"}))
         yield f"{program}, {game_steps:,} game steps: {figures}, {spent:.0f} s"
 
 
@@ -111,31 +111,31 @@ def _figures(tests: pd.DataFrame) -> str:
     if tests.empty:
         return _NOT_RUN
     value, low, high = mean_over_seeds(tests["return_mean"].to_numpy())
-    found = f"{value:.2f}" if pd.isna(low) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
+    text = f"{value:.2f}" if pd.isna(low) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
     won = tests["success_rate"].mean()
-    return f"{found}{'' if pd.isna(won) else f', {won:.0%} won'} ({len(tests)})"
+    return f"{text}{'' if pd.isna(won) else f', {won:.0%} won'} ({len(tests)})"
 
 
 def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str], earlier: str = "") -> Iterator[str]:
     """Yield the lines of the table and of its sources; rows of suites not installed here remain as ``earlier``."""
-    known = pd.read_csv(BASELINES)
+    baselines = pd.read_csv(BASELINES)
     names = [method.upper() for method in methods]
     head = ["task", "game steps", "random", *names, f"processor s ({' / '.join(names)})", "others"]
     yield f"| {' | '.join(head)} |"
     yield f"|{' --- |' * len(head)}"
     for task in tasks:
-        others = known[known["task"] == task.env_id]
-        kept = [line for line in earlier.splitlines() if line.startswith(f"| {task.env_id} |")]
-        if kept and suites()[task.env_id.partition("/")[0]].problem() is not None:
-            yield kept[0]
+        others = baselines[baselines["task"] == task.env_id]
+        rows = [line for line in earlier.splitlines() if line.startswith(f"| {task.env_id} |")]
+        if rows and suites()[task.env_id.partition("/")[0]].problem() is not None:
+            yield rows[0]
         else:
             yield f"| {' | '.join(row(task, folder / task.name, methods, others))} |"
     runs = [Run(path.parent) for path in folder.glob("*/cells/*/*/*/run.json")]
     yield ""
     yield f"Commits: {', '.join(sorted({run.description['versions']['commit'] for run in runs})) or 'none'}. Others:"
     yield ""
-    for (task, program), found in known.groupby(["task", "program"]):
-        yield f"- {task}: {program}, {found['source'].iloc[0]}"
+    for (task, program), trainings in baselines.groupby(["task", "program"]):
+        yield f"- {task}: {program}, {trainings['source'].iloc[0]}"
 
 
 def main() -> None:

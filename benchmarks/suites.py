@@ -40,16 +40,16 @@ class Contestant(NamedTuple):
 
 def rows_of(env: Any) -> Contestant:
     """Step a VecEnv, with or without the wrappers of training."""
-    shown: dict[str, Any] = env.reset()
+    observations: dict[str, Any] = env.reset()
     rng = np.random.default_rng(0)
 
     def step() -> None:
-        nonlocal shown
-        masks = shown.get("action_mask")
+        nonlocal observations
+        masks = observations.get("action_mask")
         if masks is None:
-            shown = env.step(actions[rng.integers(len(actions))])[0]
+            observations = env.step(actions[rng.integers(len(actions))])[0]
         else:
-            shown = env.step((random[rng.integers(len(random))] * masks).argmax(axis=1))[0]
+            observations = env.step((random[rng.integers(len(random))] * masks).argmax(axis=1))[0]
 
     random = rng.random((16, env.num_envs, getattr(env.action_space, "n", 1)), dtype=np.float32)
     actions = np.stack([[env.action_space.sample() for _ in range(env.num_envs)] for _ in range(16)])
@@ -124,13 +124,13 @@ def _vmas(scenario: str, n_games: int, actions: Any) -> Contestant:
 
 def rates(env_id: str, rounds: int, steps: int) -> dict[str, float]:
     """Measure agent-steps per second of processor time, the best of rounds in turns."""
-    found = contestants(env_id)
-    best = dict.fromkeys(found, 0.0)
-    for contestant in found.values():
+    programs = contestants(env_id)
+    best = dict.fromkeys(programs, 0.0)
+    for contestant in programs.values():
         contestant.step()
         contestant.step()
     for _ in range(rounds):
-        for name, contestant in found.items():
+        for name, contestant in programs.items():
             start = time.process_time()
             for _ in range(steps):
                 contestant.step()

@@ -78,14 +78,14 @@ def lines(table: pd.DataFrame, methods: Sequence[str]) -> Iterator[str]:
         for method, rows in by_method.items():
             trained = "" if method == RANDOM else shown(mean_over_seeds(rows["learning"].to_numpy()))
             means = ["", ""] if method == RANDOM else [f"{rows['explained'].mean():.2f}", f"{rows['cost'].mean():.0f}"]
-            found = shown(mean_over_seeds(rows["score"].to_numpy()))
-            yield f"| {' | '.join([str(n_agents), str(method), str(len(rows)), found, trained, *means])} |"
+            score = shown(mean_over_seeds(rows["score"].to_numpy()))
+            yield f"| {' | '.join([str(n_agents), str(method), str(len(rows)), score, trained, *means])} |"
         first, *others = [method for method in by_method if method != RANDOM]
         for other in others:
             pair = by_method[first].merge(by_method[other], on="seed", suffixes=("", "_other"))
             gains = [(pair[name] - pair[f"{name}_other"]).to_numpy() for name in ("score", "learning")]
-            found, trained = (shown(mean_over_seeds(gain)) for gain in gains)
-            yield f"| {n_agents} | {first} minus {other} | {len(pair)} | {found} | {trained} | | |"
+            score, trained = (shown(mean_over_seeds(gain)) for gain in gains)
+            yield f"| {n_agents} | {first} minus {other} | {len(pair)} | {score} | {trained} | | |"
 
 
 def shown(estimate: Estimate) -> str:
@@ -96,8 +96,8 @@ def shown(estimate: Estimate) -> str:
 
 def scripts(sizes: list[int], n_games: int) -> pd.DataFrame:
     """Return the percentage of treasures that scripted teams collect."""
-    found = {n: measure(SCRIPT, "TeamSupport", {**level(n), "coordination": 2}, n_games) for n in sizes}
-    rows = [(f"scripted, {SCRIPT}", n, 100 * row.mean / row.n_treasures) for n, row in found.items()]
+    by_size = {n: measure(SCRIPT, "TeamSupport", {**level(n), "coordination": 2}, n_games) for n in sizes}
+    rows = [(f"scripted, {SCRIPT}", n, 100 * row.mean / row.n_treasures) for n, row in by_size.items()]
     return pd.DataFrame(rows, columns=["name", "n_agents", "score"])
 
 

@@ -42,11 +42,11 @@ def main() -> None:
     print("| task | level | method | processor s, median | by seed | game steps, median |")
     print("| --- | --- | --- | --- | --- | --- |")
     for (task, level, method), rows in curves.groupby(["task", "level", "method"]):
-        found = pd.DataFrame(
+        times = pd.DataFrame(
             [reached(curve, options.reach) for _, curve in rows.groupby("seed")], columns=["seconds", "steps"]
         )
-        by_seed = ", ".join(f"{seconds:.0f}" for seconds in found["seconds"])
-        medians = found.median()
+        by_seed = ", ".join(f"{seconds:.0f}" for seconds in times["seconds"])
+        medians = times.median()
         print(f"| {task} | {level} | {method} | {medians['seconds']:.0f} | {by_seed} | {medians['steps']:,.0f} |")
 
 

@@ -31,12 +31,12 @@ def walk(policy: str = "SAFPolicy", game_steps: int = 40) -> list[Path]:
 
     import sb3_saf
 
-    seen: dict[str, None] = {}
+    files_run: dict[str, None] = {}
 
     def note(frame: FrameType, event: str, argument: object) -> None:
         # Class bodies and modules run at import, which is not part of the walk.
         if event == "call" and frame.f_code.co_flags & 0x2:  # CO_NEWLOCALS: a function
-            seen.setdefault(frame.f_code.co_filename)
+            files_run.setdefault(frame.f_code.co_filename)
 
     threading.setprofile(note)
     sys.setprofile(note)
@@ -57,7 +57,7 @@ def walk(policy: str = "SAFPolicy", game_steps: int = 40) -> list[Path]:
         sys.setprofile(None)
         threading.setprofile(None)
     folders = tuple(str(ROOT / package) for package in PACKAGES)
-    return [Path(name) for name in seen if name.startswith(folders)]
+    return [Path(name) for name in files_run if name.startswith(folders)]
 
 
 def count_lines(paths: Iterable[Path]) -> int:

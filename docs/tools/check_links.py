@@ -79,12 +79,12 @@ def check(folder: Path) -> Found:
     """
     folder = folder.resolve()
     pages = {path.resolve(): read_page(path) for path in sorted(folder.rglob("*.html"))}
-    found = Found(len(pages), sum(map(len, _internal(pages).values())), [], set())
+    report = Found(len(pages), sum(map(len, _internal(pages).values())), [], set())
     for page in pages.values():
-        found.external.update(link for link in page.links if urlsplit(link).scheme in ("http", "https"))
+        report.external.update(link for link in page.links if urlsplit(link).scheme in ("http", "https"))
     for path, links in _internal(pages).items():
-        found.broken.extend(f"{path.relative_to(folder)}: {link}" for link in links if not _leads(path, link, pages))
-    return found
+        report.broken.extend(f"{path.relative_to(folder)}: {link}" for link in links if not _leads(path, link, pages))
+    return report
 
 
 def _internal(pages: dict[Path, Page]) -> dict[Path, list[str]]:
@@ -109,12 +109,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of the built HTML")
     folder: Path = parser.parse_args().folder
     if not (folder / "index.html").is_file():
-        sys.exit(f"expected built pages in {folder}, found no index.html; run 'make docs'")
-    found = check(folder)
-    print(f"{found.n_pages} pages, {found.n_internal} links inside the site, {len(found.broken)} broken")
-    print(f"{len(found.external)} addresses elsewhere (not fetched):", *sorted(found.external), sep="\n  ")
-    if found.broken:
-        sys.exit("\n".join(["links that lead nowhere:", *found.broken]))
+        sys.exit(f"expected built pages in {folder}, got no index.html; run 'make docs'")
+    report = check(folder)
+    print(f"{report.n_pages} pages, {report.n_internal} links inside the site, {len(report.broken)} broken")
+    print(f"{len(report.external)} addresses elsewhere (not fetched):", *sorted(report.external), sep="\n  ")
+    if report.broken:
+        sys.exit("\n".join(["links that lead nowhere:", *report.broken]))
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ class Inspection(NamedTuple):
         agents = np.broadcast_to(np.arange(counted.shape[1]) % recording.n_agents, counted.shape)[counted]
         by_agent = numbers.selection_by_group(weights, agents, recording.n_agents)
         distances = numbers.policy_distances(self.action_space, recording.pool_actions[counted])
-        drawn = {
+        plots = {
             "pool/by_agent": figures.chosen_by_agent(by_agent),
             "pool/differences": figures.policy_differences(distances),
         }
@@ -89,8 +89,8 @@ class Inspection(NamedTuple):
             zones = recording.zones[counted]
             n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
             by_zone = numbers.selection_by_group(weights, zones, n_zones)
-            drawn["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
-        return drawn
+            plots["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
+        return plots
 
     def _of_the_knowledge_source(self) -> dict[str, Figure]:
         recording = self.recording

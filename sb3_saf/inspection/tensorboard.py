@@ -116,10 +116,10 @@ class Line(NamedTuple):
 
 def line_of(tag: str) -> Line | None:
     """Return the line of a tag; None if the tag has its own chart."""
-    found = _OF_LINES.fullmatch(tag)
-    if found is None:
+    match = _OF_LINES.fullmatch(tag)
+    if match is None:
         return None
-    return Line(found["chart"] or found["errors"], found["line"] or f"message_{found['with'] or 'as_read'}")
+    return Line(match["chart"] or match["errors"], match["line"] or f"message_{match['with'] or 'as_read'}")
 
 
 class Page:
@@ -209,13 +209,13 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
         groups["Team return"] = {"evaluation, with 95 % interval": ["Margin", list(_BAND)]}
     for group, charts in (_CHARTS | (_VALUE_CHARTS if value_based else {})).items():
         # Those for which the run has scalars, from inspection or from the algorithm's logs.
-        kept = {
+        lines = {
             name: patterns
             for name, patterns in charts.items()
             if any(p.startswith(_OF_ALGORITHMS) or any(re.fullmatch(p, tag) for tag in tags) for p in patterns)
         }
-        if kept:
-            groups[group] = {name: ["Multiline", [f"^{p}$" for p in patterns]] for name, patterns in kept.items()}
+        if lines:
+            groups[group] = {name: ["Multiline", [f"^{p}$" for p in patterns]] for name, patterns in lines.items()}
     zones = sorted({tag.split("/")[1] for tag in tags if tag.startswith("pool_by_zone/")})
     if zones:
         groups["Policy pool by zone"] = {
@@ -246,7 +246,7 @@ def hyperparameters(
     n_agents = require_n_agents(env)
     first = {**more, "seed": model.seed, "method": f"{type(model).__name__} {type(policy).__name__}", **more}
     width = len(str(len(first)))
-    found: dict[str, object] = {
+    settings: dict[str, object] = {
         **{f"{number:0{width}} {name}": value for number, (name, value) in enumerate(first.items(), 1)},
         "n_agents": n_agents,
         "n_games": env.num_envs // n_agents,
@@ -255,9 +255,9 @@ def hyperparameters(
         "learning_rate": model.lr_schedule(1.0),
         **{name: getattr(model, name, None) for name in _SHOWN},
     }
-    kept = {
+    values = {
         name: value if isinstance(value, (bool, str, float, int)) else str(value)
-        for name, value in found.items()
+        for name, value in settings.items()
         if value is not None
     }
-    return HParam(kept, {tag: float(scalars[tag]) for tag in _METRICS if tag in scalars})
+    return HParam(values, {tag: float(scalars[tag]) for tag in _METRICS if tag in scalars})
