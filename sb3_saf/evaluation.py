@@ -241,7 +241,7 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
         actions = act(observations, starts)
         following, rewards, row_dones, infos = env.step(actions)
         dones = np.asarray(row_dones, dtype=np.bool_)
-        ended = team_dones(dones, n_agents)
+        ended = team_dones(dones, n_agents, alone=True)
         yield PlayedStep(observations, actions, following, rewards, dones, infos, ended, remaining > 0)
         whole = [ended[game] and STAGGERED not in infos[game * n_agents] for game in range(n_games)]
         remaining = np.maximum(remaining - whole, 0)

@@ -339,7 +339,7 @@ def test_agents_with_other_spaces_are_padded_and_masked() -> None:
         np.testing.assert_array_equal(observations[agent][:size], own[agent])
         assert not observations[agent][size:].any() and len(observations[agent]) == 11
         assert infos[agent]["action_mask"].tolist() == [1] * n_actions + [0] * (5 - n_actions)
-    with pytest.raises(ValueError, match="speaker_0 has 3 actions, got action 4, which is masked"):
+    with pytest.raises(ValueError, match=r"speaker_0 has .*got action 4, which is masked"):
         game.step({"speaker_0": 4, "listener_0": 0})
     env = make_team_env("mpe/simple_speaker_listener_v4", n_envs=2, seed=0)
     evaluate_team(RandomPolicy(env, seed=0), env, 4)  # would raise at a masked action

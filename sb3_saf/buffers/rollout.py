@@ -131,8 +131,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     - **Value normalisation**: minibatches hold the returns of the rollout for policies with ``normalize_values=True``;
       advantages and :attr:`values` are those of the rollout.
     - **Inactive agents** (if observations have ``"active"``): minibatches omit their rows, so that loss, entropy and
-      the normalisation of advantages use active rows only; ``batch_size`` is then an upper bound. An agent's return
-      ends with the agent unless ``ends="team"``, see :meth:`compute_returns_and_advantage`.
+      the normalisation of advantages use active rows only; ``batch_size`` is then an upper bound. Rewards paid while an
+      agent waits or after its end count for its last action, see :meth:`compute_returns_and_advantage`.
     - ``"action_mask"`` is stored for each row, ``"state"`` once per game.
     - Adding rows that are not whole teams in index order raises a ValueError.
 
@@ -145,9 +145,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     :param gae_lambda: trade-off of bias and variance of the advantages, 1 for Monte-Carlo
     :param gamma: discount factor
     :param n_envs: B, rows
-    :param ends: whether an agent's return ends with its ``"own"`` end, or with the episode of its ``"team"``. The
-        latter is for agents that receive the team's reward after their own end (``make_team_env(...,
-        team_reward="sum")``), so that a later success also counts for them
+    :param ends: whether values end with an agent's ``"own"`` end, after which only what its row is paid counts, or with
+        the episode of its ``"team"``: after an agent's end, values are then those of its team, for agents that receive
+        the team's reward (``make_team_env(..., team_reward="sum")``), also where a rollout ends before the episode
     :param normalize_advantage: ``"agent"`` gives the advantages of each agent mean 0 and standard deviation 1 over the
         rollout, for agents whose own rewards differ in scale: PPO normalises over the rows of all agents, where the one
         that is paid more drowns the others. A rollout in which agents of a team were paid alike stays as it is, and so
@@ -269,20 +269,23 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         Compute advantages A and returns A + V of each agent by SB3's recursion.
 
-        With c_t = 1 if the agent takes part at step t, and b_t = 1 if an episode begins there::
+        With b_t = 1 if an episode begins at step t::
 
-            m_t = c_{t+1} (1 - b_{t+1})              (1 if the agent's own episode continues after step t)
-            A_t = r_t + gamma m_t V_{t+1} - V_t + gamma lambda m_t A_{t+1}
+            A_t = r_t + gamma (1 - b_{t+1}) V_{t+1} - V_t + gamma lambda (1 - b_{t+1}) A_{t+1}
 
-        An agent's return thus ends with its own end. After the last step T, b is ``dones`` and V_T ``last_values``: the
-        policies of this package return zero for inactive agents, which replaces c_T. Advantages of inactive rows are
-        unused.
+        After the last step T, b is ``dones`` and V_T ``last_values``. Where an agent does not take part, V is not that
+        of the critic, but what the rows hold until it takes part again or the episode ends::
+
+            V_t = r_t + gamma (1 - b_{t+1}) V_{t+1}
+
+        So an absence is no end, rewards paid to an agent that waits or has ended count for its last action, and V is
+        zero after its end if nothing is paid. V_T is zero for inactive agents. Advantages of inactive rows are unused.
+
+        With ``ends="team"``, V of an inactive agent is the mean of V over the active agents of its team, since all
+        receive the same reward.
 
         With ``normalize_advantage="agent"``, the advantages of each agent then get mean 0 and standard deviation 1 over
         its rows, unless all agents of each team received the same rewards.
-
-        With ``ends="team"``, m_t = 1 - b_{t+1}, and V of an inactive agent is the mean of V over the active agents of
-        its team, since all receive the same reward.
 
         :param last_values: (B,) or (B, 1) values after the last step
         :param dones: (B,) whether an episode ended with the last step
@@ -291,15 +294,17 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         counted = np.ones((self.buffer_size, self.n_envs), dtype=np.bool_)
         if self.active is not None:
             counted = self.active.reshape(self.buffer_size, self.n_envs) != 0
-        starts = self.episode_starts
         if self.active is not None and self.ends == "team":
             self.values = self._with_values_of_teams(self.values, counted)
             last = last_values.reshape(-1).cpu().numpy()
             last_values = th.from_numpy(self._with_values_of_teams(last, last != 0))
         elif self.active is not None:
-            self.episode_starts = np.where(counted, starts, np.float32(1))
+            following, continues = last_values.reshape(-1).cpu().numpy(), 1.0 - np.asarray(dones, dtype=np.float32)
+            for step in reversed(range(self.buffer_size)):
+                paid = self.rewards[step] + self.gamma * following * continues
+                self.values[step] = np.where(counted[step], self.values[step], paid)
+                following, continues = self.values[step], 1.0 - self.episode_starts[step]
         super().compute_returns_and_advantage(last_values, dones)
-        self.episode_starts = starts
         agents = np.broadcast_to(self._agents, counted.shape)
         self._returns = RolloutReturns(self.returns[counted], agents[counted])
         if self.normalize_advantage == "agent" and not self._is_reward_shared(counted):
@@ -334,15 +339,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 f"{agents.reshape(-1)[: 2 * self.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may "
                 "reorder rows"
             )
-        # All rows of a team hold the same N observations. Each step checks one row per team in turn: a full comparison
-        # would read N times as much memory, and N steps of this cover the same rows.
-        seen_by = self.pos % self.n_agents
-        seen = team.reshape(self.n_games, self.n_agents, *team.shape[1:])[:, seen_by]
-        if not np.array_equal(seen, own.reshape(seen.shape)):
-            game = int(np.flatnonzero((seen != own.reshape(seen.shape)).reshape(self.n_games, -1).any(axis=1))[0])
+        # Once for each rollout: a wrapper above CentralizedValueWrapper may change one of the two.
+        if self.pos == 0 and not np.array_equal(team[:: self.n_agents].reshape(own.shape), own):
             raise ValueError(
-                f"expected {TEAM_KEY!r} to hold the {OBS_KEY!r} of the team's own rows, but they differ for agent "
-                f"{seen_by} of game {game}; change or normalise observations below CentralizedValueWrapper only"
+                f"expected {TEAM_KEY!r} to hold the {OBS_KEY!r} of the team's own rows, but they differ; change or "
+                "normalise observations below CentralizedValueWrapper only"
             )
 
     def _check_shapes(self, own: Array, team: Array) -> None:

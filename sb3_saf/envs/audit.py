@@ -15,18 +15,14 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
-from sb3_saf.envs.gymnasium_team import GymnasiumTeam, is_gymnasium_team
+from sb3_saf.envs.gymnasium_team import ALL, INFO_MASKS, GymnasiumTeam, is_gymnasium_team
 from sb3_saf.envs.space_reader import SpaceReader, leaves_of
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, first_choices, n_mask_entries
+from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, n_mask_entries
 
 #: Steps of a trial, and its limit in seconds.
 TRIAL_STEPS: Final = 30
 TRIAL_SECONDS: Final = 1.0
-#: Keys of infos under which games give action masks.
-INFO_MASKS: Final = (ACTION_MASK_KEY, "action_masks", "avail_actions", "available_actions")
-#: Key by which some games say that all agents have ended.
-ALL: Final = "__all__"
 
 _RESET: Final = "(observations, infos)"
 _STEP: Final = "(observations, rewards, terminations, truncations, infos)"
@@ -516,9 +512,3 @@ def mask_of(value: Any, actions: spaces.Space[Any], owner: str, key: str = ACTIO
         f"expected {key!r} in {owner} to be {n_entries} zeros and ones (one per action), got {value!r}; give it at "
         "every step to every agent that acts, or pass action_masks=False"
     )
-
-
-def stuck(masks: np.ndarray, actions: spaces.Space[Any]) -> np.ndarray:
-    """Return which masks (B, A) allow nothing in some dimension of the actions, (B,) bool."""
-    starts = np.flatnonzero(first_choices(actions))
-    return (np.add.reduceat(masks != 0, starts, axis=1) == 0).any(axis=1)

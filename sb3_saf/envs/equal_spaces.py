@@ -11,7 +11,6 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from sb3_saf.envs.audit import (
-    INFO_MASKS,
     Trial,
     agents_of,
     mask_key_of,
@@ -22,7 +21,7 @@ from sb3_saf.envs.audit import (
     step_results,
     without_mask,
 )
-from sb3_saf.envs.gymnasium_team import GymnasiumTeam, is_gymnasium_team
+from sb3_saf.envs.gymnasium_team import INFO_MASKS, GymnasiumTeam, is_gymnasium_team
 from sb3_saf.envs.space_reader import FlatReader, SpaceReader
 from sb3_saf.teams.rows import ACTION_MASK_KEY, Array, n_mask_entries
 

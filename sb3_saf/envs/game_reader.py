@@ -12,7 +12,6 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_saf.envs.audit import (
-    INFO_MASKS,
     Trial,
     agents_of,
     mask_key_of,
@@ -22,6 +21,7 @@ from sb3_saf.envs.audit import (
     space_of,
     without_mask,
 )
+from sb3_saf.envs.gymnasium_team import INFO_MASKS
 from sb3_saf.envs.space_reader import FlatReader, SpaceReader, can_be_flattened, counted_from_zero
 from sb3_saf.teams.conversion import conversions_of
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, FIXED_SHAPE, STATE_KEY, TeamSpaces, n_mask_entries

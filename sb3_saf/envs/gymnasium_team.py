@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -12,14 +12,20 @@ from pettingzoo import ParallelEnv
 
 from sb3_saf.teams.rows import IS_SUCCESS
 
+#: Keys of infos under which games give action masks.
+INFO_MASKS: Final = ("action_mask", "action_masks", "avail_actions", "available_actions")
+#: Key by which some games say that all agents have ended.
+ALL: Final = "__all__"
+
 
 class GymnasiumTeam(ParallelEnv[str, Any, Any]):
     """
     PettingZoo ParallelEnv around a Gymnasium environment of several agents (``spaces.Tuple`` of observations and of
     actions, one reward per agent), such as level-based foraging and the multi-robot warehouse.
 
-    Agents are ``"agent_0"``, ``"agent_1"``, ... and end together. Each gets a copy of the environment's info, where a
-    list of N masks in ``info["action_mask"]`` becomes the agent's own mask.
+    Agents are ``"agent_0"``, ``"agent_1"``, ... They end together where the environment has one flag for all, or each
+    by its own flag where ``terminated`` and ``truncated`` are lists, arrays or dicts (also with ``"__all__"``). Each
+    gets a copy of the environment's info, where a list of N masks in ``info["action_mask"]`` becomes its own mask.
 
     :param env: the environment; ``make_team_env`` wraps such environments automatically
     :param is_ended: for an environment that reports its time limit as termination: returns whether the episode has
@@ -46,6 +52,7 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         self.agents: list[str] = []
         self.observation_spaces = dict(zip(self.possible_agents, observations.spaces, strict=True))
         self.action_spaces = dict(zip(self.possible_agents, actions.spaces, strict=True))
+        self._idle = {agent: _first_action(space) for agent, space in self.action_spaces.items()}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the space of an agent's observation."""
@@ -59,30 +66,39 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Begin an episode (see PettingZoo)."""
-        observations, info = self.env.reset(seed=seed, options=options)
+        result = self.env.reset(seed=seed, options=options)
+        if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], (Mapping, list, tuple)):
+            raise ValueError(
+                f"expected reset of {self.env} to return (observations, info), as Gymnasium does, got {result!r:.200}; "
+                "wrap an environment of the older gym, for instance by shimmy.GymV21CompatibilityV0"
+            )
         self.agents = list(self.possible_agents)
-        return self._by_agent("observations", observations), self._infos(info)
+        return self._by_agent("observations", result[0]), self._infos(result[1])
 
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Play one step with the actions of all agents (see PettingZoo)."""
-        observations, rewards, terminated, truncated, info = self.env.step([actions[a] for a in self.possible_agents])
-        is_over = bool(np.all(terminated)) or bool(np.all(truncated))
-        is_ended = bool(np.all(terminated)) if self._is_ended is None else is_over and self._is_ended(self.env)
+        """Play one step with the actions of the agents that take part (see PettingZoo); others get action 0."""
+        result = self.env.step([actions.get(agent, self._idle[agent]) for agent in self.possible_agents])
+        if not isinstance(result, tuple) or len(result) != 5:
+            raise ValueError(
+                f"expected step of {self.env} to return (observations, rewards, terminated, truncated, info), as "
+                f"Gymnasium does, got {result!r:.200}; wrap an environment of the older gym, for instance by "
+                "shimmy.GymV21CompatibilityV0"
+            )
+        observations, rewards, terminated, truncated, info = result
+        terminations, truncations = self._ends("terminated", terminated), self._ends("truncated", truncated)
         infos = self._infos(info)
-        if is_over:
-            self.agents = []
+        self.agents = [agent for agent in self.agents if not (terminations[agent] or truncations[agent])]
+        if not self.agents:
+            if self._is_ended is not None:
+                is_ended = self._is_ended(self.env)
+                terminations = dict.fromkeys(self.possible_agents, is_ended)
+                truncations = dict.fromkeys(self.possible_agents, not is_ended)
             if self._is_success is not None:
                 infos[self.possible_agents[0]][IS_SUCCESS] = self._is_success(self.env)
         given = {agent: float(reward) for agent, reward in self._by_agent("rewards", rewards).items()}
-        return (
-            self._by_agent("observations", observations),
-            given,
-            dict.fromkeys(self.possible_agents, is_ended),
-            dict.fromkeys(self.possible_agents, is_over and not is_ended),
-            infos,
-        )
+        return self._by_agent("observations", observations), given, terminations, truncations, infos
 
     def render(self) -> Any:
         """Return the environment's rendering."""
@@ -93,18 +109,42 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         self.env.close()
 
     def _by_agent(self, what: str, values: Any) -> dict[str, Any]:
-        if not isinstance(values, (Sequence, np.ndarray)) or len(values) != len(self.possible_agents):
+        """Return values by agent, from one for each agent in order, or a dict by the agents' names or indices."""
+        agents = self.possible_agents
+        if isinstance(values, Mapping):
+            for names in (agents, range(len(agents)), list(map(str, range(len(agents))))):
+                if set(names) <= set(values):
+                    return {agent: values[name] for agent, name in zip(agents, names, strict=True)}
+        if not isinstance(values, (Sequence, np.ndarray)) or len(values) != len(agents):
             raise ValueError(
-                f"expected {what} of {len(self.possible_agents)} agents from {self.env}, got {values!r:.200}; an "
-                "environment with one reward for all agents must give it to each: [reward] * n_agents"
+                f"expected {what} of {len(agents)} agents from {self.env}, got {values!r:.200}; an environment with "
+                "one value for all agents must give it to each: [value] * n_agents"
             )
-        return dict(zip(self.possible_agents, values, strict=True))
+        return dict(zip(agents, values, strict=True))
 
-    def _infos(self, info: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def _ends(self, what: str, value: Any) -> dict[str, bool]:
+        """Return which agents have ended: one flag for all, one for each, or a dict, also with ``"__all__"``."""
+        if isinstance(value, Mapping) and ALL in value:
+            others = {name: flag for name, flag in value.items() if name != ALL}
+            if value[ALL] or not others:
+                return dict.fromkeys(self.possible_agents, bool(value[ALL]))
+            value = others
+        flags = self._by_agent(what, value) if np.ndim(value) or isinstance(value, Mapping) else None
+        flags = dict.fromkeys(self.possible_agents, value) if flags is None else flags
+        wrong = [flag for flag in flags.values() if np.size(flag) != 1 or flag not in (0, 1)]
+        if wrong:
+            raise ValueError(f"expected True or False in {what} of {self.env}, got {wrong[0]!r}")
+        return {agent: bool(np.all(flag)) for agent, flag in flags.items()}
+
+    def _infos(self, info: Any) -> dict[str, dict[str, Any]]:
+        """Copy the info of all agents, or a list of one for each; lists of masks become each agent's own."""
+        if not isinstance(info, Mapping):
+            return {agent: dict(own) for agent, own in self._by_agent("infos", info).items()}
         infos = {agent: dict(info) for agent in self.possible_agents}
-        if "action_mask" in info:
-            for agent, mask in self._by_agent("action masks", info["action_mask"]).items():
-                infos[agent]["action_mask"] = mask
+        for key in INFO_MASKS:
+            if key in info:
+                for agent, mask in self._by_agent("action masks", info[key]).items():
+                    infos[agent][key] = mask
         return infos
 
 
@@ -131,3 +171,11 @@ def check_is_team(env: gym.Env[Any, Any]) -> None:
 def make_gymnasium(env_id: str, render_mode: str | None, params: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """Make an environment of Gymnasium's registry without the checks and wrappers for a single agent."""
     return gym.make(env_id, render_mode=render_mode, disable_env_checker=True, **params)
+
+
+def _first_action(space: spaces.Space[Any]) -> Any:
+    """Return an action for agents that have ended: 0, or the value nearest to it."""
+    if isinstance(space, spaces.Box):
+        return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+    start = space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else np.zeros(space.shape or ())
+    return np.asarray(start, dtype=space.dtype)[()]

@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_array, check_range, check_whole
+from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import (
@@ -23,16 +24,18 @@ from sb3_saf.teams.rows import (
     OBS_KEY,
     STATE_KEY,
     TEAM_KEY,
+    TERMINAL_OBSERVATION,
+    TRUNCATED,
     Array,
     TeamSpaces,
+    allows_nothing,
     channels_first,
+    first_choices,
 )
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, chosen_indices, require_n_agents, team_dones
 
 TimeLimit = Literal["terminal", "bootstrap"]
 
-TERMINAL_OBSERVATION: Final = "terminal_observation"
-TRUNCATED: Final = "TimeLimit.truncated"
 #: Name of the method that sb3-contrib calls.
 _ACTION_MASKS: Final = "action_masks"
 
@@ -96,6 +99,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self.team_spaces = team
         self._raw = raw
         self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
+        self._normalization = unwrap_vec_normalize(venv)
+        self._is_monitored = is_vecenv_wrapped(venv, TeamMonitor)
         self._n_steps = 0
         self._masks_shown: Array | None = None
         self._has_asked_for_masks = False
@@ -150,7 +155,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """
         Wait for the step of all games.
 
-        :return: Dict observation, rewards (B,), dones (B,) bool, infos; ``terminal_observation`` is a complete Dict
+        :return: Dict observation, rewards (B,), dones (B,) bool, infos; ``terminal_observation`` is a complete Dict.
+            With ``time_limit="bootstrap"``, the row of an agent that a time limit stops before its team is done then
         :raises ValueError: for NaN or infinity, dones that differ within a team, agents without a legal action, and
             missing terminal observations
         """
@@ -158,15 +164,37 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             self._warn_of_unused_masks()
         obs, rewards, dones, infos = self.venv.step_wait()
         self._n_steps += 1
-        check_finite("rewards", rewards, self.n_agents, self._n_steps)
+        if not self._is_monitored:
+            check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
+        joint, row_dones = self._joint_observation(obs), np.repeat(ended, self.n_agents)
+        infos = self._complete_infos(infos, ended)
+        if self.time_limit == "bootstrap" and self.team_spaces.has_active:
+            self._end_alone(joint, row_dones, infos)
         # Copies, because SB3 adds bootstrapped values to the rewards in place.
-        return (
-            self._joint_observation(obs),
-            np.array(rewards),
-            np.repeat(ended, self.n_agents),
-            self._complete_infos(infos, ended),
-        )
+        return joint, np.array(rewards), row_dones, infos
+
+    def _end_alone(
+        self, joint: dict[str, Array], row_dones: npt.NDArray[np.bool_], infos: list[dict[str, Any]]
+    ) -> None:
+        """
+        End the rows of agents that a time limit has stopped before their team, so that algorithms bootstrap them.
+
+        Their ``terminal_observation`` has their own last observation beside the present ones of their team.
+        """
+        for row, info in enumerate(infos):
+            if row_dones[row] or not info.get(TRUNCATED) or info.get(TERMINAL_OBSERVATION) is None:
+                continue
+            agent = row % self.n_agents
+            last_row = info[TERMINAL_OBSERVATION]
+            if self._normalization is not None:  # which normalises those of done rows only
+                last_row = self._normalization.normalize_obs(last_row)
+            entries = self._raw.entries(last_row, "terminal observations")
+            own = np.asarray(entries[OBS_KEY], dtype=self._raw.own.dtype)
+            last = {key: part[row].copy() for key, part in joint.items()}
+            last[OBS_KEY] = own if own.shape == self.team_spaces.own_shape else np.moveaxis(own, -1, 0)
+            last[TEAM_KEY][agent], last[ACTIVE_KEY][agent] = last[OBS_KEY], 1
+            row_dones[row], infos[row] = True, {**info, TERMINAL_OBSERVATION: last}
 
     def _warn_of_unused_masks(self) -> None:
         """Warn if games have action masks that are neither in the rows nor queried."""
@@ -181,6 +209,9 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     def _joint_observation(self, obs: object) -> dict[str, Array]:
         parts = self._checked_parts(obs, "observations")
+        if ACTIVE_KEY in parts:
+            # Rows of agents that take no part may hold a copy of another's, see the games' fill_idle_rows.
+            parts[OBS_KEY][parts[ACTIVE_KEY].reshape(-1) == 0] = 0
         teams = parts[OBS_KEY].reshape(self.n_games, *self.team_spaces.team.shape)
         joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0), AGENT_KEY: self._agents.copy()}
         if ACTIVE_KEY in parts:
@@ -231,7 +262,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """Check and copy action masks. Inactive rows, and last observations without masks, get action 0."""
         rows = np.array(masks, dtype=np.int8)
         idle = np.zeros(len(rows), dtype=bool) if active is None else active.reshape(-1) == 0
-        stuck = ~idle & ~rows.any(axis=1)
+        stuck = ~idle & allows_nothing(rows, self.action_space)
         if not are_last and stuck.any():
             row = int(np.flatnonzero(stuck)[0])
             raise ValueError(
@@ -239,7 +270,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"at step {self._n_steps} for agent {row % self.n_agents} of game {row // self.n_agents}; give agents "
                 "that have to wait for their turn one action that does nothing"
             )
-        rows[idle | stuck] = np.arange(rows.shape[1]) == 0
+        rows[idle | stuck] = first_choices(self.action_space)
         return rows
 
     def _complete_infos(self, infos: list[dict[str, Any]], ended: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:

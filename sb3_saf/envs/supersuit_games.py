@@ -23,7 +23,8 @@ from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.game_copies import Way, find_way, pickled, unpickled
 from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
-from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.envs.gymnasium_team import INFO_MASKS
+from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED, fill_idle_rows
 
 Info: TypeAlias = "dict[str, Any]"
 Infos: TypeAlias = "list[Info]"
@@ -31,7 +32,7 @@ Infos: TypeAlias = "list[Info]"
 #: Keys of infos that Stable-Baselines3 or this package uses. A game's own entries with these names are renamed.
 RESERVED_KEYS: Final = frozenset({TERMINAL_OBSERVATION, TRUNCATED, ACTIVE_KEY, "episode"})
 
-_MASKS = frozenset(audit.INFO_MASKS)
+_MASKS = frozenset(INFO_MASKS)
 _UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
 
 
@@ -44,7 +45,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
     Changes to :class:`supersuit.vector.MarkovVectorEnv`:
 
-    - an agent that has ended or not joined yet keeps its row;
+    - an agent that has ended or not joined yet keeps its row, with zeros, or with ``"active"`` a copy of another's;
     - rewards that the game pays to agents that do not act (after their end, while they are away) are in their rows;
     - the last step's infos are kept: those of the next episode's reset are in ``reset_infos``;
     - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
@@ -198,7 +199,10 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
                 for agent, own in rows.items()
             }
         empty: Any = create_empty_array(self.observation_space, self.num_envs)
-        return concatenate(self.observation_space, list(rows.values()), empty)
+        stacked: Any = concatenate(self.observation_space, list(rows.values()), empty)
+        if reader.rows.has_active and not over and isinstance(stacked[OBS_KEY], np.ndarray):
+            fill_idle_rows(stacked[OBS_KEY], stacked[ACTIVE_KEY])
+        return stacked
 
     def snapshot(self, way: Way) -> dict[str, Any]:
         """Return the complete state of the game, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""

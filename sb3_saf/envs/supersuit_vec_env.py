@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,9 @@ from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import Array
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
+
+#: Episodes of each game after which games that began alike are taken to ignore their seeds.
+_N_BEGINNINGS: Final = 10
 
 
 class SuperSuitVecEnv(TeamVecEnv):
@@ -94,8 +97,8 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._game_action_space = reader.action_space
         self._closed = self._begun = self._has_warned = False
         self._actions: Array | None = None
-        #: The first rows of the games, if all games began alike, None otherwise.
-        self._first_rows: bytes | None = None
+        #: Hashes of the first rows of each game's first episodes, to find games that ignore their seeds.
+        self._beginnings: list[list[int]] = []
         self._games: TeamConcatVecEnv | WorkerGames
         if n_cpus == 1:
             self._games = TeamConcatVecEnv(source, reader, range(n_games))
@@ -121,8 +124,8 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._begun, self._actions = False, None
         options = [own or None for own in self._options[:: self.n_agents]]
         observations, self.reset_infos = self._games.reset_all(self._seeds_of_games(), options)
-        games = {_bytes_of(observations, game, self.n_agents) for game in range(self.n_games)}
-        self._first_rows = games.pop() if len(games) == 1 and self.n_games > 1 and self._next_seeds else None
+        self._beginnings = [[] for _ in range(self.n_games)] if self._next_seeds and self.n_games > 1 else []
+        self._note_beginnings(observations, range(self.n_games))
         self._next_seeds = None
         self._reset_options()
         self._begun = True
@@ -152,20 +155,29 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._begun = True
         for row in np.flatnonzero(step.dones).tolist():
             self.reset_infos[row] = step.reset_infos[row]
-        notes = list(step.notes)
-        if self._first_rows is not None and step.dones.any():
-            game = int(np.flatnonzero(step.dones)[0]) // self.n_agents
-            if _bytes_of(step.observations, game, self.n_agents) != self._first_rows:
-                notes.append(
-                    f"all {self.n_games} games began alike, although their seeds differ and their episodes do: the "
-                    "game seems to ignore reset(seed=...), so that all copies play the same; draw episodes from a "
-                    "generator made in reset: if seed is not None: self.rng = np.random.default_rng(seed)"
-                )
-            self._first_rows = None
+        notes = [*step.notes, *self._note_beginnings(step.observations, np.flatnonzero(step.dones[:: self.n_agents]))]
         if notes and not self._has_warned:
             self._has_warned = True
             warnings.warn(f"{notes[0]}; later warnings are not reported", UserWarning, stacklevel=2)
         return step.observations, step.rewards, step.dones, step.infos
+
+    def _note_beginnings(self, observations: Any, begun: Iterable[int]) -> list[str]:
+        """Return a warning if all games began alike in ten episodes that differ."""
+        if not self._beginnings:
+            return []
+        for game in begun:
+            self._beginnings[game].append(hash(_bytes_of(observations, game, self.n_agents)))
+        if min(map(len, self._beginnings)) < _N_BEGINNINGS:
+            return []
+        first, *others = (beginnings[:_N_BEGINNINGS] for beginnings in self._beginnings)
+        self._beginnings = []
+        if len(set(first)) == 1 or any(other != first for other in others):
+            return []
+        return [
+            f"all {self.n_games} games began alike in {_N_BEGINNINGS} episodes, which differ, although their seeds are "
+            "different: the game seems to ignore reset(seed=...), so that all copies play the same; draw episodes from "
+            "a generator made in reset: if seed is not None: self.rng = np.random.default_rng(seed)"
+        ]
 
     def close(self) -> None:
         """Close all games and end the worker processes; a second call does nothing."""

@@ -10,8 +10,15 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, TeamSpaces
+from sb3_saf.teams.rows import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    TERMINAL_OBSERVATION,
+    TRUNCATED,
+    TeamSpaces,
+)
 
 
 class VecGame(ParallelEnv[Any, Any, Any]):

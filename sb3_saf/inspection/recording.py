@@ -35,7 +35,6 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.evaluation import PlayedStep, play
 from sb3_saf.inspection.reading import (
     OurPolicy,
@@ -48,7 +47,7 @@ from sb3_saf.inspection.reading import (
 from sb3_saf.policies.base import TeamMaskablePolicy
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY
+from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.teams.vec_env import require_n_agents
 
 Floats = npt.NDArray[np.float32]

@@ -236,7 +236,7 @@ class TeamPolicy(TeamRowsPolicy):
         :param action_masks: (B, M) of MaskablePPO; None allows everything
         :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In a rollout, values are computed lazily
         """
-        encoded = self._encoded(obs)
+        encoded = self._encoded(obs, of_step=True)
         distribution = self._distribution(obs, encoded.own, action_masks)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
@@ -308,10 +308,10 @@ class TeamPolicy(TeamRowsPolicy):
             "sb3_saf.TeamRolloutBuffer can."
         )
 
-    def _encoded(self, obs: PyTorchObs) -> Encoded:
-        """Encode the inputs of actor and critic."""
+    def _encoded(self, obs: PyTorchObs, of_step: bool = False) -> Encoded:
+        """Encode the inputs of actor and critic; ``of_step`` as in :meth:`encode_teams`."""
         if self._critic_reads_teams:
-            return Encoded(*self.encode_teams(obs))
+            return Encoded(*self.encode_teams(obs, of_step))
         return Encoded(self.encode_own(obs), None)
 
     @property

@@ -356,7 +356,7 @@ class TeamRowsPolicy(BasePolicy):
         """Encode the own observations of rows, or plain own observations."""
         return self.row_encoder.rows(self._own(obs))
 
-    def encode_teams(self, obs: PyTorchObs) -> tuple[EncodedRows, EncodedTeams]:
+    def encode_teams(self, obs: PyTorchObs, of_step: bool = False) -> tuple[EncodedRows, EncodedTeams]:
         """
         Encode the rows' own observations and those of their teams.
 
@@ -364,6 +364,8 @@ class TeamRowsPolicy(BasePolicy):
         teams are found by their joint observation.
 
         :param obs: rows
+        :param of_step: whether rows in the order of whole teams are those of a step of the environment, which are whole
+            teams by construction; otherwise, their joint observations are compared
         """
         if isinstance(obs, TeamMinibatch):
             observations, rows, active = obs.teams
@@ -371,13 +373,13 @@ class TeamRowsPolicy(BasePolicy):
             own = members if rows is None else members.at(rows)
             return own, EncodedTeams(members.features, members.arranged(observations.shape[:2]), rows, active)
         own, active = self.encode_own(obs), self._active(obs)
-        if not self._are_whole_teams(obs):
+        if not self._are_whole_teams(obs, of_step):
             return own, self.row_encoder.joint_rows(self._team(obs), self._agent(obs), own, active)
         n_agents = self.team_spaces.n_agents
         teams = own.arranged((own.n_rows // n_agents, n_agents))
         return own, EncodedTeams(own.features, teams, None, None if active is None else active[::n_agents])
 
-    def _are_whole_teams(self, obs: PyTorchObs) -> bool:
+    def _are_whole_teams(self, obs: PyTorchObs, of_step: bool) -> bool:
         """Return whether rows are whole teams with agents in index order, as in a step of all games."""
         n_agents, team, agent, own = self.team_spaces.n_agents, self._team(obs), self._agent(obs), self._own(obs)
         if len(agent) % n_agents or team.requires_grad or own.dtype != team.dtype:
@@ -386,6 +388,8 @@ class TeamRowsPolicy(BasePolicy):
         in_order = th.arange(n_agents, device=agent.device).expand(n_teams, -1)
         if not th.equal(agent.view(n_teams, n_agents), in_order):
             return False
+        if of_step:
+            return True
         active = self._active(obs)
         if active is not None:
             by_team = active.view(n_teams, n_agents, n_agents)

@@ -28,12 +28,21 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
-from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION
 from sb3_saf.qplex.learning import TeamError, team_errors
 from sb3_saf.qplex.mixers import MixerName
 from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy, State
 from sb3_saf.teams.checks import check_count, check_whole_teams
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
+from sb3_saf.teams.rows import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    TERMINAL_OBSERVATION,
+    Array,
+    TeamSpaces,
+)
+from sb3_saf.teams.vec_env import team_dones
 
 SelfQPLEX = TypeVar("SelfQPLEX", bound="QPLEX")
 
@@ -321,6 +330,7 @@ class QPLEX(OffPolicyAlgorithm):
         actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
         new_obs, rewards, dones, infos = env.step(actions)
         assert isinstance(new_obs, dict)
+        dones = team_dones(dones, self.n_agents, alone=True).repeat(self.n_agents)
         self.num_timesteps += env.num_envs
         callback.update_locals(locals())
         if not callback.on_step():

@@ -302,6 +302,27 @@ def first_choices(action_space: spaces.Space[Any]) -> Array:
     return mask
 
 
+def allows_nothing(masks: Array, action_space: spaces.Space[Any]) -> npt.NDArray[np.bool_]:
+    """Return which masks (B, A) allow no choice in some dimension of the actions, (B,)."""
+    starts = np.flatnonzero(first_choices(action_space))
+    return np.asarray((np.add.reduceat(masks != 0, starts, axis=1, dtype=np.int64) == 0).any(axis=1))
+
+
+def fill_idle_rows(rows: Array, active: Array) -> None:
+    """
+    Fill the own observations of agents that take no part with copies of those of their team that do.
+
+    Statistics over rows (SB3's VecNormalize) then are those of agents that take part; ``CentralizedValueWrapper`` sets
+    the rows of the others to zero.
+
+    :param rows: (N, ...) own observations of a team, which are changed
+    :param active: (N,) which agents take part
+    """
+    acting, idle = np.flatnonzero(active), np.flatnonzero(np.asarray(active) == 0)
+    if len(acting) and len(idle):
+        rows[idle] = rows[acting[np.arange(len(idle)) % len(acting)]]
+
+
 def check_masks(action_mask: spaces.Space[Any] | None, action_space: spaces.Space[Any]) -> None:
     """Raise ValueError unless the space of action masks, if there is one, fits the actions."""
     n_entries = n_mask_entries(action_space)

@@ -190,18 +190,22 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     return size
 
 
-def team_dones(dones: Array, n_agents: int) -> npt.NDArray[np.bool_]:
+def team_dones(dones: Array, n_agents: int, alone: bool = False) -> npt.NDArray[np.bool_]:
     """
     Return which games have ended.
 
     :param dones: (B,) one flag per row, of any dtype
     :param n_agents: N
+    :param alone: whether rows may be done before their team, as those of agents that a time limit has stopped are above
+        ``CentralizedValueWrapper(time_limit="bootstrap")``
     :return: (E,)
     :raises ValueError: if the flags differ within a team
     """
     by_game = np.asarray(dones).astype(bool).reshape(-1, n_agents)
     if not by_game.any():
         return np.zeros(len(by_game), dtype=np.bool_)
+    if alone:
+        return np.asarray(by_game.all(axis=1))
     ended = by_game[:, 0]
     if (by_game != ended[:, np.newaxis]).any():
         game = int(np.flatnonzero((by_game != ended[:, np.newaxis]).any(axis=1))[0])

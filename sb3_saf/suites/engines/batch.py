@@ -13,10 +13,18 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_keys, check_like, check_list, check_whole
-from sb3_saf.envs.joint_observation import TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.envs.space_reader import checked_actions
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.rows import IS_SUCCESS, Array, TeamSpaces
+from sb3_saf.teams.rows import (
+    ACTIVE_KEY,
+    IS_SUCCESS,
+    OBS_KEY,
+    TERMINAL_OBSERVATION,
+    TRUNCATED,
+    Array,
+    TeamSpaces,
+    fill_idle_rows,
+)
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 
@@ -130,7 +138,7 @@ class BatchVecEnv(TeamVecEnv):
         if any(self._options):
             raise ValueError(f"expected no options for the reset of batched games, got {self._options[0]}")
         self._actions = None
-        rows = self.batch.reset(self._next_seeds)
+        rows = _filled(self.batch.reset(self._next_seeds), self.n_agents)
         self._next_seeds = None
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._running = True
@@ -160,7 +168,7 @@ class BatchVecEnv(TeamVecEnv):
         step = self.batch.step(actions)
         rewards = np.array(step.rewards, dtype=np.float32).reshape(self.num_envs)
         dones = step.ended.repeat(self.n_agents)
-        return step.rows, rewards, dones, self._infos(step, dones)
+        return _filled(step.rows, self.n_agents), rewards, dones, self._infos(step, dones)
 
     def _infos(self, step: BatchStep, dones: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:
         infos: list[dict[str, Any]] = [{}] * self.num_envs
@@ -203,6 +211,17 @@ class BatchVecEnv(TeamVecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Return False for each row: none is wrapped in a Gymnasium wrapper."""
         return [False for _ in chosen_indices(indices, self.num_envs)]
+
+
+def _filled(rows: dict[str, Array], n_agents: int) -> dict[str, Array]:
+    """Fill the own observations of agents that take no part, see :func:`sb3_saf.teams.rows.fill_idle_rows`."""
+    if ACTIVE_KEY not in rows or rows[ACTIVE_KEY].all():
+        return rows
+    own, active = np.array(rows[OBS_KEY]), rows[ACTIVE_KEY].reshape(-1, n_agents)
+    by_game = own.reshape(-1, n_agents, *own.shape[1:])
+    for game in np.flatnonzero((active == 0).any(axis=1)):
+        fill_idle_rows(by_game[game], active[game])
+    return {**rows, OBS_KEY: own}
 
 
 class ResumableBatchVecEnv(BatchVecEnv):
