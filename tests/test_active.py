@@ -250,7 +250,7 @@ def test_returns_of_the_dead_go_on_where_their_team_is_paid(n_steps: int) -> Non
     assert not rows.all()
     np.testing.assert_allclose(team.advantages[rows], immortal.advantages[rows], rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(team.returns[rows], immortal.returns[rows], rtol=1e-5, atol=1e-5)
-    with pytest.raises(ValueError, match="ends must be .*'own'"):
+    with pytest.raises(ValueError, match=r"ends must be .*'own'"):
         make_buffer(env, n_steps, ends="all")
 
 

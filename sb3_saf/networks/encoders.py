@@ -268,7 +268,7 @@ class PaperCNN(Encoder):
             self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Encode observations (K, *shape) as (K, features_dim)."""
+        """Encode observations (K, ...) as (K, features_dim)."""
         if self._places is None or not self.pixels.looks_up(observations):
             return self.net(self.pixels(observations))
         first = self.net[0]
@@ -302,7 +302,7 @@ class NatureEncoder(Encoder):
         self.nature = NatureCNN(spaces.Box(0, 255, self.pixels.shape, np.uint8), features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Encode observations (K, *shape) as (K, features_dim)."""
+        """Encode observations (K, ...) as (K, features_dim)."""
         return self.nature(self.pixels(observations))
 
 
@@ -367,7 +367,7 @@ class LightEncoder(Encoder):
         self._places = places_of_linear(self.n_tiles)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Encode observations (K, *shape) as (K, features_dim)."""
+        """Encode observations (K, ...) as (K, features_dim)."""
         if self.pixels.looks_up(observations):
             return self.net[2:](self._first_layer(observations))
         if self.pixels.layout == "codes":
@@ -416,7 +416,7 @@ class MLPEncoder(Encoder):
             self.register_buffer("divisor", th.from_numpy(divisor), persistent=False)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Encode observations (K, *shape), raw or preprocessed, as (K, features_dim)."""
+        """Encode observations (K, ...), raw or preprocessed, as (K, features_dim)."""
         if not observations.is_floating_point():
             observations = preprocess_obs(observations, self.space)  # type: ignore[assignment]
         return self.net((observations / self.divisor if self.is_scaled else observations).flatten(1))
@@ -490,7 +490,7 @@ class ObservationEncoder(Encoder):
             _warn_if_large(self.encoder, observation_space)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Encode observations (K, *shape) as (K, features_dim)."""
+        """Encode observations (K, ...) as (K, features_dim)."""
         return self.encoder(observations)
 
 
