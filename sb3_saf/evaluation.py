@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, STAGGERED, Array
-from sb3_saf.teams.vec_env import find_n_agents, team_dones
+from sb3_saf.teams.vec_env import episode_value, find_n_agents, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -48,12 +48,14 @@ class EvaluationResult(NamedTuple):
     :param returns: team return of each episode, the sum of the rewards of all agents over all steps
     :param lengths: game steps of each episode
     :param successes: whether each episode was won; empty if the games do not report it (``"is_success"`` in the last
-        info of agent 0)
+        infos)
+    :param agent_returns: (episodes, N) own return of each agent, the sum of its rewards
     """
 
     returns: list[float]
     lengths: list[int]
     successes: tuple[bool, ...] = ()
+    agent_returns: tuple[tuple[float, ...], ...] = ()
 
     @property
     def mean(self) -> float:
@@ -69,6 +71,11 @@ class EvaluationResult(NamedTuple):
     def success_rate(self) -> float | None:
         """Fraction of episodes won; None if the games do not report it."""
         return float(np.mean(self.successes)) if self.successes else None
+
+    @property
+    def agent_means(self) -> tuple[float, ...]:
+        """(N,) mean return of each agent."""
+        return tuple(float(value) for value in np.mean(self.agent_returns, axis=0)) if self.agent_returns else ()
 
     def interval(self, confidence: float = 0.95) -> Interval:
         """Return Student's t interval of the mean team return."""
@@ -309,25 +316,31 @@ def evaluate_team(
     returns: list[float] = []
     lengths: list[int] = []
     successes: list[bool] = []
-    returns_now, lengths_now = np.zeros(n_games), np.zeros(n_games, dtype=np.int64)
+    agent_returns: list[tuple[float, ...]] = []
+    returns_now, lengths_now = np.zeros((n_games, n_agents)), np.zeros(n_games, dtype=np.int64)
     for step in play(env, actions_of(model, env, deterministic), n_eval_episodes):
-        rewards = step.rewards.reshape(n_games, n_agents).sum(axis=1, dtype=np.float64)
+        rewards = step.rewards.reshape(n_games, n_agents).astype(np.float64)
         returns_now += rewards
         lengths_now += 1
         for i in np.flatnonzero(step.counted).tolist():
-            info, reward, done = step.infos[i * n_agents], float(rewards[i]), bool(step.ended[i])
+            infos = step.infos[i * n_agents : (i + 1) * n_agents]
+            info, reward, done = infos[0], float(rewards[i].sum()), bool(step.ended[i])
             if callback is not None:
                 callback(locals(), globals())
             if not done or STAGGERED in info:
                 continue
-            returns.append(float(info["episode"]["r"] if monitored else returns_now[i]))
-            lengths.append(int(info["episode"]["l"] if monitored else lengths_now[i]))
-            if (won := info.get(IS_SUCCESS)) is not None:
-                successes.append(bool(won))
+            episode = {"r": returns_now[i].sum(), "l": lengths_now[i], "agents": returns_now[i].tolist()}
+            if monitored:
+                episode = info["episode"]
+            returns.append(float(episode["r"]))
+            lengths.append(int(episode["l"]))
+            agent_returns.append(tuple(episode["agents"]))
+            if (won := episode_value(infos, IS_SUCCESS)) is not None:
+                successes.append(won)
         returns_now[step.ended], lengths_now[step.ended] = 0, 0
         if render:
             env.render()
-    return EvaluationResult(returns, lengths, tuple(successes))
+    return EvaluationResult(returns, lengths, tuple(successes), tuple(agent_returns))
 
 
 def _team_size(env: VecEnv) -> int:

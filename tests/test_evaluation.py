@@ -21,6 +21,7 @@ from sb3_saf import inspect_team, make_team_env, ppo_settings, replay
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import (
     EvaluationResult,
     RandomPolicy,
@@ -66,8 +67,9 @@ class TestEvaluatePolicy:
         assert returns == [60, 9, 60, 9]
         assert lengths == [2, 3, 2, 3]
         assert evaluate_policy(StillPolicy(), env, 4) == (34.5, 25.5)
+        by_agent = ((20.0,) * 3, (3.0,) * 3) * 2
         assert evaluate_team(StillPolicy(), env, 4) == EvaluationResult(
-            [60, 9, 60, 9], [2, 3, 2, 3], (False, False, True, True)
+            [60, 9, 60, 9], [2, 3, 2, 3], (False, False, True, True), by_agent
         )
 
     def test_sb3_alone_counts_agents(self) -> None:
@@ -162,6 +164,63 @@ class TestEvaluatePolicy:
     def test_number_of_episodes(self, n_episodes: Any) -> None:
         with pytest.raises(ValueError, match=f"n_eval_episodes must be an integer of at least 1, got {n_episodes}"):
             evaluate_policy(StillPolicy(), teams(), n_episodes)
+
+
+class Outcome(ParallelEnv[str, Any, Any]):
+    """
+    Agent i is paid i at each of four steps; every second game is won. Agent a dies in lost games.
+
+    :param told: who is told the outcome: "acting" agents at the end, the agents at their own "end", all at "every" step
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "outcome"}
+    possible_agents: ClassVar[list[str]] = ["a", "b"]
+
+    def __init__(self, told: str) -> None:
+        self.told, self.n_games = told, 0
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Box(-1, 1, (1,), np.float32)
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Discrete(2)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.agents, self.steps = ["a", "b"], 0
+        self.n_games += 1
+        return self._seen(), {agent: {} for agent in self.agents}
+
+    def _seen(self) -> dict[str, Any]:
+        return {agent: np.zeros(1, np.float32) for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        self.steps += 1
+        won, team, observations = self.n_games % 2 == 0, list(self.agents), self._seen()
+        ends = {agent: self.steps == 4 or (agent == "a" and self.steps == 2 and not won) for agent in team}
+        infos: dict[str, dict[str, Any]] = {agent: {} for agent in team}
+        for agent in team:
+            if (
+                self.told == "every"
+                or (self.told == "acting" and self.steps == 4)
+                or (self.told == "a" == agent and ends["a"])
+            ):
+                infos[agent] = {"is_success": won and self.steps == 4, "score": 7 if won else 3}
+        self.agents = [agent for agent in team if not ends[agent]]
+        return observations, {a: float("ab".index(a)) for a in team}, ends, dict.fromkeys(team, False), infos
+
+
+@pytest.mark.parametrize("told", ["acting", "every", "a"])
+def test_what_is_of_the_episode_is_found_wherever_the_game_puts_it(told: str, tmp_path: Path) -> None:
+    venv = SuperSuitVecEnv(partial(Outcome, told), 2, seed=0, active=True, action_masks="auto")
+    env = CentralizedValueWrapper(TeamMonitor(venv, str(tmp_path / "monitor.csv"), info_keywords=("score",)))
+    result = evaluate_team(RandomPolicy(env, seed=0), env, 20)
+    assert len(result.returns) == len(result.successes) == 20 and result.success_rate == 0.5
+    assert result.agent_means == (0, 4) and result.agent_returns[0] == (0, 4)
+    model = PPO("IPPOPolicy", env, **ppo_settings(env, n_steps=8), seed=0).learn(2 * 2 * 8 * 4)
+    assert model.ep_info_buffer is not None and model.ep_success_buffer is not None
+    assert len(model.ep_success_buffer) == len(model.ep_info_buffer) == 16
+    assert np.mean(model.ep_success_buffer) == 0.5
+    assert sorted(entry["score"] for entry in model.ep_info_buffer) == [3] * 8 + [7] * 8
 
 
 class TestIntervals:
@@ -361,7 +420,10 @@ class TestTeamEvalCallback:
         callback = TeamEvalCallback(eval_env, n_eval_episodes=4, eval_freq=8, log_path=str(tmp_path), verbose=0)
         self.learn(callback, 36, tmp_path, n_games=3)
         saved = np.load(tmp_path / "evaluations.npz")
-        assert sorted(saved) == ["ep_lengths", "game_steps", "results", "successes", "timesteps"]
+        assert sorted(saved) == ["agent_results", "ep_lengths", "game_steps", "results", "successes", "timesteps"]
+        assert (
+            saved["agent_results"].shape == (4, 4, 3) and (saved["agent_results"].sum(axis=2) == saved["results"]).all()
+        )
         assert saved["game_steps"].tolist() == [9, 18, 24, 33]
         assert saved["timesteps"].tolist() == [27, 54, 72, 99]
         assert saved["results"].tolist() == [[60, 9, 60, 9]] * 4
@@ -378,6 +440,7 @@ class TestTeamEvalCallback:
         assert [float(row["eval/mean_reward"]) for row in log] == [34.5, 34.5]
         assert [float(row["eval/mean_ep_length"]) for row in log] == [2.5, 2.5]
         assert [float(row["eval/success_rate"]) for row in log] == [0.5, 0.5]
+        assert [float(row["eval/mean_reward/2"]) for row in log] == [11.5, 11.5]
 
     def test_the_best_model_is_kept_and_callbacks_are_called(self, tmp_path: Path) -> None:
         rewards = iter([1.0, 3.0, 2.0, 4.0])
@@ -393,10 +456,10 @@ class TestTeamEvalCallback:
         callback = TeamEvalCallback(
             eval_env, best, after, n_eval_episodes=1, eval_freq=2, best_model_save_path=str(tmp_path), verbose=0
         )
-        self.learn(callback, 8, tmp_path)
+        self.learn(callback, 16, tmp_path)  # four rollouts, with one evaluation each
         assert (best.n_calls, after.n_calls) == (3, 4)
         assert (callback.best_mean_reward, callback.last_mean_reward) == (12, 12)
-        assert PPO.load(tmp_path / "best_model").num_timesteps == 24
+        assert PPO.load(tmp_path / "best_model").num_timesteps == 42
         assert best.model is after.model is callback.model
 
     def test_callbacks_can_stop_the_training(self, tmp_path: Path) -> None:
@@ -428,7 +491,9 @@ class TestTeamEvalCallback:
     def test_it_says_what_it_finds(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         eval_env = teams(lengths=(3, 2), reward=constant(1, 10))
         self.learn(TeamEvalCallback(eval_env, n_eval_episodes=2, eval_freq=8), 8, tmp_path)
-        assert capsys.readouterr().out == (
+        *said, share = capsys.readouterr().out.splitlines(keepends=True)
+        assert share.startswith("Evaluation took ") and share.endswith(" % of the time\n")
+        assert "".join(said) == (
             "Evaluation after 8 game steps: team return 34.50 [-289.51, 358.51] (95 %, Student's t, 2 team episodes, "
             "0 % won), 2.50 steps per episode\nSuccess rate: 0.00 %\nNew best mean team return\n"
         )

@@ -159,14 +159,13 @@ def test_keywords_that_are_columns_are_refused() -> None:
         TeamMonitor(TeamVenv(), info_keywords=("score", "l"))
 
 
-def test_missing_info_keyword_is_named() -> None:
-    env = TeamMonitor(TeamVenv(lengths=(2,)), info_keywords=("score", "episode_number"))
-    with pytest.raises(
-        ValueError,
-        match=r"expected the info_keywords \['score', 'episode_number'\] in the last info of agent 0, got .* in game "
-        r"0; leave out \['score'\] or let the environment give them",
-    ):
-        play(env, 2)
+def test_missing_info_keyword_is_named_once(tmp_path: Path) -> None:
+    env = TeamMonitor(TeamVenv(lengths=(2,)), str(tmp_path / "monitor.csv"), ("score", "episode_number"))
+    with pytest.warns(UserWarning, match=r"one without \['score'\], of game 0") as told:
+        infos = play(env, 4)
+    assert len(told) == 1
+    assert [infos[step][0]["episode"]["score"] for step in (1, 3)] == [None, None]
+    assert [infos[step][0]["episode"]["episode_number"] for step in (1, 3)] == [0, 1]
 
 
 def test_nan_reward_stops_the_run() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -10,22 +11,24 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, show_game_steps, team_steps
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
-from sb3_saf.teams.vec_env import check_other_games, require_n_agents
+from sb3_saf.teams.vec_env import agent_names, check_other_games, require_n_agents
 
 
 class TeamEvalCallback(EvalCallback):
     """
     SB3's EvalCallback for teams.
 
-    It writes the same results: ``evaluations.npz`` (with one more array, ``game_steps``), ``best_model.zip``,
-    ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/success_rate``, and also ``eval/game_steps``. Returns are team
-    returns, lengths are game steps. SB3's ``timesteps`` remain agent steps (game steps x N).
+    It writes the same results: ``evaluations.npz`` (with two more arrays, ``game_steps`` and ``agent_results``, the
+    agents' own returns), ``best_model.zip``, ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/success_rate``, and
+    also ``eval/game_steps`` and, not on the screen, ``eval/mean_reward/AGENT`` for each agent. Returns are the team's,
+    lengths are game steps. SB3's ``timesteps`` remain agent steps (game steps x N).
 
     :param eval_env: environment of teams, for instance from ``make_team_env`` with another seed
     :param callback_on_new_best: called when the mean team return is the best so far
     :param callback_after_eval: called after every evaluation
     :param n_eval_episodes: team episodes per evaluation
-    :param eval_freq: **game steps** between evaluations, summed over all parallel games; 0 or less for none
+    :param eval_freq: **game steps** between evaluations, summed over all parallel games; 0 or less for none. A rollout
+        has one evaluation at most, since the model does not change in it
     :param log_path: folder for ``evaluations.npz``
     :param best_model_save_path: folder for ``best_model.zip``
     :param deterministic: whether the model takes its most likely actions
@@ -64,7 +67,10 @@ class TeamEvalCallback(EvalCallback):
             warn=warn,
         )
         self.evaluations_game_steps: list[int] = []
+        self.evaluations_agent_results: list[list[list[float]]] = []
         self._next_evaluation = 0
+        self._is_done_for_rollout = False
+        self._started = self._seconds = 0.0
 
     def _init_callback(self) -> None:
         require_n_agents(self.training_env)
@@ -75,7 +81,18 @@ class TeamEvalCallback(EvalCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
+        self._started, self._seconds = time.monotonic(), 0.0
         self._plan_next()
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        self._is_done_for_rollout = False
+
+    def _on_training_end(self) -> None:
+        super()._on_training_end()
+        if self._seconds:
+            share = self._seconds / (time.monotonic() - self._started)
+            self._say(f"Evaluation took {100 * share:.0f} % of the time")
 
     def _game_steps(self) -> int:
         return team_steps(self.model)
@@ -86,24 +103,21 @@ class TeamEvalCallback(EvalCallback):
             self._next_evaluation = (self._game_steps() // self.eval_freq + 1) * self.eval_freq
 
     def _on_step(self) -> bool:
-        if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation:
+        if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation or self._is_done_for_rollout:
             return True
         self._plan_next()
-        return self._evaluate()
+        self._is_done_for_rollout = True  # the model does not change before the next rollout
+        begin = time.monotonic()
+        go_on = self._evaluate()
+        self._seconds += time.monotonic() - begin
+        return go_on
 
     def _evaluate(self) -> bool:
         """Play, store and log; return whether training continues."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
-        self._is_success_buffer = []
         result = evaluate_team(
-            self.model,
-            self.eval_env,
-            self.n_eval_episodes,
-            self.deterministic,
-            render=self.render,
-            callback=self._log_success_callback,
-            warn=self.warn,
+            self.model, self.eval_env, self.n_eval_episodes, self.deterministic, render=self.render, warn=self.warn
         )
         self.last_mean_reward = result.mean
         self._store(result)
@@ -116,15 +130,17 @@ class TeamEvalCallback(EvalCallback):
         self.evaluations_timesteps.append(self.num_timesteps)
         self.evaluations_game_steps.append(self._game_steps())
         self.evaluations_results.append(result.returns)
+        self.evaluations_agent_results.append([list(returns) for returns in result.agent_returns])
         self.evaluations_length.append(result.lengths)
         arrays = {
             "timesteps": np.array(self.evaluations_timesteps),
             "game_steps": np.array(self.evaluations_game_steps),
             "results": np.array(self.evaluations_results),
+            "agent_results": np.array(self.evaluations_agent_results),
             "ep_lengths": np.array(self.evaluations_length),
         }
-        if self._is_success_buffer:
-            self.evaluations_successes.append(self._is_success_buffer)
+        if result.successes:
+            self.evaluations_successes.append(list(result.successes))
             arrays["successes"] = np.array(self.evaluations_successes)
         np.savez(self.log_path, **arrays)  # type: ignore[arg-type]
 
@@ -134,10 +150,11 @@ class TeamEvalCallback(EvalCallback):
         self.logger.record("eval/mean_reward", result.mean)
         self.logger.record("eval/mean_ep_length", mean_length)
         self.logger.record("eval/game_steps", steps)
-        if self._is_success_buffer:
-            success_rate = float(np.mean(self._is_success_buffer))
-            self._say(f"Success rate: {100 * success_rate:.2f} %")
-            self.logger.record("eval/success_rate", success_rate)
+        for name, mean in zip(agent_names(self.eval_env), result.agent_means, strict=True):
+            self.logger.record(f"eval/mean_reward/{name}", mean, exclude="stdout")
+        if result.success_rate is not None:
+            self._say(f"Success rate: {100 * result.success_rate:.2f} %")
+            self.logger.record("eval/success_rate", result.success_rate)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.record(GAME_STEPS_TAG, steps)
         self.logger.dump(self.num_timesteps)

@@ -7,6 +7,7 @@ import time
 import warnings
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
@@ -14,7 +15,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.rows import TEAM_KEY, TEAM_KEYS
-from sb3_saf.teams.vec_env import find_n_agents
+from sb3_saf.teams.vec_env import agent_names, find_n_agents
 
 GAME_STEPS_TAG = "time/game_steps"
 GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"
@@ -107,7 +108,8 @@ def show_game_steps(model: BaseAlgorithm) -> None:
 class GameStepsCallback(BaseCallback):
     """
     Log ``time/game_steps`` and ``time/game_steps_per_second`` beside SB3's ``time/total_timesteps`` and ``time/fps``,
-    which count agent steps, and make TensorBoard's x-axis count game steps. Without teams it does nothing.
+    which count agent steps, and make TensorBoard's x-axis count game steps; log each agent's own return beside the
+    team's, ``rollout/ep_rew_mean/AGENT``, but not on the screen. Without teams it does nothing.
 
     Before training it checks policy, buffer and batch size (:func:`check_training`).
 
@@ -135,3 +137,10 @@ class GameStepsCallback(BaseCallback):
             self.logger.record(GAME_STEPS_TAG, self.num_timesteps // self._n_agents)
             self.logger.record(GAME_STEPS_PER_SECOND_TAG, round(rate, 1))
         return True
+
+    def _on_rollout_end(self) -> None:
+        """Log the agents' own mean returns over the episodes of SB3's ``rollout/ep_rew_mean``."""
+        episodes = [episode["agents"] for episode in self.model.ep_info_buffer or () if "agents" in episode]
+        if self._n_agents is not None and episodes:
+            for name, mean in zip(agent_names(self.training_env), np.mean(episodes, axis=0).tolist(), strict=True):
+                self.logger.record(f"rollout/ep_rew_mean/{name}", mean, exclude="stdout")

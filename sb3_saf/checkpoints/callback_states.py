@@ -31,8 +31,8 @@ from sb3_saf.checkpoints.environments import (
 )
 from sb3_saf.inspection.callback import InspectionCallback
 
-#: Kinds of counters: an integer, any number, a list of integers, a list of evaluations.
-_Kind = Literal["whole", "real", "steps", "results"]
+#: Kinds of counters: an integer, any number, a list of integers, a list of evaluations, the same for each agent.
+_Kind = Literal["whole", "real", "steps", "results", "agents"]
 
 #: Counters of callbacks, the only attributes that a checkpoint sets.
 _COUNTERS: Final[dict[Any, dict[str, _Kind]]] = {
@@ -45,7 +45,11 @@ _COUNTERS: Final[dict[Any, dict[str, _Kind]]] = {
         "evaluations_length": "results",
         "evaluations_successes": "results",
     },
-    TeamEvalCallback: {"evaluations_game_steps": "steps", "_next_evaluation": "whole"},
+    TeamEvalCallback: {
+        "evaluations_game_steps": "steps",
+        "evaluations_agent_results": "agents",
+        "_next_evaluation": "whole",
+    },
     EveryNTimesteps: {"last_time_trigger": "whole"},
     StopTrainingOnMaxEpisodes: {"n_episodes": "whole"},
     StopTrainingOnNoModelImprovement: {"last_best_mean_reward": "real", "no_improvement_evals": "whole"},
@@ -129,6 +133,8 @@ def _check_counter(callback: BaseCallback, value: Tree, kind: _Kind, name: str) 
         for entry in value:
             if kind == "steps":
                 check_whole(entry, name)
+            elif kind == "agents":
+                check_list(entry, name)
             else:
                 _check_evaluation(callback, entry, name)
 

@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import IO, Any, Final, Literal
 
 import numpy as np
@@ -15,7 +15,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.checkpoints.checks import check_array, check_real, check_whole
-from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, team_dones
+from sb3_saf.teams.rows import IS_SUCCESS
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, episode_value, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
 
@@ -25,9 +26,13 @@ class TeamMonitor(TeamVecEnvWrapper):
     Count team episodes.
 
     When the episode of a game ends, only the info of its **agent 0** gets ``info["episode"] = {"r": team return, "l":
-    game steps, "t": seconds since the start}``, where the team return is the sum of the rewards of all agents over all
-    steps (``team_return="mean"``: their mean over agents). SB3 logs the mean of these entries, so
-    ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
+    game steps, "t": seconds since the start, "agents": [each agent's own return]}``, where the team return is the sum
+    of the rewards of all agents over all steps (``team_return="mean"``: their mean over agents). SB3 logs the mean of
+    these entries, so ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
+
+    What is of the episode is taken from whichever agent's info the game puts it in, agents that are out included, and
+    then is in that of agent 0 only: ``"is_success"`` (if agents report differently: whether all succeeded) and
+    ``info_keywords``. Infos of the last step count, or, if none has the entry, the latest of the episode.
 
     It is not a subclass of VecMonitor, because SB3's ``evaluate_policy`` would wait for an ``"episode"`` entry in every
     row and never return. With a TeamMonitor it counts every agent as an episode and warns; use
@@ -36,7 +41,7 @@ class TeamMonitor(TeamVecEnvWrapper):
     :param venv: rows of flattened teams, game-major, then agent
     :param filename: file or folder for a ``monitor.csv`` as SB3 writes it, one line per team episode; None for none. It
         is created at the first step. An existing file is kept as ``monitor.csv.1``, ``monitor.csv.2`` ...
-    :param info_keywords: entries of agent 0's last info to add to the episode's
+    :param info_keywords: entries of infos to add to the episode's; None in an episode without them, with one warning
     :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
     :param team_return: team return as the sum of the agents' rewards, or as their mean if every agent is given the
         whole reward of its team
@@ -63,9 +68,13 @@ class TeamMonitor(TeamVecEnvWrapper):
                 "the environment give them other names"
             )
         self.info_keywords = info_keywords
+        self._of_episode = (IS_SUCCESS, *info_keywords)
         self.episode_count = 0
         self.t_start = time.time()
-        self._returns = np.zeros(self.n_games, dtype=np.float64)
+        self._returns = np.zeros((self.n_games, self.n_agents), dtype=np.float64)
+        #: Latest entries of infos that are of the episode, by game.
+        self._notes: list[dict[str, Any]] = [{} for _ in range(self.n_games)]
+        self._has_warned = False
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
         self._filename = filename
@@ -75,6 +84,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         """Start new episodes in all games; unfinished ones are not counted."""
         self._returns[:] = 0
         self._lengths[:] = 0
+        self._notes = [{} for _ in range(self.n_games)]
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -91,35 +101,48 @@ class TeamMonitor(TeamVecEnvWrapper):
         check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
         # float64, because sums of many float32 rewards are inexact.
-        by_game = rewards.reshape(self.n_games, self.n_agents)
-        self._returns += by_game.sum(axis=1, dtype=np.float64) * self._share
+        self._returns += rewards.reshape(self.n_games, self.n_agents)
         self._lengths += 1
+        for row, info in enumerate(infos):
+            if info and not ended[row // self.n_agents]:
+                self._notes[row // self.n_agents].update({key: info[key] for key in self._of_episode if key in info})
         if ended.any():
             infos = list(infos)
             for game in np.flatnonzero(ended).tolist():
-                row = game * self.n_agents
-                infos[row] = {**infos[row], "episode": self._finish_episode(game, infos[row])}
+                rows = slice(game * self.n_agents, (game + 1) * self.n_agents)
+                infos[rows] = self._finish_episode(game, infos[rows])
         return obs, rewards, dones, infos
 
-    def _finish_episode(self, game: int, info: dict[str, Any]) -> dict[str, Any]:
-        missing = [key for key in self.info_keywords if key not in info]
-        if missing:
-            raise ValueError(
-                f"expected the info_keywords {list(self.info_keywords)} in the last info of agent 0, got "
-                f"{sorted(map(str, info))} in game {game}; leave out {missing} or let the environment give them"
+    def _finish_episode(self, game: int, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return the last infos of a game's agents, with the episode in that of agent 0."""
+        last = {key: value for key in self._of_episode if (value := episode_value(infos, key)) is not None}
+        of_episode = {**self._notes[game], **last}
+        missing = [key for key in self.info_keywords if key not in of_episode]
+        if missing and not self._has_warned:
+            self._has_warned = True
+            given = sorted({str(key) for info in infos for key in info})
+            warnings.warn(
+                f"expected the info_keywords {list(self.info_keywords)} in infos of every episode, got one without "
+                f"{missing}, of game {game}, whose last infos have {given}; its entry is None",
+                UserWarning,
+                stacklevel=4,
             )
         episode: dict[str, Any] = {
-            "r": float(self._returns[game]),
+            "r": float(self._returns[game].sum() * self._share),
             "l": int(self._lengths[game]),
             "t": round(time.time() - self.t_start, 6),
-            **{key: info[key] for key in self.info_keywords},
+            **{key: of_episode.get(key) for key in self.info_keywords},
         }
-        self._returns[game] = 0
-        self._lengths[game] = 0
-        self.episode_count += 1
         if self._writer is not None:
             self._writer.write_row(episode)
-        return episode
+        episode["agents"] = self._returns[game].tolist()
+        self._returns[game] = 0
+        self._lengths[game] = 0
+        self._notes[game] = {}
+        self.episode_count += 1
+        others = [{key: value for key, value in info.items() if key != IS_SUCCESS} for info in infos]
+        success = {IS_SUCCESS: of_episode[IS_SUCCESS]} if IS_SUCCESS in of_episode else {}
+        return [{**others[0], **success, "episode": episode}, *others[1:]]
 
     def _begin_file(self) -> ResultsWriter | None:
         """Create the file at the first step, so that a run that fails earlier touches no file."""
@@ -151,6 +174,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         return {
             "returns": self._returns.copy(),
             "lengths": self._lengths.copy(),
+            "notes": [dict(notes) for notes in self._notes],
             "episode_count": self.episode_count,
             "t_start": self.t_start,
             "n_steps": self._n_steps,
@@ -183,6 +207,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         """Restore a state; lines written to the file after it are cut off, since their episodes are played again."""
         self._returns[:] = state["returns"]
         self._lengths[:] = state["lengths"]
+        self._notes = [dict(notes) for notes in state["notes"]]
         self.episode_count = state["episode_count"]
         self.t_start = state["t_start"]
         self._n_steps = state["n_steps"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from numbers import Integral
 from typing import Any, Final, TypeVar, cast
 
@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from sb3_saf.teams.checks import check_count, check_whole_teams
 from sb3_saf.teams.errors import NonFiniteError
 from sb3_saf.teams.randomness import game_seeds
-from sb3_saf.teams.rows import Array
+from sb3_saf.teams.rows import IS_SUCCESS, Array
 
 #: Attributes with the shape of a vector environment of flattened teams.
 _TEAM_ATTRIBUTES: Final = ("n_agents", "n_games")
@@ -190,6 +190,13 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     return size
 
 
+def agent_names(venv: VecEnv) -> list[str]:
+    """Return the names of the N agents, in index order; their indices if the environment does not name them."""
+    n_agents = require_n_agents(venv)
+    named = (vars(layer)["possible_agents"] for layer in layers(venv) if "possible_agents" in vars(layer))
+    return [str(name) for name in next(named, range(n_agents))]
+
+
 def team_dones(dones: Array, n_agents: int, alone: bool = False) -> npt.NDArray[np.bool_]:
     """
     Return which games have ended.
@@ -215,6 +222,19 @@ def team_dones(dones: Array, n_agents: int, alone: bool = False) -> npt.NDArray[
             "(sb3_saf.make_team_env does so), or check n_agents and the order of rows (game-major, then agent)"
         )
     return ended.copy()
+
+
+def episode_value(infos: Iterable[Mapping[str, Any]], key: str) -> Any:
+    """
+    Return an entry that is of the whole episode from the last infos of a game's agents; None if none of them has it.
+
+    :param infos: of all agents
+    :param key: its name; ``"is_success"`` is whether all agents that report it succeeded
+    """
+    values = [info[key] for info in infos if info.get(key) is not None]
+    if key == IS_SUCCESS and values:
+        return all(bool(value) for value in values)
+    return values[0] if values else None
 
 
 def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
