@@ -64,7 +64,7 @@ def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
 
 def commands_and_zones(model: BaseAlgorithm, env: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return the commands of one episode of every game, and the agents' zones; (steps, rows) each."""
-    params = env.unwrapped.batch.params
+    params = env.get_attr("params", 0)[0]
     obs, commands, zones = env.reset(), [], []
     for _ in range(params.max_cycles):
         actions, _ = model.predict(obs, deterministic=False)

@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf import CentralizedValueWrapper, TeamMonitor, TeamRolloutBuffer, ppo_settings
-from sb3_saf.suites.registry import find_task
+from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
 
 SB3: Final = "SB3 PPO"
@@ -137,8 +137,8 @@ def free_models(n_games: int) -> dict[str, PPO]:
 
 def suite_models(env_id: str, n_games: int) -> dict[str, PPO]:
     """Create SB3's PPO and ours on games of a batched suite."""
-    one = find_task(env_id)
-    assert one is not None and one.suite.vec_env is not None
+    one = find_environment(env_id)
+    assert one.suite is not None and one.suite.vec_env is not None
     return _models(partial(one.suite.vec_env, one.task, n_games, 0), SUITE_STEPS)
 
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_saf import make_team_env
-from sb3_saf.suites.registry import find_task
+from sb3_saf.suites.registry import find_environment
 
 N_GAMES = 64
 TASKS = ("smax/3m", "overcooked/cramped_room", "jaxmarl/MPE_simple_spread_v3", "vmas/balance", "vmas/navigation")
@@ -96,8 +96,8 @@ def vmas_engine(env: Any, n_games: int, actions: Any) -> Contestant:
 
 def contestants(env_id: str) -> dict[str, Contestant]:
     """Create engine alone, rows, training chain, game by game."""
-    one = find_task(env_id)
-    assert one is not None and one.suite.vec_env is not None
+    one = find_environment(env_id)
+    assert one.suite is not None and one.suite.vec_env is not None
     venv = one.suite.vec_env(one.task, N_GAMES, 0)
     sample = [[venv.action_space.sample() for _ in range(venv.num_envs)] for _ in range(16)]
     actions = np.stack(sample).reshape(16, N_GAMES, venv.n_agents, *venv.action_space.shape)

@@ -102,7 +102,7 @@ def test_rows_are_the_games_of_parallel_env_also_where_they_end_at_different_ste
     ends: list[tuple[int, int]] = []
     for step in range(30):
         if step == 4:
-            venv.games[1].reset(seed=9)
+            venv.batch.objects[1].reset(seed=9)
             twins[1].reset(seed=9)
         actions = rng.integers(0, 7, size=(3, 5))
         observations, rewards, dones, infos = venv.step(actions.reshape(-1))

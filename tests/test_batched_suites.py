@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, game_seeds, make_team_env
 from sb3_saf.checkpoints.data import read_tree, write_tree
 from sb3_saf.checkpoints.environments import check_environment_state, environment_state, load_environment_state
-from sb3_saf.suites.registry import find_task, suites
+from sb3_saf.suites.registry import find_environment, suites
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.training.settings import load_settings
 
@@ -31,8 +31,8 @@ needs_jaxmarl, needs_vmas = _needs("jaxmarl"), _needs("vmas")
 
 def rows_of(env_id: str, n_envs: int, seed: int = 0, **params: Any) -> Any:
     """Create the VecEnv of a task, without the wrappers of ``make_team_env``."""
-    one = find_task(env_id)
-    assert one is not None and one.suite.vec_env is not None
+    one = find_environment(env_id)
+    assert one.suite is not None and one.suite.vec_env is not None
     return one.suite.vec_env(one.task, n_envs, seed, **params)
 
 

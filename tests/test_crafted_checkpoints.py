@@ -107,8 +107,6 @@ def _first_statistics(tree: Any) -> Any:
 
 
 HARMFUL: dict[str, tuple[str, Change]] = {
-    "agents beyond the map": ("ppo", lambda tree: _fill(_games(tree)["x"], 10_000_000)),
-    "order of arrival": ("ppo", lambda tree: _fill(_games(tree)["rank"], 32_000)),
     "statistics of another shape": ("ppo", lambda tree: _first_statistics(tree).update(exp_avg=th.zeros(3))),
     "statistics that are missing": ("ppo", lambda tree: _first_statistics(tree).pop("exp_avg_sq")),
     "a path among the counters": (

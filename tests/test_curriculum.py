@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf
 from sb3_saf import Stage, make_team_env
-from sb3_saf.training.environments import find_environment
+from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
 
 SMALL: Final[dict[str, Any]] = {"n_agents": 3, "grid_size": 8, "n_treasures": 6}
@@ -38,8 +38,8 @@ def _play(env: VecEnv, steps: int, seed: int = 0) -> list[Played]:
     for _ in range(steps):
         obs, rewards, dones, infos = env.step(rng.integers(5, size=env.num_envs))
         assert isinstance(obs, dict)
-        params = getattr(env, "params", None)
-        seen.append(Played(getattr(params, "coordination", 0), obs, rewards, dones, infos))
+        coordination = env.get_attr("params", 0)[0].coordination if env.has_attr("params") else 0
+        seen.append(Played(coordination, obs, rewards, dones, infos))
     return seen
 
 
@@ -111,10 +111,10 @@ def test_settings_give_shares_of_the_run() -> None:
     stages = [{"share": 0.25, "coordination": 1}, {"share": 0.5, "coordination": 2}]
     settings = load_settings("saf", "TeamTogether-v0", "smoke", {"coordination": 3}, {"curriculum": stages})
     env = settings.make_env(0)
-    assert env.params.coordination == 1
+    assert env.get_attr("params", 0)[0].coordination == 1
     assert env.ends == (round(settings.game_steps / 4), round(settings.game_steps * 0.75))
     evaluation = settings.make_env(0, evaluation=True)
-    assert evaluation.params.coordination == 3
+    assert evaluation.get_attr("params", 0)[0].coordination == 3
 
 
 @pytest.mark.parametrize(

@@ -127,60 +127,41 @@ class Walk(gym.Env[Array, int]):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "named"),
     [
-        (lambda: make_team_env("TeamTogether", n_envs=0), "n_envs must be an integer of at least 1, got 0"),
-        (lambda: make_team_env("TeamTogether", n_envs=2.0), "n_envs must be an integer of at least 1, got 2.0"),  # type: ignore[arg-type]
-        (lambda: make_team_env("TeamTogether", n_envs=True), "n_envs must be an integer of at least 1, got True"),
-        (lambda: make_team_env(CounterEnv, n_cpus=0), "n_cpus must be an integer of at least 1, got 0"),
-        (lambda: make_team_env("TeamTogether", seed=-1), "seed must be an integer of at least 0, or None, got -1"),
-        (lambda: make_team_env(CounterEnv, seed=1.5), "seed must be an integer of at least 0, or None, got 1.5"),  # type: ignore[arg-type]
-        (
-            lambda: make_team_env("TeamTogether", n_envs=2, n_cpus=2),
-            r"n_cpus=2 divides games among SuperSuit's processes, but backend='native' steps all games at once; leave "
-            r"n_cpus out \(native has n_threads\) or use backend='supersuit'",
-        ),
-        (
-            lambda: make_team_env("TeamTogether", backend="gpu"),  # type: ignore[arg-type]
-            "backend must be one of 'native', 'supersuit', got 'gpu'",
-        ),
-        (
-            lambda: make_team_env(CounterEnv, backend="native"),
-            "backend='native' is the compiled core of HECOGrid, got it with CounterEnv; leave backend out or use "
-            "backend='supersuit'",
-        ),
-        (
-            lambda: make_team_env("TeamTogether", time_limit="never", **SMALL),  # type: ignore[arg-type]
-            "time_limit must be one of 'terminal', 'bootstrap', got 'never'",
-        ),
-        (
-            lambda: make_team_env("TeamTogeter"),
-            r"unknown task 'TeamTogeter' \(did you mean 'TeamTogether'\?\); the tasks are .*\. For any other "
-            r"environment pass a task of a suite .*, a PettingZoo ParallelEnv, or a factory that returns one, for "
-            r"instance simple_spread_v3.parallel_env",
-        ),
-        (lambda: make_team_env("TeamTogether-v1"), "unknown task 'TeamTogether-v1'"),
-        (
-            lambda: make_team_env("TeamTogether", n_agent=5),
-            r"unknown parameter 'n_agent' \(did you mean 'n_agents'\?\)",
-        ),
-        (
-            lambda: make_team_env(CounterEnv(), n_agents=3),
-            r"parameters \['n_agents'\] go to a factory, got them with CounterEnv; give them to the environment "
-            r"when you make it, or pass its factory \(such as simple_spread_v3.parallel_env\) instead",
-        ),
-        (
-            lambda: make_team_env(TeamVenv()),
-            r"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv TeamVenv; wrap it yourself: "
-            r"sb3_saf.CentralizedValueWrapper\(sb3_saf.TeamMonitor\(venv\)\)",
-        ),
-        (lambda: make_team_env(Walk), "expected a PettingZoo ParallelEnv or a function that makes one, got"),
-        (lambda: make_team_env(3), "expected a PettingZoo ParallelEnv or a function that makes one, got"),
+        (lambda: make_team_env("TeamTogether", n_envs=0), "n_envs .*got 0"),
+        (lambda: make_team_env("TeamTogether", n_envs=2.0), "n_envs .*got 2.0"),  # type: ignore[arg-type]
+        (lambda: make_team_env("TeamTogether", n_envs=True), "n_envs .*got True"),
+        (lambda: make_team_env(CounterEnv, n_cpus=0), "n_cpus .*got 0"),
+        (lambda: make_team_env("TeamTogether", seed=-1), "seed .*got -1"),
+        (lambda: make_team_env(CounterEnv, seed=1.5), "seed .*got 1.5"),  # type: ignore[arg-type]
+        (lambda: make_team_env("TeamTogether", n_envs=2, n_cpus=2), "n_cpus=2 .*backend='supersuit'"),
+        (lambda: make_team_env("TeamTogether", backend="gpu"), "backend .*'native', 'supersuit', got 'gpu'"),  # type: ignore[arg-type]
+        (lambda: make_team_env(CounterEnv, backend="native"), "backend='native' .*CounterEnv"),
+        (lambda: make_team_env("TeamTogether", time_limit="never", **SMALL), "time_limit .*'bootstrap', got 'never'"),  # type: ignore[arg-type]
+        (lambda: make_team_env("TeamTogether", active=True), "active=True; .*backend='supersuit'"),
+        (lambda: make_team_env("TeamTogether", action_masks=True), "action_masks=True; .*backend='supersuit'"),
+        (lambda: make_team_env("TeamTogether", state=True), "state=True .*backend='supersuit'"),
+        (lambda: make_team_env("TeamTogether-v1"), "'TeamTogether-v1'"),
+        (lambda: make_team_env("TeamTogether", n_agent=5), "'n_agent' .*'n_agents'"),
+        (lambda: make_team_env(CounterEnv(), n_agents=3), r"\['n_agents'\] .*factory"),
+        (lambda: make_team_env(TeamVenv()), r"TeamVenv; .*CentralizedValueWrapper\("),
+        (lambda: make_team_env(Walk), "ParallelEnv"),
+        (lambda: make_team_env(3), "ParallelEnv"),
+        (lambda: make_team_env("TeamSupport", stagger=True, backend="supersuit"), "stagger=True .*TeamSupport-v0"),
+        (lambda: make_team_env(CounterEnv, stagger=True), "stagger=True .*CounterEnv"),
     ],
 )
-def test_wrong_calls(make: Callable[[], VecEnv], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_wrong_calls(make: Callable[[], VecEnv], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
         make()
+
+
+def test_hecogrid_through_supersuit_has_the_games_state_and_signals() -> None:
+    env = make_team_env("TeamTogether", 2, backend="supersuit", state=True, active=True, **SMALL)
+    assert env.team_spaces.state is not None and env.team_spaces.has_active
+    assert env.reset()["state"].shape[0] == env.num_envs
+    env.close()
 
 
 @pytest.mark.parametrize("env", ["TeamTogether", CounterEnv])
@@ -206,15 +187,3 @@ def test_staggered_games_end_at_different_times_and_play_whole_episodes_then() -
     assert ends == [[10, 20], [8, 18], [6, 16], [4, 14], [2, 12]]
     result = evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7)
     assert result.lengths == [10] * 7  # short episodes do not count
-
-
-@pytest.mark.parametrize(
-    ("env", "kwargs", "message"),
-    [
-        ("TeamSupport", {"backend": "supersuit"}, "stagger=True needs backend='native', got 'supersuit'"),
-        (lambda: None, {}, "stagger=True needs HECOGrid's compiled games"),
-    ],
-)
-def test_only_compiled_games_are_staggered(env: Any, kwargs: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_team_env(env, stagger=True, **kwargs)

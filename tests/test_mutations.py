@@ -22,9 +22,10 @@ import hecogrid_envs
 from hecogrid_envs.text import parse_level, render_text
 from sb3_saf.experiments.definitions import find_experiment
 from sb3_saf.experiments.grid import Selection
-from sb3_saf.training.settings import ALGOS, ENV_IDS, load_settings
+from sb3_saf.training.settings import ALGOS, load_settings
 from sb3_saf.training.yaml_files import SIZES
 
+ENV_IDS = [f"{task}-v0" for task in hecogrid_envs.TASK_NAMES]
 COUNT = int(os.environ.get("MUTATIONS", "100"))
 #: Processor seconds after which a mutation counts as a hang.
 PATIENCE = 30

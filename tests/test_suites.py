@@ -36,9 +36,8 @@ from sb3_saf.envs.team_reward import SharedReward
 from sb3_saf.networks.encoders import PaperCNN, PartsEncoder, PartsSpace
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam
-from sb3_saf.suites.registry import find_task, suites
+from sb3_saf.suites.registry import find_environment, suites
 from sb3_saf.suites.suite import Suite
-from sb3_saf.training.environments import find_environment
 from sb3_saf.training.settings import load_settings, saved_settings
 from tests.toy_envs import CounterEnv
 
@@ -80,10 +79,10 @@ def _random_episodes(env_id: str, seed: int, n_steps: int = 12) -> list[Any]:
 # --- declarations -----------------------------------------------------------------------------------------------------
 
 
-AVAILABLE = [suite for suite in suites().values() if suite.unavailable is None]
+PACKAGED = [suite for suite in suites().values() if suite.extra]
 
 
-@pytest.mark.parametrize("suite", AVAILABLE, ids=[suite.name for suite in AVAILABLE])
+@pytest.mark.parametrize("suite", PACKAGED, ids=[suite.name for suite in PACKAGED])
 def test_the_extra_of_a_suite_installs_what_it_requires(suite: Suite) -> None:
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg", encoding="utf-8")
@@ -99,7 +98,7 @@ def test_what_is_said_of_packages_that_are_missing_or_of_another_version() -> No
     old = Suite("x", requires=("gymnasium<0.1",), **one)
     assert f"works with gymnasium<0.1, got version {gym.__version__}: pip install 'gymnasium<0.1'" == old.problem()
     with pytest.raises(ValueError, match=r"x/\.\.\.: works with gymnasium<0.1"):
-        old.check_task("y")
+        old.find_task("y")
     assert "another version of Python" in str(Suite("x", requires=('a; python_version < "3"',), **one).problem())
 
 
@@ -130,7 +129,8 @@ def test_the_listing(capsys: pytest.CaptureFixture[str]) -> None:
         assert suite.title in listed
         problem = suite.problem()
         assert problem in listed if problem else f"{suite.name}/{suite.examples[0]}: " in listed
-    assert main(["lbff"]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["lbff"])
     assert "did you mean 'lbf'" in capsys.readouterr().err
 
 
@@ -478,6 +478,22 @@ def test_modules_and_functions_by_name() -> None:
         make_team_env("no_such.module")
 
 
-def test_ids_of_no_suite_are_left_to_others() -> None:
-    assert find_task("TeamTogether") is None
-    assert find_task("hecogrid/TeamTogether-v0") is None
+def test_the_tasks_of_hecogrid_are_a_suite_and_have_short_names() -> None:
+    for name in ("TeamSupport", "TeamSupport-v0", "hecogrid/TeamSupport", "hecogrid/TeamSupport-v0"):
+        environment = find_environment(name)
+        assert (environment.id, environment.folder_name) == ("TeamSupport-v0", "TeamSupport-v0")
+        assert environment.suite is suites()["hecogrid"] and environment.task == "TeamSupport-v0"
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("TeemSupport", "'TeamSupport-v0'"),
+        ("lfb/Foraging-8x8-2p-3f-v3", "'lbf/Foraging-8x8-2p-3f-v3'"),
+        ("simple_spread", "'mpe/simple_spread_v3'"),
+        ("hecogrid/TeamSuport", "hecogrid/TeamSupport-v0"),
+    ],
+)
+def test_an_unknown_name_lists_the_nearest(name: str, nearest: str) -> None:
+    with pytest.raises(ValueError, match=f"unknown .*{name}.*did you mean.* {nearest}"):
+        make_team_env(name)

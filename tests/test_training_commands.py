@@ -24,13 +24,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from hecogrid_envs.play import main as play_main
 from sb3_saf import QPLEX, SAFPolicy, evaluate_team, quickstart
 from sb3_saf.experiments.cli import main as experiments_main
+from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import folders
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.callbacks import GameStepsProgressBar, ProgressLines
-from sb3_saf.training.environments import find_environment
 from sb3_saf.training.folders import Run
 from sb3_saf.training.run import RunOptions
 from sb3_saf.training.run import train as train_settings
@@ -282,8 +282,6 @@ def test_games_that_cannot_be_shown_say_what_they_lack() -> None:
 
 
 def test_environments_by_other_names(tmp_path: Path) -> None:
-    assert find_environment(f"hecogrid/{ENV}") == find_environment(ENV)
-    assert find_environment("hecogrid/TeamSupport-v0").folder_name == "TeamSupport-v0"
     pettingzoo.register("parallel", "own/counter-v0", "tests.toy_envs:CounterEnv")
     try:
         assert load_settings("saf", "own/counter-v0", env_kwargs={"n_agents": 3}).n_agents == 3
@@ -321,7 +319,7 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
     model = PPO.load(run / "tests.toy_envs-CounterEnv.zip")
     assert isinstance(model.observation_space, spaces.Dict)
     own = model.observation_space["obs"]
-    assert own.shape == (6,) and own.dtype == np.float64  # two frames of three numbers, converted
+    assert own.shape == (6,) and own.dtype == np.float32  # two frames of three numbers, converted
     assert model.num_timesteps < 400 * 2  # stopped by the callback
     with np.load(run / "vecnormalize.npz") as statistics:
         assert set(statistics) == {"obs", "returns"} and statistics["obs"].shape == (1 + 2 * 6,)
@@ -405,7 +403,7 @@ def failed(
         (["--env", "nowhere.game"], ("cannot import parallel_env from 'nowhere.game'",)),
         (["--env", "tests.toy_envs:BareEnv", "--env-kwargs", "size:3"], ("cannot be made with {'size': 3}",)),
         (["--gym-packages", "nowhere"], ("--gym-packages: cannot import 'nowhere'",)),
-        (["--vec-env", "subproc"], ("n_cpus", "native")),
+        (["--vec-env", "subproc"], ("n_cpus=2", "TeamTogether-v0")),
         (["--num-threads", "-4"], ("argument --num-threads: must be at least 1, or -1, got -4",)),
         (["-n", "0"], ("--game-steps: must be at least 1, got 0",)),
         (["-params", "gamma:50"], ("gamma=50",)),

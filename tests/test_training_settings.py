@@ -19,10 +19,11 @@ from hecogrid_envs.params import HECOGridParams
 from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
-from sb3_saf.training.settings import ALGOS, ENV_IDS, SIZES, Settings, load_settings, saved_settings
+from sb3_saf.training.settings import ALGOS, SIZES, Settings, load_settings, saved_settings
 from sb3_saf.training.yaml_files import Size, config_names, read_settings
 
 ENV = "TeamTogether-v0"
+ENV_IDS = suites()["hecogrid"].tasks
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import signal
 import sys
 import threading
@@ -12,12 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from hecogrid_envs.task import check_task
 from sb3_saf.checkpoints.learning import handled
 from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, MODULE, PROGRAM, Experiment, own_experiment
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
 from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
+from sb3_saf.suites.registry import find_environment, folder_name
 from sb3_saf.teams.checks import check_seed, unknown_name
 from sb3_saf.training.commands import (
     OneLineParser,
@@ -196,16 +195,17 @@ def _name(options: argparse.Namespace) -> str:
         what = "several environments need a name before --env" if options.env else "name an experiment"
         raise ValueError(f"{what}: {example}")
     # An environment names the grid on it.
-    return re.sub(r"[:/]", "-", options.env[0].removesuffix("-v0") if name is None else name)
+    return folder_name(options.env[0] if name is None else name).removesuffix("-v0")
 
 
 def _env(task: str, experiment: Experiment) -> str:
     """Return the environment of a task; the paper's experiments accept any of HECOGrid's."""
     if task in experiment.envs:
         return task
-    if experiment.name not in EXPERIMENTS:
+    env_id = find_environment(task).id
+    if env_id not in experiment.envs and experiment.name not in EXPERIMENTS:
         raise unknown_name("environment of this experiment", task, experiment.envs)
-    return f"{check_task(task.removesuffix('-v0'))}-v0"
+    return env_id
 
 
 def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:

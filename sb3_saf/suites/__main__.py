@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
-import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
-from sb3_saf.make import make_team_env
-from sb3_saf.suites.registry import suites
+from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
+from sb3_saf.suites.registry import find_environment, suites
 from sb3_saf.suites.suite import Suite
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.teams.rows import TeamSpaces
-from sb3_saf.training.commands import USAGE_ERROR, OneLineParser
 
 PROGRAM: Final = "python -m sb3_saf.suites"
 
@@ -21,9 +21,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    :return: 0, or 2 if the command was invalid
+    :return: 0
+    :raises SystemExit: with 2 if the command was invalid
     """
-    parser = OneLineParser(prog=PROGRAM, description="Suites of cooperative games, and the tasks of one of them.")
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Suites of cooperative games, and the tasks of one.")
     parser.add_argument("name", nargs="?", help=f"one of {', '.join(suites())}: list all of its tasks")
     name = parser.parse_args(arguments).name
     try:
@@ -36,8 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             print("\n".join(f"{name}/{task}" for task in suites()[name].tasks))
     except ValueError as error:
-        print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return USAGE_ERROR
+        parser.error(str(error))
     return 0
 
 
@@ -53,15 +53,18 @@ def summary(suite: Suite) -> str:
 
 def example(suite: Suite, task: str) -> str:
     """Return the id of a task with its agents, observations and actions."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about opponents, which the line names
-        env = make_team_env(f"{suite.name}/{task}")
-    spaces = TeamSpaces.from_observation_space(env.observation_space)
-    env.close()
-    masked = ", masked" if spaces.action_mask is not None else ""
+    env_id = f"{suite.name}/{task}"
+    if suite.vec_env is not None:
+        venv = suite.vec_env(task, 1, None, **suite.defaults)
+    else:
+        venv = SuperSuitVecEnv(partial(find_environment(env_id).make_game, {}), 1, action_masks="auto")
+    row = TeamSpaces.of_rows(venv.observation_space, venv.action_space, venv.n_agents)
+    venv.close()
+    masked = ", masked" if row.action_mask is not None else ""
     opponents = ", opponents among them" if suite.is_competitive(task) else ""
-    seen, acted = _short(spaces.own), _short(env.action_space)
-    return f"{suite.name}/{task}: {spaces.n_agents} agents{opponents}, sees {seen}, acts {acted}{masked}"
+    return (
+        f"{env_id}: {row.n_agents} agents{opponents}, sees {_short(row.own)}, acts {_short(venv.action_space)}{masked}"
+    )
 
 
 def _short(space: Any) -> str:

@@ -1,37 +1,104 @@
-"""All suites, found by their files, and tasks by id."""
+"""Environments by name, the one look-up of Python, commands and experiments; suites by their files."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
 import warnings
-from collections.abc import Iterator
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache, partial
+from importlib.util import find_spec
+from typing import Any, Final
+
+import pettingzoo
 
 import sb3_saf.suites
-from sb3_saf.suites.suite import Suite
+from sb3_saf.envs.equal_spaces import team_game
+from sb3_saf.envs.vec_game import VecGame
+from sb3_saf.suites.suite import N_NEAREST, Suite
+from sb3_saf.teams.checks import import_by_name
+
+#: Suite whose tasks are named without it: "TeamSupport" is "hecogrid/TeamSupport-v0".
+HOME: Final = "hecogrid"
+HOW_TO_NAME: Final = (
+    "a HECOGrid task (TeamSupport), a task of a suite (lbf/Foraging-8x8-2p-3f-v3; python -m sb3_saf.suites lists "
+    "them), a module with parallel_env (mpe2.simple_spread_v3), a function that makes a ParallelEnv "
+    "(my_package.my_module:make_env), or an id registered with PettingZoo"
+)
 
 
-class SuiteTask(NamedTuple):
+@dataclass(frozen=True)
+class TeamEnvironment:
     """
-    A task of an installed suite.
+    Environment with a name.
 
-    :param suite: declaration of the suite
-    :param task: name after the slash
+    :param id: its name in files: ``"TeamSupport-v0"``, ``"lbf/Foraging-8x8-2p-3f-v3"``, ``"package.module:function"``
+    :param make: makes one game from ``render_mode`` and parameters
+    :param suite: its suite, None for modules, functions and ids registered with PettingZoo
+    :param task: name of the task in its suite
     """
 
-    suite: Suite
-    task: str
+    id: str
+    make: Callable[..., Any]
+    suite: Suite | None = None
+    task: str = ""
 
     @property
-    def id(self) -> str:
-        """Id for users."""
-        return f"{self.suite.name}/{self.task}"
+    def yaml_keys(self) -> tuple[str, ...]:
+        """Entries of YAML files for this environment, from general to specific."""
+        return ("default", self.id) if self.suite is None else ("default", self.suite.name, self.id)
+
+    @property
+    def folder_name(self) -> str:
+        """Name of the environment in file names."""
+        return folder_name(self.id)
+
+    def complete(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Add the suite's defaults to parameters of the game; check all, if the suite can without making a game."""
+        if self.suite is None:
+            return dict(params)
+        params = {**self.suite.defaults, **params}
+        return params if self.suite.complete is None else self.suite.complete(self.task, params)
+
+    def count_agents(self, params: Mapping[str, Any]) -> int:
+        """
+        Count the agents, N; a game is made unless the suite knows them.
+
+        :param params: result of :meth:`complete`
+        """
+        if self.suite is not None and self.suite.complete is not None:
+            return int(params["n_agents"])
+        game = self.make_game(params)
+        agents = getattr(game, "possible_agents", None)
+        game.close()
+        if not agents:
+            raise ValueError(f"expected {self.id} to list its agents in possible_agents, got {agents!r}")
+        return len(agents)
+
+    def make_game(self, params: Mapping[str, Any], render_mode: str | None = None, **changes: Any) -> Any:
+        """
+        Make one game of agents with equal spaces.
+
+        :param params: parameters of the game
+        :param render_mode: of the game; None to leave the argument out
+        :param changes: parameters that replace others
+        :raises ValueError: for invalid parameters, or if it is no ParallelEnv
+        """
+        kwargs = {**params, **changes} if render_mode is None else {**params, **changes, "render_mode": render_mode}
+        try:
+            game = team_game(self.make(**kwargs))
+        except TypeError as error:  # most often an argument that it does not have
+            hint = "" if render_mode is None else "; to show its games, give it the argument render_mode (PettingZoo's)"
+            raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}{hint}") from error
+        if not isinstance(game, pettingzoo.ParallelEnv):
+            raise ValueError(f"expected {self.id} to make a PettingZoo ParallelEnv, got a {type(game).__name__}")
+        return game
 
     def warn_if_competitive(self) -> None:
-        """Warn once per caller that opposing agents are trained as one team."""
-        if self.suite.is_competitive(self.task):
+        """Warn that opposing agents are trained as one team."""
+        if self.suite is not None and self.suite.is_competitive(self.task):
             warnings.warn(
                 f"agents of {self.id} play against each other; here all agents of a game are one team that shares one "
                 "policy, so both sides are trained as one",
@@ -40,28 +107,65 @@ class SuiteTask(NamedTuple):
             )
 
 
+def find_environment(name: str) -> TeamEnvironment:
+    """
+    Look up an environment.
+
+    :param name: see ``HOW_TO_NAME``; modules in the name are imported
+    :raises ValueError: for an unknown name, naming the nearest; for a suite whose package is missing or of another
+        version; for a module that cannot be imported
+    """
+    name = str(name)
+    prefix, slash, task = name.partition("/") if "/" in name else (HOME, "", name)
+    if (suite := suites().get(prefix)) is not None and (slash or suite.find_task(task) is not None):
+        return _of_suite(suite, task)
+    if name in pettingzoo.parallel_registry:
+        return TeamEnvironment(name, partial(pettingzoo.make, "parallel", name))
+    if ":" in name or "." in name or _is_module(name):
+        module, _, function = name.partition(":")
+        return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"environment {name!r}"))
+    home, *others = sorted(suites().values(), key=lambda one: one.name != HOME)
+    ids = [*home.tasks, *(f"{one.name}/{task}" for one in others for task in one.examples)]
+    nearest = " or ".join(map(repr, get_close_matches(name, ids, n=N_NEAREST)))
+    did_you_mean = f" (did you mean {nearest}?)" if nearest else ""
+    raise ValueError(f"unknown environment {name!r}{did_you_mean}; expected {HOW_TO_NAME}")
+
+
+def _of_suite(suite: Suite, name: str) -> TeamEnvironment:
+    task = suite.find_task(name)
+    if task is None:
+        raise suite.unknown_task(name)
+    if suite.game is not None:
+        make: Callable[..., Any] = partial(suite.game, task)
+    else:
+        assert suite.vec_env is not None
+        make = partial(_vec_game, suite.vec_env, task)
+    return TeamEnvironment(task if suite.name == HOME else f"{suite.name}/{task}", make, suite, task)
+
+
+def _vec_game(make: Callable[..., Any], task: str, **params: Any) -> VecGame:
+    return VecGame(make(task, 1, None, **params))
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return name.isidentifier() and find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def folder_name(env_id: str) -> str:
+    """Return the name of an environment in file names."""
+    return env_id.removeprefix(f"{HOME}/").replace("/", "-").replace(":", "-")
+
+
 @cache
 def suites() -> dict[str, Suite]:
     """Return the declarations of all suites by name."""
-    return {suite.name: suite for suite in _declared()}
-
-
-def _declared() -> Iterator[Suite]:
+    declared: dict[str, Suite] = {}
     for module in pkgutil.iter_modules(sb3_saf.suites.__path__, f"{sb3_saf.suites.__name__}."):
-        if module.name.endswith("__main__"):
-            continue
-        found = getattr(importlib.import_module(module.name), "SUITE", None)
-        if isinstance(found, Suite):
-            yield found
-
-
-def find_task(env_id: str) -> SuiteTask | None:
-    """
-    Look a task up by an id such as ``"lbf/Foraging-8x8-2p-3f-v3"``.
-
-    :return: None if no suite has the name before the slash
-    :raises ValueError: if the suite's package is missing or of another version, or has no such task
-    """
-    name, slash, task = env_id.partition("/")
-    suite = suites().get(name) if slash else None
-    return None if suite is None else SuiteTask(suite, suite.check_task(task))
+        if not module.name.endswith("__main__"):
+            suite = getattr(importlib.import_module(module.name), "SUITE", None)
+            if isinstance(suite, Suite):
+                declared[suite.name] = suite
+    return declared

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from numbers import Integral
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -75,3 +76,17 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
             f"({n_rows // n_agents} teams and {n_rows % n_agents} rows over); {fix}"
         )
     return n_rows // n_agents
+
+
+def import_by_name(module: str, name: str, what: str) -> Any:
+    """Import a callable from a module; the ValueError contains ``what``."""
+    try:
+        value = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{what}: cannot import {name} from {module!r} ({error}); install the package, or set PYTHONPATH to "
+            "the folder that has it"
+        ) from error
+    if not callable(value):
+        raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}")
+    return value

@@ -14,7 +14,7 @@ from typing import Any, NoReturn, TypeVar
 
 import torch as th
 
-from sb3_saf.training.environments import HOW_TO_NAME
+from sb3_saf.suites.registry import HOW_TO_NAME
 from sb3_saf.training.yaml_files import parse_value
 
 USAGE_ERROR = 2

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.weights import load_weights
 from sb3_saf.inspection.figures import gif
+from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.checks import check_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
@@ -31,7 +32,6 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.environments import find_environment
 from sb3_saf.training.folders import find_model
 from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
 from sb3_saf.training.wrappers import load_normalization

@@ -8,9 +8,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.commands import CommandError, OneLineParser, run_command, user_errors
-from sb3_saf.training.environments import folder_name
 from sb3_saf.training.folders import RUN_FILE, Run, Source, python_command
 from sb3_saf.training.settings import Settings, load_settings
 

@@ -41,8 +41,8 @@ def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str
     :param overrides: arguments of PPO that take precedence; ``policy_kwargs`` are merged
     :raises ValueError: if ``env`` has no teams, or PPO does not train ``algo``
     """
+    from sb3_saf.suites.registry import HOME
     from sb3_saf.teams.checks import unknown_name
-    from sb3_saf.training.environments import HECOGRID
     from sb3_saf.training.settings import ALGOS, find_algorithm
     from sb3_saf.training.values import algorithm_arguments, convert
     from sb3_saf.training.yaml_files import entry_of, read_settings
@@ -52,7 +52,7 @@ def ppo_settings(env: VecEnv, algo: str = "mappo", **overrides: Any) -> dict[str
         raise unknown_name("method of PPO", algo, trained)
     n_agents, spec = require_n_agents(env), find_algorithm(algo)
     n_games, encoder = env.num_envs // n_agents, _encoder_of(env)
-    source = entry_of(read_settings(spec.config), ("default",) if encoder is None else ("default", HECOGRID), "small")
+    source = entry_of(read_settings(spec.config), ("default",) if encoder is None else ("default", HOME), "small")
     hints, taken = algorithm_arguments(PPO), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
     found = {key: convert(key, source[key], hints[key]) for key in taken if key in source}
     rollout = source["n_steps"] * source["n_envs"]  # game steps, in all games

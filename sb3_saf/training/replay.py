@@ -60,7 +60,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
     with user_errors(ValueError, OSError, ExportError):
         seed = evaluation_seed(check_seed(options.seed))
         settings = [_settings_of(path, options) for path in options.model]
-        render_mode = None if settings[0].environment.task else "rgb_array"  # HECOGrid is drawn from its state
+        suite = settings[0].environment.suite
+        render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
         with closing(
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
         ) as games:

@@ -245,8 +245,9 @@ class Training:
     def _inspection(self, every_game_steps: int) -> InspectionCallback:
         """Make the callback that inspects the policy for TensorBoard, on games not used in training."""
         settings = self.settings
+        suite = settings.environment.suite
         # Other games may not support pictures.
-        render_mode = "rgb_array" if settings.environment.task else None
+        render_mode = "rgb_array" if suite is not None and suite.is_drawn_from_state else None
         games = self._games(settings, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode=render_mode)
         return InspectionCallback(
             games,
@@ -270,14 +271,10 @@ class Training:
 
 
 def _level(settings: Settings) -> str:
-    """Return the parameters of the games as text; for HECOGrid, those that define its levels."""
-    of_levels = ("coordination", "heterogeneity")
-    kept = {
-        key: value
-        for key, value in settings.env_kwargs.items()
-        if settings.environment.task is None or key in of_levels
-    }
-    return ", ".join(f"{key} {value}" for key, value in kept.items())
+    """Return the parameters of the games as text; only those that define levels if the suite names them."""
+    suite = settings.environment.suite
+    names = (() if suite is None else suite.level_params) or tuple(settings.env_kwargs)
+    return ", ".join(f"{name} {settings.env_kwargs[name]}" for name in names)
 
 
 def load_parameters(model: BaseAlgorithm, path: Path) -> None:

@@ -23,9 +23,8 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.make import make_team_env
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS, DECLARATIONS
-from sb3_saf.suites.registry import suites
+from sb3_saf.suites.registry import HOME, TeamEnvironment, find_environment, suites
 from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
-from sb3_saf.training.environments import ENV_IDS, HECOGRID, TeamEnvironment, find_environment
 from sb3_saf.training.values import algorithm_arguments, convert, policy_arguments
 from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows, wraps_games
 from sb3_saf.training.yaml_files import DEFAULT, SIZES, Size, entry_of, merge, read_settings
@@ -72,7 +71,7 @@ class Settings:
     Everything that determines a run except its seed.
 
     :param algo: name in ``ALGOS``
-    :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
+    :param env_id: such as ``"TeamTogether-v0"``; see ``suites.registry.HOW_TO_NAME``
     :param size: one of ``SIZES``
     :param n_agents: N
     :param env_kwargs: parameters of the game; all of them for HECOGrid
@@ -104,7 +103,7 @@ class Settings:
     @property
     def task(self) -> str:
         """The HECOGrid task's name, or the environment's."""
-        return self.environment.task or self.env_id
+        return self.env_id.removesuffix("-v0")
 
     @property
     def environment(self) -> TeamEnvironment:
@@ -136,16 +135,13 @@ class Settings:
         :param n_cpus: number of processes for the games; HECOGrid's compiled games need one
         :param render_mode: render mode of the games; None for no rendering
         """
-        task, params = self.environment.task, dict(self.env_kwargs)
-        if evaluation:
-            params = {key: value for key, value in params.items() if key not in self.environment.training_params}
-        source: Any = task
-        if self.environment.suite_task is not None and not wraps_games(self.wrapping):
-            source = self.env_id
-        elif task is None or wraps_games(self.wrapping):
+        source: Any = self.env_id
+        params = dict(self.env_kwargs) if render_mode is None else {**self.env_kwargs, "render_mode": render_mode}
+        suite = self.environment.suite
+        if evaluation and suite is not None:
+            params = {key: value for key, value in params.items() if key not in suite.training_params}
+        if wraps_games(self.wrapping):
             source, params = partial(self.make_game, render_mode), {}
-        if not callable(source) and render_mode is not None:
-            params["render_mode"] = render_mode
         env = make_team_env(
             source,
             n_envs=self.n_envs if n_envs is None else n_envs,
@@ -237,7 +233,7 @@ def load_settings(
     Load settings by name; the arguments take precedence over the files.
 
     :param algo: name in ``ALGOS``
-    :param env_id: such as ``"TeamTogether-v0"``; see ``environments.HOW_TO_NAME``
+    :param env_id: such as ``"TeamTogether-v0"``; see ``suites.registry.HOW_TO_NAME``
     :param size: ``"paper"``, ``"medium"``, ``"small"`` or ``"smoke"``
     :param env_kwargs: parameters of the game
     :param overrides: keys as in the algorithm's file, such as ``{"n_envs": 8, "policy_kwargs": {"n_slots": 8}}``
@@ -248,7 +244,7 @@ def load_settings(
     if size not in SIZES:
         raise unknown_name("size", size, SIZES)
     content, source = read_settings(config or method.config), str(config or f"zoo_configs/{method.config}.yml")
-    known = (DEFAULT, HECOGRID, *ENV_IDS, *suites(), environment.id)
+    known = (DEFAULT, *suites(), *suites()[HOME].tasks, environment.id)
     for key in content:
         if key not in known and not {".", ":", "/"} & set(str(key)):
             raise ValueError(f"{source}: {unknown_name('environment', key, known)}")
@@ -372,7 +368,6 @@ def _build(
 
 __all__ = [
     "ALGOS",
-    "ENV_IDS",
     "SIZES",
     "AlgorithmSpec",
     "Settings",

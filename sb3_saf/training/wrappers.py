@@ -25,9 +25,9 @@ from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
+from sb3_saf.teams.checks import import_by_name
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import OBS_KEY
-from sb3_saf.training.environments import import_by_name
 
 _NAMES = str | list[Any] | dict[str, Any] | None
 #: Optional settings for wrappers and callbacks, with their types.

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.checkpoints.checks import check_keys, check_like, check_list, check_whole
 from sb3_saf.envs.space_reader import checked_actions
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import (
     ACTIVE_KEY,
     IS_SUCCESS,
     OBS_KEY,
+    STAGGERED,
     TERMINAL_OBSERVATION,
     TRUNCATED,
     Array,
@@ -56,17 +56,46 @@ class Batch(ABC):
     :param agents: N names
     :param rows: spaces of a row's observation
     :param action_space: action space of a row
-    :param env: the suite's environment, for its attributes
+    :param env: the suite's environment, for attributes that all games share
+    :param objects: E objects of the single games, for their attributes and methods; empty if the engine has none
+    :param shares_reward: whether all agents of a team receive the same reward
     """
 
     def __init__(
-        self, n_games: int, agents: Sequence[str], rows: TeamSpaces, action_space: spaces.Space[Any], env: Any
+        self,
+        n_games: int,
+        agents: Sequence[str],
+        rows: TeamSpaces,
+        action_space: spaces.Space[Any],
+        env: Any = None,
+        objects: Sequence[Any] = (),
+        shares_reward: bool = False,
     ) -> None:
         self.n_games = n_games
         self.agents = list(agents)
         self.rows = rows
         self.action_space = action_space
         self.env = env
+        self.objects = objects
+        self.shares_reward = shares_reward
+
+    def take_options(self, options: Sequence[Mapping[str, Any]]) -> None:
+        """
+        Take the options of the next reset.
+
+        :param options: (E,) for each game, not all of them empty
+        :raises ValueError: if the games take none, or invalid ones
+        """
+        raise ValueError(f"expected no options for the reset of these games, got {options[0]}")
+
+    def shorten(self) -> npt.NDArray[np.bool_]:
+        """
+        Cut the episodes that have just begun: that of game ``e`` ends ``e / E`` of its length early.
+
+        :return: (E,) which games will end early
+        :raises ValueError: if episodes have no time limit that the engine could move
+        """
+        raise ValueError("stagger=True needs games with a time limit, which these games have not; leave it out")
 
     @abstractmethod
     def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
@@ -93,6 +122,9 @@ class Batch(ABC):
 class ResumableBatch(Batch):
     """Base of batches with snapshots."""
 
+    #: What the games are, as plain data: only games with the same take a snapshot.
+    settings: Mapping[str, Any] = {}
+
     @abstractmethod
     def snapshot(self) -> dict[str, Array]:
         """Return a copy of the complete state, random state included."""
@@ -106,43 +138,58 @@ class BatchVecEnv(TeamVecEnv):
     """
     VecEnv of a batch of games: row ``e * N + i`` is agent ``i`` of game ``e``.
 
-    Observations of rows are Dicts, see :class:`sb3_saf.teams.rows.TeamSpaces`. Infos of done rows hold
-    ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite reports
-    wins. All other infos are one empty dict.
+    Observations of rows are own observations, or Dicts, see :class:`sb3_saf.teams.rows.TeamSpaces`. Infos of done rows
+    hold ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite
+    reports wins.
 
     :param batch: the games
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
-    :param render_mode: None or ``"rgb_array"``
+    :param render_mode: None or ``"rgb_array"``; games with objects of their own take all that these know
+    :param stagger: whether episodes begun by :meth:`reset` end at different times: that of game ``e`` is shorter by
+        ``e / E`` of its length, and its last infos have ``"staggered"``
     :raises ValueError: for any other render mode
     """
 
-    def __init__(self, batch: Batch, seed: int | None = None, render_mode: str | None = None) -> None:
-        if render_mode not in (None, "rgb_array"):
+    def __init__(
+        self, batch: Batch, seed: int | None = None, render_mode: str | None = None, stagger: bool = False
+    ) -> None:
+        if render_mode not in (None, "rgb_array") and not batch.objects:
             raise ValueError(f"render_mode must be 'rgb_array' or None here, got {render_mode!r}")
         self.batch = batch
         self.possible_agents = list(batch.agents)
+        self.shares_reward = batch.shares_reward
         self.render_mode = render_mode
         self.metadata = {"render_modes": ["rgb_array"]}
         self._actions: Array | None = None
         self._running = False
+        self._stagger = stagger
         n_games = check_count("n_envs", batch.n_games)
+        #: Games in an episode that is shorter than others, (E,).
+        self._is_short = np.zeros(n_games, dtype=np.bool_)
         super().__init__(n_games, len(batch.agents), batch.rows.to_row_space(), batch.action_space, seed)
 
-    def reset(self) -> dict[str, Array]:
+    def reset(self) -> VecEnvObs:
         """
         Begin an episode in every game.
 
         :return: (B, ...) rows
-        :raises ValueError: for options, which these games do not support
+        :raises ValueError: for options that the games do not take
         """
-        if any(self._options):
-            raise ValueError(f"expected no options for the reset of batched games, got {self._options[0]}")
+        options = self._options[:: self.n_agents]
+        if any(options):
+            self.batch.take_options(options)
         self._actions = None
         rows = _filled(self.batch.reset(self._next_seeds), self.n_agents)
+        if self._stagger:
+            self._is_short = self.batch.shorten()
         self._next_seeds = None
+        self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._running = True
-        return rows
+        return self._observations(rows)
+
+    def _observations(self, rows: dict[str, Array]) -> VecEnvObs:
+        return rows if self.batch.rows.is_dict else rows[OBS_KEY]
 
     def step_async(self, actions: npt.ArrayLike) -> None:
         """
@@ -168,45 +215,63 @@ class BatchVecEnv(TeamVecEnv):
         step = self.batch.step(actions)
         rewards = np.array(step.rewards, dtype=np.float32).reshape(self.num_envs)
         dones = step.ended.repeat(self.n_agents)
-        return _filled(step.rows, self.n_agents), rewards, dones, self._infos(step, dones)
+        infos = self._infos(step, dones)
+        self._is_short &= ~step.ended
+        return self._observations(_filled(step.rows, self.n_agents)), rewards, dones, infos
 
     def _infos(self, step: BatchStep, dones: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:
-        infos: list[dict[str, Any]] = [{}] * self.num_envs
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if not dones.any():
             return infos
         last = zip(*(part[dones] for part in step.last.values()), strict=True)
         for row in dones.nonzero()[0].tolist():
             game, agent = divmod(row, self.n_agents)
-            info = {
-                TRUNCATED: bool(step.truncated[game]),
-                TERMINAL_OBSERVATION: dict(zip(step.last, next(last), strict=True)),
-            }
+            observation = dict(zip(step.last, next(last), strict=True))
+            info = {TRUNCATED: bool(step.truncated[game]), TERMINAL_OBSERVATION: self._observations(observation)}
             if step.won is not None and agent == 0:
                 info[IS_SUCCESS] = bool(step.won[game])
+            if self._is_short[game]:
+                info[STAGGERED] = True
             infos[row] = info
             self.reset_infos[row] = {}
         return infos
 
     def close(self) -> None:
-        """Do nothing: engines hold memory only."""
-
-    def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
-        """Return one picture per row, None unless the render mode is ``"rgb_array"``; rows of a game share one."""
-        games = range(self.n_games)
-        return self.per_row(self.batch.picture(game) if self.render_mode == "rgb_array" else None for game in games)
+        """Close the windows of games, if there are any; engines hold memory only."""
+        for game in self.batch.objects:
+            game.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the suite's environment, which all rows share."""
+        """Return an attribute of each row's game, or of the environment that all games share."""
+        if self.batch.objects:
+            return [getattr(game, attr_name) for game in self._games_of(indices)]
         value = self.render_mode if attr_name == "render_mode" else getattr(self.batch.env, attr_name)
         return [value for _ in chosen_indices(indices, self.num_envs)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Raise an error: all games share one engine with fixed parameters."""
-        raise AttributeError(f"games of an engine have no attributes of their own, got {attr_name!r}; make new games")
+        """Set an attribute of each row's game."""
+        for game in self._games_of(indices):
+            setattr(game, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Raise an error: all games share one engine without objects for single games."""
-        raise AttributeError(f"games of an engine have no methods of their own, got {method_name!r}")
+        """Call a method of each row's game, once per row; :meth:`game_method` calls it once per game."""
+        return [getattr(game, method_name)(*args, **kwargs) for game in self._games_of(indices)]
+
+    def game_method(
+        self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method once per game (see the base class); without objects of games there is ``render`` only."""
+        chosen = chosen_indices(games, self.n_games, "game")
+        if method_name == "render" and not self.batch.objects:
+            return [self.batch.picture(game) for game in chosen]
+        selected = self._games_of([game * self.n_agents for game in chosen])
+        return [getattr(game, method_name)(*args, **kwargs) for game in selected]
+
+    def _games_of(self, indices: VecEnvIndices) -> list[Any]:
+        """Return the object of each row's game; AttributeError, as SB3 expects, if the engine has none."""
+        if not self.batch.objects:
+            raise AttributeError("these games share one engine and have no attributes or methods of their own")
+        return [self.batch.objects[row // self.n_agents] for row in chosen_indices(indices, self.num_envs)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Return False for each row: none is wrapped in a Gymnasium wrapper."""
@@ -231,6 +296,7 @@ class ResumableBatchVecEnv(BatchVecEnv):
     :param batch: games with snapshots
     :param seed: see the base class
     :param render_mode: see the base class
+    :param stagger: see the base class
     """
 
     batch: ResumableBatch
@@ -242,32 +308,34 @@ class ResumableBatchVecEnv(BatchVecEnv):
         :return: for :meth:`load_checkpoint_state` of an environment with the same arguments
         """
         return {
+            "settings": dict(self.batch.settings),
             "running": self._running,
             "next_seeds": self._next_seeds,
+            "is_short": self._is_short.copy(),
             "games": self.batch.snapshot() if self._running else {},
         }
 
     def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
-        Check that a state is valid for these games.
+        Check that a state is one of games like these.
 
         :param state: result of :meth:`checkpoint_state`
-        :raises ValueError: naming the first difference
+        :raises ValueError: naming the first setting, or the first array, that differs
         """
-        check_keys(dict(state), ("running", "next_seeds", "games"), "the games")
-        check_like(state["running"], False, "'running' of the games")
-        if (seeds := state["next_seeds"]) is not None:
-            check_list(seeds, "the seeds of the games", self.n_games)
-            for seed in seeds:
-                check_whole(seed, "a seed of the games", high=2**63 - 1)
-        if state["running"]:
-            check_like(state["games"], self._example(), "the games")
-
-    def _example(self) -> dict[str, Array]:
-        """Return a state of these games, which are reset first if they have not begun."""
+        for name, value in self.batch.settings.items():
+            if (other := state["settings"].get(name)) != value:
+                raise ValueError(f"expected games with {name}={value!r}, got a state with {name}={other!r}")
+        if not state["running"]:
+            return
         if not self._running:
             self.batch.reset([0] * self.n_games)
-        return self.batch.snapshot()
+        for name, array in self.batch.snapshot().items():
+            other = np.asarray(state["games"][name])
+            if (other.shape, other.dtype) != (array.shape, array.dtype):
+                raise ValueError(
+                    f"expected {name!r} of the games as {array.dtype} {array.shape}, got {other.dtype} {other.shape}; "
+                    "make the environment with the task, parameters and number of games of the state"
+                )
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
@@ -280,4 +348,5 @@ class ResumableBatchVecEnv(BatchVecEnv):
         if state["running"]:
             self.batch.restore(state["games"])
         self._running = state["running"]
+        self._is_short = np.array(state["is_short"])
         self._next_seeds = None if state["next_seeds"] is None else list(state["next_seeds"])
