@@ -35,3 +35,34 @@ def test_kernels_are_compiled_once_and_anew_after_a_change(tmp_path: Path) -> No
         file.write("# Another condition.\n")
     assert start(package) == ("0", True)
     assert start(package)[0] == "1"
+
+
+LATER = """
+import os
+import subprocess
+import sys
+import warnings
+
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    import hecogrid_envs
+    import sb3_saf.networks.tanh
+print(*(str(one.message) for one in caught if "NUMBA_CACHE_DIR" in str(one.message)), sep="\\n")
+print(os.environ["NUMBA_CACHE_DIR"])
+"""
+
+
+def test_without_any_place_for_compiled_code_a_temporary_folder_is_used_and_named_once(tmp_path: Path) -> None:
+    """Files where numba would make folders stand for folders that cannot be written, also by root."""
+    for package in (PACKAGE, PACKAGE.parent / "sb3_saf"):
+        copy = shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+        for folder in [copy, *(path for path in copy.rglob("*") if path.is_dir())]:
+            (folder / "__pycache__").touch()
+    (tmp_path / "cache").touch()
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONSAFEPATH": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    command = [sys.executable, "-c", LATER]
+    lines = subprocess.run(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
+    message, place = lines.splitlines()
+    assert place in message and not Path(place).exists()

@@ -149,7 +149,6 @@ def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint(monitors: Monitor
     assert returns_in(tmp_path / "monitor.csv") == [69, 69]
     resumed = monitors(2)
     resumed.reset()
-    resumed.check_checkpoint_state(state)
     resumed.load_checkpoint_state(state)
     assert returns_in(tmp_path / "monitor.csv") == [69]
 

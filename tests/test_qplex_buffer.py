@@ -13,8 +13,8 @@ import pytest
 from gymnasium import spaces
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
-from sb3_saf.checkpoints.data import read_tree, write_tree
 from sb3_saf.teams.rows import TeamSpaces
+from sb3_saf.teams.trees import read_tree, write_tree
 
 N_AGENTS, N_GAMES, N_ACTIONS = 2, 3, 4
 OWN = spaces.Box(0, 255, (3,), np.uint8)
@@ -208,7 +208,7 @@ def test_a_checkpoint_is_written_without_a_second_buffer_in_memory(tmp_path: Pat
     tracemalloc.start()
     try:
         with (tmp_path / "file").open("wb") as file:
-            write_tree(file, buffer.checkpoint_state(), "1.0")
+            write_tree(file, buffer.checkpoint_state())
         written = tracemalloc.get_traced_memory()[1]
         tracemalloc.reset_peak()
         with (tmp_path / "file").open("rb") as file:

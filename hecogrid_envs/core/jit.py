@@ -1,5 +1,6 @@
 """
-Compiler decorators for kernels, and unaligned loads, stores and copies of words, which NumPy's typed views lack.
+Compiler decorators for kernels, a place for compiled code, and unaligned loads, stores and copies of words, which
+NumPy's typed views lack.
 
 Kernels are parts of one function, :func:`hecogrid_envs.core.play.play`, which numba caches on disk. Parts have no
 wrappers for Python, since only kernels call them: this halves the compile time. Called from Python, they are plain
@@ -8,7 +9,12 @@ Python functions.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import os
+import shutil
+import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -16,7 +22,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba import types
+from numba import config, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
@@ -24,6 +30,35 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 _NO_WRAPPERS: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """
+    Compile a function for calls from Python as ``numba.njit(nogil=True, **options)`` does, and keep the code on disk.
+
+    Numba keeps it beside the source or in the user's cache. Where neither can be written, for instance in a container
+    without a home, this process and its children keep it in a temporary folder.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return njit(cache=True, nogil=True, **options)(function)
+        except RuntimeError as error:
+            if "no locator" not in str(error):
+                raise
+            folder = tempfile.mkdtemp(prefix="numba-")
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            os.environ["NUMBA_CACHE_DIR"] = folder  # of processes that this one starts
+            config.CACHE_DIR = folder  # type: ignore[attr-defined]
+            warnings.warn(
+                f"neither the package's folder nor the user's cache can be written: compiled code is kept in {folder} "
+                "until this process ends; set NUMBA_CACHE_DIR to a folder that can be written, to compile only once",
+                UserWarning,
+                stacklevel=2,
+            )
+            return njit(cache=True, nogil=True, **options)(function)
+
+    return decorate
 
 
 def kernel(function: Function) -> Function:

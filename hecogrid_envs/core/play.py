@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from numba import njit
-
 from hecogrid_envs.core.generation import begin, new_level, redraw
-from hecogrid_envs.core.jit import hot, inlined, kernel, source_key
+from hecogrid_envs.core.jit import cached, hot, inlined, kernel, source_key
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.rules import act
 from hecogrid_envs.core.types import BEGIN, REDRAW, RESET, RESTART, STEP, TILES, U8, Buffers, Games, World, whole
@@ -17,7 +15,7 @@ from hecogrid_envs.core.view import draw_pictures, observe_tiles
 def _compiled_play(sources: int) -> Any:
     """Compile :func:`play` for a source key (:func:`~hecogrid_envs.core.jit.source_key`)."""
 
-    @njit(cache=True, nogil=True)
+    @cached()
     def play(
         games: Games, world: World, buffers: Buffers, task: int, views: U8, last_views: U8, first: int, end: int
     ) -> None:

@@ -18,8 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.checkpoints.checks import check_array, check_keys, check_list, check_whole
-from sb3_saf.teams.checks import check_count, check_whole_teams
+from sb3_saf.teams.checks import check_count, check_form, check_whole_teams
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 Indices = npt.NDArray[np.int64]
@@ -306,68 +305,20 @@ class TeamReplayBuffer(ReplayBuffer):
             "n_steps": self._n_steps,
         }
 
-    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that a state is valid for this buffer.
-
-        :param state: result of :meth:`checkpoint_state`
-        :raises ValueError: naming the first part that does not fit
-        """
-        if state.get("n_slots") != self.n_slots:
-            raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state.get('n_slots')}")
-        check_keys(dict(state), ("n_slots", "slots", "aside", "free", "pos", "n_steps"), "the replay buffer")
-        for name in ("pos", "n_steps"):
-            check_whole(state[name], f"{name!r} of the replay buffer", high=self.n_slots - 1)
-        pos, n_steps, free = state["pos"], state["n_steps"], state["free"]
-        if n_steps < self.buffer_size and pos != n_steps:
-            raise ValueError(f"expected a replay buffer of {n_steps} steps that goes on at {n_steps}, got {pos}")
-        n_filled = self.n_slots if n_steps == self.buffer_size else pos + 1
-        self._check_arrays(state["slots"], {name: part[:n_filled] for name, part in self._by_slot().items()})
-        self._check_arrays(state["aside"], self.aside, any_length=True)
-        n_places = len(state["aside"][OBS_KEY])
-        used = state["slots"]["aside_index"]
-        check_list(free, "'free' of the replay buffer")
-        for place in free:
-            check_whole(place, "a place in 'free' of the replay buffer")
-        places = sorted([*used[used != _IN_NEXT_SLOT].tolist(), *free])
-        if places != list(range(n_places)):
-            raise ValueError(f"expected each of the {n_places} observations put aside to belong to one step or to none")
-        if len({len(part) for part in state["aside"].values()}) > 1:
-            raise ValueError("expected as many observations put aside of each kind")
-        self._check_values(state["slots"], "seen ")
-        self._check_values(state["aside"], "")
-
-    def _check_arrays(self, found: Any, like: Mapping[str, Array], any_length: bool = False) -> None:
-        check_keys(found, like, "the arrays of the replay buffer")
-        for name, own in like.items():
-            length = np.shape(found[name])[:1] if any_length else own.shape[:1]
-            check_array(found[name], (*length, *own.shape[1:]), own.dtype, f"{name!r} of the replay buffer")
-
-    def _check_values(self, arrays: Mapping[str, Array], prefix: str) -> None:
-        """Check values that networks use as table indices."""
-        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
-        if "actions" in arrays and (arrays["actions"] >= n_actions).any():
-            raise ValueError(f"expected actions from 0 to {n_actions - 1}, got {arrays['actions'].max()}")
-        own, space = arrays[f"{prefix}{OBS_KEY}"], self.team_spaces.team
-        if own.dtype.kind in "biu" and ((own < space.low) | (own > space.high)).any():
-            raise ValueError(f"expected observations in {space}, got {own.min()} to {own.max()}")
-        for key in (ACTION_MASK_KEY, ACTIVE_KEY):
-            flags = arrays.get(f"{prefix}{key}")
-            if flags is not None and flags.size and not 0 <= flags.min() <= flags.max() <= 1:
-                raise ValueError(f"expected {key!r} of 0 and 1, got {flags.min()} to {flags.max()}")
-
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
         Restore a state.
 
         :param state: result of :meth:`checkpoint_state`
-        :raises ValueError: see :meth:`check_checkpoint_state`
+        :raises ValueError: for the state of another buffer, naming the first difference
         """
-        self.check_checkpoint_state(state)
+        if state["n_slots"] != self.n_slots:
+            raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state['n_slots']}")
+        n_filled = self.n_slots if state["n_steps"] == self.buffer_size else state["pos"] + 1
+        check_form("the replay buffer", state["slots"], {k: part[:n_filled] for k, part in self._by_slot().items()})
         self.reset()
         for name, array in self._by_slot().items():
-            saved = state["slots"][name]
-            array[: len(saved)] = saved
+            array[:n_filled] = state["slots"][name]
         self.aside = {key: np.array(part) for key, part in state["aside"].items()}
         self._free, self.pos, self._n_steps = list(state["free"]), state["pos"], state["n_steps"]
         self.full = self._n_steps == self.buffer_size

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
+from pathlib import Path
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG, check_training, show_game_steps, team_steps
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
+from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.vec_env import agent_names, check_other_games, require_n_agents
 
 
@@ -142,7 +143,8 @@ class TeamEvalCallback(EvalCallback):
         if result.successes:
             self.evaluations_successes.append(list(result.successes))
             arrays["successes"] = np.array(self.evaluations_successes)
-        np.savez(self.log_path, **arrays)  # type: ignore[arg-type]
+        with atomic_file(Path(f"{self.log_path}.npz")) as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]
 
     def _log(self, result: EvaluationResult) -> None:
         steps, mean_length = self._game_steps(), float(np.mean(result.lengths))
@@ -166,7 +168,8 @@ class TeamEvalCallback(EvalCallback):
             self._say("New best mean team return")
             self.best_mean_reward = result.mean
             if self.best_model_save_path is not None:
-                self.model.save(os.path.join(self.best_model_save_path, "best_model"))
+                with atomic_file(Path(self.best_model_save_path, "best_model.zip")) as file:
+                    self.model.save(file)
             if self.callback_on_new_best is not None:
                 go_on = self.callback_on_new_best.on_step()
         return go_on and (self.callback is None or self._on_event())

@@ -116,6 +116,8 @@ class GameStepsCallback(BaseCallback):
     ``sb3_saf.train`` and ``resumable_learn`` add it automatically; pass it to any other ``learn``.
     """
 
+    only_shows = True  # has no state in checkpoints
+
     def __init__(self) -> None:
         super().__init__()
         self._n_agents: int | None = None

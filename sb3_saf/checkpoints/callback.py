@@ -14,16 +14,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
 from sb3_saf.checkpoints.callback_states import all_callbacks, callback_states
-from sb3_saf.checkpoints.checks import check_keys, check_text, check_whole
-from sb3_saf.checkpoints.data import Tree, encode, write_tree
 from sb3_saf.checkpoints.environments import environment_state
-from sb3_saf.checkpoints.generators import generator_states
 from sb3_saf.checkpoints.logs import logger_state
-from sb3_saf.checkpoints.models import is_off_policy, model_state, require_resumable
-from sb3_saf.checkpoints.runs import callback_descriptions, description, software
+from sb3_saf.checkpoints.models import generator_states, is_off_policy, model_state, require_resumable
+from sb3_saf.checkpoints.runs import description, software
 from sb3_saf.checkpoints.store import CheckpointFolder, Loaded
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.trees import Tree, encode, write_tree
 from sb3_saf.teams.vec_env import require_n_agents
 
 
@@ -32,7 +30,7 @@ class Run(NamedTuple):
     Run of a model.
 
     :param name: stored in every checkpoint, so that no other run continues in the folder
-    :param description: description of the model and its games at the first start
+    :param description: of model, games and callbacks at the first start
     """
 
     name: str
@@ -41,8 +39,7 @@ class Run(NamedTuple):
 
 #: Entries of a checkpoint.
 _ENTRIES: Final = (
-    *("run", "game_steps", "software", "description", "callback_descriptions"),
-    *("model", "environment", "callbacks", "generators", "logger"),
+    *("run", "game_steps", "software", "description", "model", "environment", "callbacks", "generators", "logger"),
 )
 
 _RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary()
@@ -60,10 +57,8 @@ def newest_checkpoint(folder: CheckpointFolder) -> Loaded | None:
     :raises CheckpointError: see :meth:`CheckpointFolder.newest`; also for a file with other content
     """
     newest = folder.newest()
-    if newest is not None:
-        check_keys(newest.tree, _ENTRIES, "the checkpoint")
-        check_text(newest.tree["run"], "the run's name")
-        check_whole(newest.tree["game_steps"], "the game steps")
+    if newest is not None and not (isinstance(newest.tree, dict) and newest.tree.keys() == set(_ENTRIES)):
+        raise CheckpointError(f"expected a checkpoint of {', '.join(_ENTRIES)}, got {newest.path} with other content")
     return newest
 
 
@@ -119,7 +114,7 @@ class TeamCheckpointCallback(BaseCallback):
         show_game_steps(self.model)
         self.store.acquire()
         if self.model not in _RUNS:
-            enter_run(self.model, Run(uuid.uuid4().hex, description(self.model)))
+            enter_run(self.model, Run(uuid.uuid4().hex, description(self.model, self.others)))
         self._run = _RUNS[self.model]
         newest = newest_checkpoint(self.store)
         if newest is not None and newest.tree["run"] != self._run.name:
@@ -185,21 +180,20 @@ class TeamCheckpointCallback(BaseCallback):
         """Copy the present state; with a replay buffer, to disk."""
         steps = self._game_steps()
         if not is_off_policy(self.model):
-            self._last = (steps, encode(self._state(), software()["sb3_saf"]))
+            self._last = (steps, encode(self._state()))
         elif steps != self._written:
-            self._write(lambda file: write_tree(file, self._state(), software()["sb3_saf"]), steps)
+            self._write(lambda file: write_tree(file, self._state()), steps)
 
     def _state(self) -> dict[str, Tree]:
         return {
             "run": self._run.name,
             "game_steps": self._game_steps(),
-            "software": software(),
+            "software": software(self.model),
             "description": self._run.description,
-            "callback_descriptions": callback_descriptions(self.others),
             "model": model_state(self.model),
             "environment": environment_state(self.training_env) if self.exact else None,
             "callbacks": callback_states(self.others) if self.exact else None,
-            "generators": generator_states(self.model.action_space),
+            "generators": generator_states(self.model),
             "logger": logger_state(self.model.logger),
         }
 

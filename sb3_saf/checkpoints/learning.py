@@ -21,18 +21,21 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_saf.callbacks.finite import FiniteCallback
 from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run, newest_checkpoint
-from sb3_saf.checkpoints.callback_states import all_callbacks, check_callback_states, load_callback_states
-from sb3_saf.checkpoints.checks import refused
-from sb3_saf.checkpoints.data import Tree
-from sb3_saf.checkpoints.environments import check_environment_state, load_environment_state
-from sb3_saf.checkpoints.generators import check_generator_states, load_generator_states
-from sb3_saf.checkpoints.logs import check_logger_state, continue_logs
-from sb3_saf.checkpoints.models import check_model_state, is_off_policy, load_model_state, require_resumable
-from sb3_saf.checkpoints.runs import check_descriptions, check_software, warn_of_differences
+from sb3_saf.checkpoints.callback_states import all_callbacks, load_callback_states
+from sb3_saf.checkpoints.environments import load_environment_state
+from sb3_saf.checkpoints.logs import continue_logs
+from sb3_saf.checkpoints.models import (
+    is_off_policy,
+    load_generator_states,
+    load_model_state,
+    require_resumable,
+    settings_restored_on_error,
+)
+from sb3_saf.checkpoints.runs import check_description, description, software, warn_of_differences
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.envs.game_copies import ForeignGamesError, pickled_games, sign_games
+from sb3_saf.envs.game_copies import ForeignGamesError, check_signatures, pickled_games, sign_games
 from sb3_saf.teams.errors import CheckpointError, NonFiniteError
-from sb3_saf.teams.vec_env import require_n_agents
+from sb3_saf.teams.trees import Tree
 
 #: Torch's error message for action distributions with NaN parameters.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)
@@ -49,10 +52,10 @@ def resume(
     """
     Load the newest valid checkpoint into a model, its environment and its callbacks.
 
-    These are made by the caller as for the first start, so nothing is unpickled. The checkpoint is compared with them,
-    and checked, before they are modified. Afterwards ``model.learn(total_timesteps - model.num_timesteps, callback,
-    reset_num_timesteps=False)`` continues, with the ``total_timesteps`` of the first start, on which schedules depend.
-    Draw no random numbers in between.
+    These are made by the caller as for the first start, so nothing is unpickled but games with this user's signature.
+    The description in the checkpoint is compared with theirs before they are modified. Afterwards
+    ``model.learn(total_timesteps - model.num_timesteps, callback, reset_num_timesteps=False)`` continues, with the
+    ``total_timesteps`` of the first start, on which schedules depend. Draw no random numbers in between.
 
     :param folder: folder of a TeamCheckpointCallback
     :param model: made as for the first start, with its environment
@@ -70,38 +73,30 @@ def resume(
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
     others = [one for one in all_callbacks(callback) if not isinstance(one, TeamCheckpointCallback)]
     tree = loaded.tree
+    check_description(tree["description"], description(model, others))
+    if exact and tree["environment"] is None:
+        raise CheckpointError(f"expected the state of the games with exact=True, got {loaded.path} without it")
+    games = [tree["environment"], tree["callbacks"]]
     if trust_games:
-        sign_games([tree["environment"], tree["callbacks"]])
+        sign_games(games)
     try:
-        _check(model, others, tree)
+        check_signatures(games)
     except ForeignGamesError as error:
         if exact:
             raise
-        warnings.warn(f"{error}. Now new episodes begin; all else goes on", UserWarning, stacklevel=2)
+        warnings.warn(f"{error}. New episodes begin; everything else continues", UserWarning, stacklevel=2)
         tree = {**tree, "environment": None, "callbacks": None}
-        _check(model, others, tree)
-    warn_of_differences(tree["software"])
-    _load(model, others, tree)
-    games = "new episodes begin" if tree["environment"] is None else "the games go on where they were, bit for bit"
+    warn_of_differences(tree["software"], software(model))
+    try:
+        _load(model, others, tree)
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise CheckpointError(f"the checkpoint {loaded.path} does not fit: {reason}; make a new model") from error
+    message = "new episodes begin" if tree["environment"] is None else "the games go on where they were, bit for bit"
     if any(pickled_games([tree["environment"], tree["callbacks"]])):
-        games += "; they were unpickled from it, as this user signed them"
-    model.logger.log(f"Resumed from {loaded.path}: {games}")
+        message += "; they were unpickled from it, as this user signed them"
+    model.logger.log(f"Resumed from {loaded.path}: {message}")
     return loaded.path
-
-
-def _check(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
-    """Check the whole checkpoint before loading any of it; a CheckpointError names the first difference."""
-    assert model.env is not None
-    check_descriptions(model, others, tree["description"], tree["callback_descriptions"])
-    check_software(tree["software"])
-    check_model_state(model, tree["model"])
-    if tree["model"]["counters"]["num_timesteps"] != tree["game_steps"] * require_n_agents(model.env):
-        raise refused("num_timesteps", "those of the game steps", tree["model"]["counters"]["num_timesteps"])
-    if tree["environment"] is not None:
-        check_environment_state(model.env, tree["environment"])
-        check_callback_states(others, tree["callbacks"])
-    check_generator_states(tree["generators"], model.action_space)
-    check_logger_state(tree["logger"])
 
 
 def _load(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
@@ -116,7 +111,7 @@ def _load(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> N
         model._last_obs = None
     continue_logs(model, tree["logger"])
     enter_run(model, Run(tree["run"], tree["description"]))
-    load_generator_states(tree["generators"], model.action_space)  # last: the calls above may draw from them
+    load_generator_states(tree["generators"], model)  # last: the calls above may draw from them
 
 
 def resumable_learn(
@@ -167,7 +162,7 @@ def resumable_learn(
                 print(f"Going on from {path}")
             learn_arguments["reset_num_timesteps"] = False
             total_timesteps -= model.num_timesteps
-        with _saved_on_interrupt(checkpoints, is_off_policy(model), again):
+        with settings_restored_on_error(model), _saved_on_interrupt(checkpoints, is_off_policy(model), again):
             model.learn(total_timesteps, [*before, checkpoints, *given], **learn_arguments)
     finally:
         checkpoints.store.release()

@@ -10,8 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
 
 from sb3_saf.callbacks.game_steps import game_steps
-from sb3_saf.checkpoints.checks import check_keys, check_list, check_name, check_real, check_text, check_whole
-from sb3_saf.checkpoints.data import Tree
+from sb3_saf.teams.trees import Tree
 
 
 def logger_state(logger: Logger) -> Tree:
@@ -30,24 +29,6 @@ def logger_state(logger: Logger) -> Tree:
     }
 
 
-def check_logger_state(state: Tree) -> None:
-    """Check names and values; a CheckpointError names the first invalid one."""
-    check_keys(state, ("tensorboard", "numbers"), "logger")
-    if state["tensorboard"] is not None:
-        check_name(state["tensorboard"], "the folder of the logs")
-    check_list(state["numbers"], "the logged numbers")
-    for entry in state["numbers"]:
-        check_list(entry, "a logged number", 4)
-        name, value, excluded, count = entry
-        check_text(name, "the name of a logged number")
-        if not isinstance(value, (bool, np.bool_)):
-            check_real(value, name, finite=False)
-        check_list(excluded, f"what {name} is excluded from")
-        for part in excluded:
-            check_text(part, f"what {name} is excluded from")
-        check_whole(count, f"the count of {name}")
-
-
 def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
     """Set a logger that continues in the same folder; a logger set by the caller is kept."""
     if not hasattr(model, "logger"):
@@ -64,7 +45,7 @@ def _continued_logger(model: BaseAlgorithm, name: str | None) -> Logger:
     formats = ["stdout"] if model.verbose >= 1 else [""]
     if name is None or model.tensorboard_log is None:
         return configure(None, formats)
-    folder = os.path.join(model.tensorboard_log, name)
+    folder = os.path.join(model.tensorboard_log, os.path.basename(name))
     logger = configure(folder, formats)
     board = TensorBoardOutputFormat(folder)
     # TensorBoard hides entries written after the checkpoint, which are written again.

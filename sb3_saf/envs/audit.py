@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
-from math import isfinite
+from math import isfinite, isnan
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +24,11 @@ from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, n_mask_entries
 #: Steps of a trial, and its limit in seconds.
 TRIAL_STEPS: Final = 30
 TRIAL_SECONDS: Final = 1.0
+
+#: Packages whose objects are not searched for settings of a game, and limits of the search.
+_NO_SETTINGS: Final = ("builtins", "numpy", "torch", "jax", "jaxlib", "random", "threading", "_thread", "pygame")
+_MOST_SETTINGS: Final = 500
+_MOST_ITEMS: Final = 50
 
 _RESET: Final = "(observations, infos)"
 _STEP: Final = "(observations, rewards, terminations, truncations, infos)"
@@ -210,6 +216,46 @@ def layers_of(env: Any) -> list[Any]:
         layers.append(inner)
     bare = env.unwrapped
     return layers if any(layer is bare for layer in layers) else [*layers, bare]
+
+
+def settings_of(env: Any, depth: int = 4) -> dict[str, Any]:
+    """
+    Return what a new game keeps of its arguments: the numbers, flags and text among its attributes, by dotted names.
+
+    :param env: before its first episode
+    :param depth: how far attributes of attributes are followed
+    """
+    result: dict[str, Any] = {}
+    todo = [("", env, 0)]
+    visited = set()
+    while todo:
+        name, value, level = todo.pop()
+        if _is_plain(value):
+            result[name] = value
+        elif id(value) not in visited and level < depth and len(result) < _MOST_SETTINGS:
+            visited.add(id(value))
+            result[f"{name}.class".lstrip(".")] = type(value).__name__
+            todo += [
+                (f"{name}.{key}".lstrip("."), inner, level + 1)
+                for key, inner in sorted(vars(value).items(), reverse=True)
+                if _is_plain(inner) or (hasattr(inner, "__dict__") and _may_hold_settings(inner))
+            ]
+    return result
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a value is a number, a flag, text other than a path, or a small collection of these."""
+    if isinstance(value, (list, tuple)):
+        return len(value) <= _MOST_ITEMS and all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return len(value) <= _MOST_ITEMS and all(map(_is_plain, [*value, *value.values()]))
+    if type(value) is float:
+        return not isnan(value)
+    return value is None or type(value) in (bool, int) or (type(value) is str and os.sep not in value)
+
+
+def _may_hold_settings(value: Any) -> bool:
+    return not callable(value) and type(value).__module__.partition(".")[0] not in _NO_SETTINGS
 
 
 def has_game_attribute(env: Any, name: str) -> bool:

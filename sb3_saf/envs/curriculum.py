@@ -11,7 +11,6 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.checkpoints.checks import check_whole
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 
@@ -92,24 +91,12 @@ class Curriculum(TeamVecEnvWrapper):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Return the position in the curriculum, without the state of the games."""
-        return {"ends": list(self.ends), "game_steps": self.game_steps}
-
-    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that a state is valid for this curriculum."""
-        if state["ends"] != list(self.ends):
-            raise ValueError(f"expected stages that end at game steps {list(self.ends)}, got {state['ends']!r:.80}")
-        check_whole(state["game_steps"], "the game steps of a curriculum")
-        if state["game_steps"] % self.n_games:
-            raise ValueError(f"expected game_steps to be a multiple of {self.n_games}, got {state['game_steps']}")
+        return {"game_steps": self.game_steps}
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state of :meth:`checkpoint_state`."""
         self.game_steps = state["game_steps"]
         self._enter(self._present_stage())
-
-    def venv_in(self, state: Mapping[str, Any]) -> VecEnv:
-        """Return the games that a state of :meth:`checkpoint_state` belongs to."""
-        return self.stages[int(np.searchsorted(self.ends, state["game_steps"], side="right"))]
 
     def close(self) -> None:
         """Close the games of all stages."""

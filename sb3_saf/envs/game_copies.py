@@ -29,10 +29,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
-from sb3_saf.checkpoints.data import decode, encode
-from sb3_saf.envs.audit import layers_of
+from sb3_saf.envs.audit import layers_of, settings_of
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.rows import ACTION_MASK_KEY
+from sb3_saf.teams.trees import decode, encode
 
 if TYPE_CHECKING:
     from sb3_saf.envs.supersuit_games import TeamMarkovVectorEnv
@@ -204,20 +204,22 @@ def signature(data: npt.NDArray[np.uint8]) -> str:
     return hmac.new(_key(key_file()), data.tobytes(), "sha256").hexdigest()
 
 
-def check_signature(data: npt.NDArray[np.uint8], signed: object) -> None:
-    """Raise ForeignGamesError unless this user has signed a pickled game."""
-    if not isinstance(signed, str) or not hmac.compare_digest(signature(data), signed):
-        raise ForeignGamesError(
-            "its games are pickled and were not signed with this user's key, and unpickling a stranger's file runs "
-            "code from it; pass trust_games=True if you know who wrote it (a run of your own on another machine, for "
-            f"instance; the key is in {key_file()})"
-        )
+def check_signatures(tree: Any) -> None:
+    """Raise ForeignGamesError unless this user has signed all pickled games of a checkpoint."""
+    for game in pickled_games(tree):
+        data = np.asarray(game["pickled"])
+        if not hmac.compare_digest(signature(data), str(game.get("signature"))):
+            raise ForeignGamesError(
+                "its games are pickled and were not signed with this user's key, and unpickling a stranger's file runs "
+                "code from it; pass trust_games=True if you know who wrote it (a run of your own on another machine, "
+                f"for instance; the key is in {key_file()})"
+            )
 
 
 def pickled_games(tree: Any) -> Iterator[dict[str, Any]]:
     """Find the pickled games of a checkpoint."""
     if isinstance(tree, dict):
-        if isinstance(tree.get("pickled"), np.ndarray):
+        if "pickled" in tree:
             yield tree
         tree = list(tree.values())
     if isinstance(tree, (list, tuple)):
@@ -229,6 +231,17 @@ def sign_games(tree: Any) -> None:
     """Sign all pickled games of a checkpoint whose source the user trusts."""
     for game in pickled_games(tree):
         game["signature"] = signature(game["pickled"])
+
+
+def common_settings(make_game: Callable[[], Any]) -> dict[str, Any]:
+    """Return the settings of new games, see :func:`settings_of`, without those that differ from game to game."""
+    with _kept_generators():
+        games = [make_game(), make_game()]
+    one, other = map(settings_of, games)
+    for game in games:
+        with suppress(Exception):
+            game.close()
+    return {name: value for name, value in one.items() if name in other and repr(value) == repr(other[name])}
 
 
 # --- trials -----------------------------------------------------------------------------------------------------------
@@ -276,7 +289,7 @@ def _trial(make_game: Callable[[], TeamMarkovVectorEnv], way: Way) -> str | None
 def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: Way) -> str | None:
     """Return the first difference between a game and its copy, or None."""
     rows, _ = _play(original, original.reset(seed=0)[0], TRIAL_STEPS)
-    copy.restore(decode(encode(original.snapshot(way), "trial")))
+    copy.restore(decode(encode(original.snapshot(way))))
     began = _global_generators()
     _, seen = _play(original, rows, TRIAL_STEPS)
     seen.append(_bytes_of(original.reset()[0]))

@@ -13,7 +13,6 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.checkpoints.checks import check_array, check_range, check_whole
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.conversion import AgentConversion
@@ -134,14 +133,6 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
     def checkpoint_state(self) -> dict[str, Any]:
         """Return the step count and the present action masks."""
         return {"n_steps": self._n_steps, "masks_shown": self._masks_shown}
-
-    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that a state is valid for this wrapper."""
-        check_whole(state["n_steps"], "the steps of CentralizedValueWrapper")
-        if (masks := state["masks_shown"]) is not None:
-            shape = (self.num_envs, self._raw.n_masked_actions or 0)
-            check_array(masks, shape, np.int8, "the action masks of CentralizedValueWrapper")
-            check_range(masks, 0, 1, "the action masks of CentralizedValueWrapper")
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a state (see :meth:`checkpoint_state`)."""
@@ -350,13 +341,6 @@ class DictRows(TeamVecEnvWrapper):
             for info in infos
         ]
         return {OBS_KEY: obs}, rewards, dones, infos  # type: ignore[dict-item]
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        """Return nothing: the wrapper has no state."""
-        return {}
-
-    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Do nothing."""
 
 
 def _protected_from_transposition(venv: VecEnv, n_agents: int | None) -> VecEnv:

@@ -14,7 +14,6 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.checkpoints.checks import check_array, check_real, check_whole
 from sb3_saf.teams.rows import IS_SUCCESS
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, episode_value, team_dones
 
@@ -181,15 +180,6 @@ class TeamMonitor(TeamVecEnvWrapper):
             "file_size": 0 if self._writer is None else _synced_size(self._writer.file_handler),
         }
 
-    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that a state is valid for this monitor."""
-        for name, own in (("returns", self._returns), ("lengths", self._lengths)):
-            check_array(state[name], own.shape, own.dtype, f"{name!r} of the monitor")
-        for name in ("episode_count", "n_steps", "file_size"):
-            check_whole(state[name], f"{name!r} of the monitor")
-        check_real(state["t_start"], "'t_start' of the monitor")
-        self._check_file(state["file_size"], state["episode_count"])
-
     def _check_file(self, size: int, episode_count: int) -> None:
         """Check that the first ``size`` bytes of the file hold the run's episodes."""
         path = self._path()
@@ -205,6 +195,7 @@ class TeamMonitor(TeamVecEnvWrapper):
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state; lines written to the file after it are cut off, since their episodes are played again."""
+        self._check_file(state["file_size"], state["episode_count"])
         self._returns[:] = state["returns"]
         self._lengths[:] = state["lengths"]
         self._notes = [dict(notes) for notes in state["notes"]]

@@ -12,11 +12,10 @@ import numpy.typing as npt
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.checkpoints.checks import check_array, check_keys, check_like, check_list, check_whole
 from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.equal_spaces import EqualSpaces, trial_of
-from sb3_saf.envs.game_copies import check_signature, signature
+from sb3_saf.envs.game_copies import check_signatures, common_settings, signature
 from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv, common_space
 from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
 from sb3_saf.envs.supersuit_games import GameSource, TeamConcatVecEnv
@@ -92,6 +91,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         source, reader = _source_and_reader(make_env, n_cpus, active, action_masks, state, float64)
         for note in reader.notes:
             warnings.warn(note, UserWarning, stacklevel=2)
+        self._source = source
         self.possible_agents = list(reader.agents)
         self.conversions = reader.conversions
         self._game_action_space = reader.action_space
@@ -194,6 +194,10 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     # ---- checkpoints
 
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that new games keep (see the base class)."""
+        return common_settings(self._source.build)
+
     def checkpoint_state(self) -> dict[str, Any]:
         """Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`)."""
         self._check_open()
@@ -209,29 +213,9 @@ class SuperSuitVecEnv(TeamVecEnv):
             "games": snapshots if self._begun else [],
         }
 
-    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Check that a state is valid for these games, and that pickled games have this user's signature."""
-        where = "the state of the games"
-        check_keys(state, ("seeds", "next_seeds", "begun", "warned", "games"), where)
-        for name in ("seeds", "next_seeds"):
-            check_list(state[name], f"{name} of the games", self.n_games)
-            for seed in state[name]:
-                if seed is not None:
-                    check_whole(seed, "the seed of a game")
-        check_like([state["begun"], state["warned"]], [True, True], where)
-        check_list(state["games"], where, self.n_games if state["begun"] else 0)
-        for game in state["games"]:
-            content = ("pickled", "signature") if "pickled" in game else ("state",)
-            check_keys(game, ("n_steps", "ended", *content), "the state of a game")
-            check_whole(game["n_steps"], "the steps of a game")
-            check_like(game["ended"], [True] * self.n_agents, "the agents that have ended")
-            if "pickled" in game:
-                check_array(game["pickled"], np.shape(game["pickled"]), np.uint8, "a pickled game")
-                check_signature(game["pickled"], game["signature"])
-
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of :meth:`checkpoint_state`."""
-        self.check_checkpoint_state(state)
+        """Restore a state of :meth:`checkpoint_state`; ForeignGamesError for pickled games of another user."""
+        check_signatures(state["games"])
         if state["begun"]:
             self._games.restore(state["games"])
         self.seeded_with = tuple(state["seeds"])

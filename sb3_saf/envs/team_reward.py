@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -36,10 +35,3 @@ class SharedReward(TeamVecEnvWrapper):
         by_game = np.asarray(rewards).reshape(self.n_games, self.n_agents)
         shared = by_game.sum(axis=1) if self.team_reward == "sum" else by_game.mean(axis=1)
         return obs, np.repeat(shared, self.n_agents), dones, infos
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        """Return nothing: the wrapper has no state."""
-        return {}
-
-    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Do nothing."""

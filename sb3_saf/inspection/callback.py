@@ -51,6 +51,8 @@ class InspectionCallback(BaseCallback):
         is not of this package or ``eval_env`` does not match the training environment
     """
 
+    only_shows = True  # has no state in checkpoints
+
     def __init__(
         self,
         eval_env: VecEnv,

@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from numba import njit
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from hecogrid_envs.core.jit import cached
 from sb3_saf.networks.layers import Linear
 
 Floats = npt.NDArray[np.float32]
@@ -121,7 +121,7 @@ def _by_group(queries: th.Tensor) -> Floats:
 # --- kernels: queries and shown have one entry for all groups, or one for each ----------------------------------------
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@cached(error_model="numpy", fastmath=_FAST)
 def _take(queries: Floats, sources: Floats, shown: npt.NDArray[np.bool_], taken: Floats, weights: Floats) -> None:
     n_groups, n_sources, n_features = sources.shape
     zero = np.float32(0)
@@ -151,7 +151,7 @@ def _take(queries: Floats, sources: Floats, shown: npt.NDArray[np.bool_], taken:
                         taken[g, q, i] += weight * sources[g, s, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@cached(error_model="numpy", fastmath=_FAST)
 def _give_back(
     of_taken: Floats,
     of_weights: Floats,

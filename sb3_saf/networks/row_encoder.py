@@ -14,8 +14,8 @@ from typing import Final, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from numba import njit
 
+from hecogrid_envs.core.jit import cached
 from sb3_saf.networks.layers import InOrder, Rows, gather
 
 _WORD: Final = 8  # bytes in a machine word
@@ -255,7 +255,7 @@ def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
     return flat.clone() if flat.storage_offset() % _WORD else flat
 
 
-@njit(cache=True, nogil=True)
+@cached()
 def _hash_row(words: npt.NDArray[np.uint64], row: int) -> np.uint64:
     """Multiply and fold, in four independent lanes so that the multiplications overlap."""
     multiplier, shift = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
@@ -283,7 +283,7 @@ def _hash_row(words: npt.NDArray[np.uint64], row: int) -> np.uint64:
     return a
 
 
-@njit(cache=True, nogil=True)
+@cached()
 def _equal_rows(words: npt.NDArray[np.uint64], row: int, other: int) -> bool:
     width = words.shape[1]
     i = 0
@@ -302,7 +302,7 @@ def _equal_rows(words: npt.NDArray[np.uint64], row: int, other: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@cached()
 def _find_unique(
     words: npt.NDArray[np.uint64],
     table: npt.NDArray[np.int32],

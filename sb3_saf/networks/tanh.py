@@ -13,7 +13,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from numba import njit
+
+from hecogrid_envs.core.jit import cached
 
 _LIMIT: Final = np.float32(9.0)
 _P0, _P1, _P2, _P3, _P4 = (
@@ -55,7 +56,7 @@ def _tanh(x: th.Tensor) -> th.Tensor:
     return y
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@cached(error_model="numpy", fastmath={"contract"})
 def _fill(x: npt.NDArray[np.float32], y: npt.NDArray[np.float32]) -> None:
     """Write the tanh of all numbers; NaN stays NaN."""
     for i in range(x.size):

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from numba import njit
 from torch.autograd.function import once_differentiable
+
+from hecogrid_envs.core.jit import cached
 
 Ints: TypeAlias = npt.NDArray[np.int64]
 Floats: TypeAlias = npt.NDArray[Any]
@@ -197,13 +198,13 @@ def _flat(tensor: th.Tensor) -> npt.NDArray[Any]:
 # Arrays are flat and indices unsigned: numba then omits the check for negative indices, and loops are vectorised.
 
 
-@njit(cache=True, nogil=True)
+@cached()
 def _mark(views: npt.NDArray[Any], seen: npt.NDArray[np.bool_]) -> None:
     for code in views.flat:
         seen[code] = True
 
 
-@njit(cache=True, nogil=True)
+@cached()
 def _gather(
     views: Ints,
     table: Floats,
@@ -248,7 +249,7 @@ def _gather(
             to += size
 
 
-@njit(cache=True, nogil=True)
+@cached()
 def _scatter(
     views: Ints,
     gradient: Floats,

@@ -36,7 +36,7 @@ that step many games in one call: an SB3 VecEnv of B rows, game-major, then agen
 - ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` as SB3 declares them; engines without objects for
   single games raise AttributeError, as SB3 expects for missing attributes;
 - ``checkpoint_state()`` and ``load_checkpoint_state(state)``, plain data and NumPy arrays, random state included, for
-  exact resume; optionally ``check_checkpoint_state(state)``.
+  exact resume.
 
 Arrays may be read-only, and may be reused by the engine's next step: :class:`CentralizedValueWrapper` copies them.
 Observations must be finite. Every suite is wrapped in :class:`TeamMonitor` (which counts episodes and returns), the

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from numbers import Integral
 from typing import Any, Final
@@ -90,3 +90,29 @@ def import_by_name(module: str, name: str, what: str) -> Any:
     if not callable(value):
         raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}")
     return value
+
+
+def check_form(name: str, value: Any, like: Any) -> None:
+    """
+    Compare names, shapes and dtypes of nested dicts and lists of arrays, as ``load_state_dict`` does.
+
+    :param name: name of the value, for the message
+    :raises ValueError: naming the first difference
+    """
+    if isinstance(like, Mapping):
+        if not isinstance(value, Mapping) or value.keys() != like.keys():
+            found = list(value) if isinstance(value, Mapping) else type(value).__name__
+            raise ValueError(f"expected {name} to have the entries {list(like)}, got {found}")
+        for key, part in like.items():
+            check_form(f"{name}[{key!r}]", value[key], part)
+    elif isinstance(like, (list, tuple)):
+        if not isinstance(value, (list, tuple)) or len(value) != len(like):
+            raise ValueError(f"expected {name} to be {len(like)} values, got {value!r:.80}")
+        for index, part in enumerate(like):
+            check_form(f"{name}[{index}]", value[index], part)
+    elif isinstance(like, np.ndarray):
+        shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+        if shape != like.shape or dtype != like.dtype:
+            raise ValueError(f"expected {name} of shape {like.shape} and {like.dtype}, got {shape} and {dtype}")
+    elif not isinstance(value, type(like)):
+        raise ValueError(f"expected {name} to be a {type(like).__name__}, got {value!r:.80}")

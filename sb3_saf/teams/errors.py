@@ -21,7 +21,3 @@ class CheckpointError(ValueError):
 
 class DamagedCheckpointError(CheckpointError):
     """Raised for a truncated or changed file, whose checksum does not match."""
-
-
-class UnknownFormatError(CheckpointError):
-    """Raised for an undamaged checkpoint in a format that this version cannot read."""

@@ -67,6 +67,10 @@ class TeamVecEnv(VecEnv):
         super().__init__(n_games * n_agents, observation_space, action_space)
         self.seed(seed)
 
+    def settings(self) -> dict[str, Any]:
+        """Return what determines the games except their seeds, as plain data: a run resumes only with equal ones."""
+        return {}
+
     def per_row(self, of_games: Iterable[Value]) -> list[Value]:
         """Repeat one value per game for each row of the game."""
         return [value for value in of_games for _ in range(self.n_agents)]

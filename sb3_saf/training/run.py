@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_saf.callbacks.finite import FiniteCallback
 from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.learning import resumable_learn
+from sb3_saf.checkpoints.models import settings_restored_on_error
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.teams.checks import evaluation_seed
@@ -167,7 +168,8 @@ class Training:
             arguments["log_interval"] = options.log_interval or None
         checkpoint_freq = self._every(options.checkpoint_freq, CHECKPOINTS_PER_RUN)
         if self.folder is None or checkpoint_freq == 0:
-            self.model.learn(total, [FiniteCallback(), GameStepsCallback(), *self.callbacks], **arguments)
+            with settings_restored_on_error(self.model):
+                self.model.learn(total, [FiniteCallback(), GameStepsCallback(), *self.callbacks], **arguments)
             return
         resumable_learn(
             self.model,

@@ -18,9 +18,9 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
+from sb3_saf.checkpoints.environments import load_normalization_statistics, normalization_statistics
 from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
@@ -171,7 +171,7 @@ def save_normalization(env: VecEnv, folder: Path) -> None:
     """Write the statistics of a VecNormalize, if any, to ``vecnormalize.npz`` in a folder."""
     layer = unwrap_vec_normalize(env)
     if layer is not None:
-        arrays: dict[str, Any] = {key: np.array([one.count, *_flat(one)]) for key, one in _statistics(layer).items()}
+        arrays: dict[str, Any] = normalization_statistics(layer)
         with atomic_file(folder / NORMALIZATION_FILE) as file:
             np.savez(file, **arrays)
 
@@ -184,20 +184,6 @@ def load_normalization(env: VecEnv, folder: Path) -> None:
     path = folder / NORMALIZATION_FILE
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            for key, statistics in _statistics(layer).items():
-                values, shape = arrays[key], np.shape(statistics.mean)
-                mean, var = values[1:].reshape(2, *shape)
-                statistics.mean, statistics.var, statistics.count = mean.copy(), var.copy(), float(values[0])
+            load_normalization_statistics(layer, dict(arrays))
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(f"cannot read the statistics of normalize in {path}: {error}") from error
-
-
-def _statistics(layer: VecNormalize) -> dict[str, RunningMeanStd]:
-    found = {"returns": layer.ret_rms}
-    if layer.norm_obs:
-        found |= layer.obs_rms if isinstance(layer.obs_rms, dict) else {OBS_KEY: layer.obs_rms}
-    return found
-
-
-def _flat(statistics: RunningMeanStd) -> np.ndarray:
-    return np.concatenate([np.ravel(statistics.mean), np.ravel(statistics.var)])

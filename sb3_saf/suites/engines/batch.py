@@ -12,8 +12,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_saf.envs.audit import settings_of
 from sb3_saf.envs.space_reader import checked_actions
-from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.checks import check_count, check_form
 from sb3_saf.teams.rows import (
     ACTIVE_KEY,
     IS_SUCCESS,
@@ -78,6 +79,8 @@ class Batch(ABC):
         self.env = env
         self.objects = objects
         self.shares_reward = shares_reward
+        #: What the games are, as plain data: only games with the same take a snapshot.
+        self.settings: dict[str, Any] = {} if env is None else settings_of(env)
 
     def take_options(self, options: Sequence[Mapping[str, Any]]) -> None:
         """
@@ -122,9 +125,6 @@ class Batch(ABC):
 class ResumableBatch(Batch):
     """Base of batches with snapshots."""
 
-    #: What the games are, as plain data: only games with the same take a snapshot.
-    settings: Mapping[str, Any] = {}
-
     @abstractmethod
     def snapshot(self) -> dict[str, Array]:
         """Return a copy of the complete state, random state included."""
@@ -167,6 +167,10 @@ class BatchVecEnv(TeamVecEnv):
         #: Games in an episode that is shorter than others, (E,).
         self._is_short = np.zeros(n_games, dtype=np.bool_)
         super().__init__(n_games, len(batch.agents), batch.rows.to_row_space(), batch.action_space, seed)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the games are, and whether first episodes are shortened (see the base class)."""
+        return {"stagger": self._stagger, **self.batch.settings}
 
     def reset(self) -> VecEnvObs:
         """
@@ -308,44 +312,23 @@ class ResumableBatchVecEnv(BatchVecEnv):
         :return: for :meth:`load_checkpoint_state` of an environment with the same arguments
         """
         return {
-            "settings": dict(self.batch.settings),
             "running": self._running,
             "next_seeds": self._next_seeds,
             "is_short": self._is_short.copy(),
             "games": self.batch.snapshot() if self._running else {},
         }
 
-    def check_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Check that a state is one of games like these.
-
-        :param state: result of :meth:`checkpoint_state`
-        :raises ValueError: naming the first setting, or the first array, that differs
-        """
-        for name, value in self.batch.settings.items():
-            if (other := state["settings"].get(name)) != value:
-                raise ValueError(f"expected games with {name}={value!r}, got a state with {name}={other!r}")
-        if not state["running"]:
-            return
-        if not self._running:
-            self.batch.reset([0] * self.n_games)
-        for name, array in self.batch.snapshot().items():
-            other = np.asarray(state["games"][name])
-            if (other.shape, other.dtype) != (array.shape, array.dtype):
-                raise ValueError(
-                    f"expected {name!r} of the games as {array.dtype} {array.shape}, got {other.dtype} {other.shape}; "
-                    "make the environment with the task, parameters and number of games of the state"
-                )
-
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """
         Restore a state; the observations are those of that state.
 
         :param state: result of :meth:`checkpoint_state`
-        :raises ValueError: see :meth:`check_checkpoint_state`
+        :raises ValueError: for the state of other games, naming the first difference
         """
-        self.check_checkpoint_state(state)
         if state["running"]:
+            if not self._running:
+                self.batch.reset([0] * self.n_games)
+            check_form("the games", state["games"], self.batch.snapshot())
             self.batch.restore(state["games"])
         self._running = state["running"]
         self._is_short = np.array(state["is_short"])
