@@ -1,0 +1,554 @@
+"""Games as the authors of other libraries write them: masks, rewards, ends and spaces in forms of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_saf import (
+    CentralizedValueWrapper,
+    GymnasiumTeam,
+    RandomPolicy,
+    TeamRolloutBuffer,
+    check_team_env,
+    evaluate_team,
+    make_team_env,
+)
+
+BOX = spaces.Box(-1, 1, (2,), np.float32)
+ZEROS = np.zeros(2, np.float32)
+
+
+class Game(ParallelEnv[str, Any, Any]):
+    """Two agents, four steps, reward 1 for each agent and step; subclasses change what a step returns."""
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "game"}
+    possible_agents: Any = ["a", "b"]
+    length = 4
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        return BOX
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return spaces.Discrete(3)
+
+    def see(self, agent: Any) -> Any:
+        return ZEROS
+
+    def info(self, agent: Any) -> dict[str, Any]:
+        return {}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.agents, self.t = list(self.possible_agents), 0
+        return {a: self.see(a) for a in self.agents}, {a: self.info(a) for a in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        self.t += 1
+        self.actions = actions
+        over, team = self.t == self.length, list(self.agents)
+        out: list[Any] = [
+            {a: self.see(a) for a in team},
+            dict.fromkeys(team, 1.0),
+            dict.fromkeys(team, False),
+            dict.fromkeys(team, over),
+            {a: self.info(a) for a in team},
+        ]
+        self.change(out)
+        if over:
+            self.agents = []
+        return tuple(out)
+
+    def change(self, out: list[Any]) -> None:
+        pass
+
+
+def ppo(env: Any, **kwargs: Any) -> PPO:
+    settings: dict[str, Any] = {"n_steps": 8, "n_epochs": 1, "seed": 0, "gamma": 0.5, "gae_lambda": 1.0}
+    buffer = {"rollout_buffer_class": TeamRolloutBuffer, "batch_size": 8 * env.num_envs}
+    return PPO("IPPOPolicy", env, **{**settings, **buffer, **kwargs})
+
+
+# --- action masks -----------------------------------------------------------------------------------------------------
+
+
+class MaskedGame(Game):
+    """
+    Raises at illegal actions.
+
+    :param key: where observations have masks; "info:KEY" for infos
+    :param others: further entries of observations
+    :param actions: action space
+    :param mask: the mask
+    :param given: steps at which infos have the mask
+    """
+
+    def __init__(
+        self,
+        key: str,
+        others: dict[str, Any] | None = None,
+        actions: Any = None,
+        mask: Any = (0, 1, 0),
+        given: Callable[[int], bool] = lambda step: True,
+    ) -> None:
+        self.in_info = key.startswith("info:")
+        self.key = key.removeprefix("info:")
+        self.others = {"observation": BOX} if others is None else others
+        self.actions_space = spaces.Discrete(3) if actions is None else actions
+        self.mask = np.array(mask, np.int8)
+        self.given = given
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return self.actions_space
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        if self.in_info:
+            return BOX
+        return spaces.Dict({**self.others, self.key: spaces.MultiBinary(len(self.mask))})
+
+    def see(self, agent: Any) -> Any:
+        if self.in_info:
+            return ZEROS
+        return {name: np.zeros(space.shape, space.dtype) for name, space in self.others.items()} | {self.key: self.mask}
+
+    def info(self, agent: Any) -> dict[str, Any]:
+        return {self.key: self.mask} if self.in_info and self.given(self.t) else {}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        if self.given(self.t):
+            for action in actions.values():
+                choices = np.atleast_1d(action) + np.concatenate([[0], np.cumsum(self._sizes)[:-1]]).astype(int)
+                assert self.mask[choices].all(), f"illegal action {action}"
+        return super().step(actions)
+
+    @property
+    def _sizes(self) -> Any:
+        space = self.actions_space
+        return space.nvec if isinstance(space, spaces.MultiDiscrete) else [space.n]
+
+
+MULTI = {"actions": spaces.MultiDiscrete([2, 3]), "mask": (0, 1, 1, 0, 0)}
+
+
+@pytest.mark.parametrize(
+    "game",
+    [
+        {"key": "action_mask"},
+        {"key": "action_mask", "others": {"observations": BOX}},
+        {"key": "action_mask", "others": {"real_obs": BOX, "step": spaces.Discrete(5)}},
+        {"key": "avail_actions", "others": {"obs": BOX}},
+        {"key": "action_mask", **MULTI},
+        {"key": "info:action_mask"},
+        {"key": "info:avail_actions"},
+        {"key": "info:action_mask", **MULTI},
+    ],
+    ids=str,
+)
+def test_masks_are_used_wherever_they_are(game: dict[str, Any]) -> None:
+    env = make_team_env(MaskedGame, 2, seed=0, **game)
+    assert env.team_spaces.n_masked_actions == len(game.get("mask", "abc"))
+    assert not any("mask" in key or "avail" in key for key in getattr(env.team_spaces.own, "spaces", ()))
+    ppo(env).learn(32)
+    assert evaluate_team(RandomPolicy(env, seed=0), env, 4).mean == 8
+
+
+@pytest.mark.parametrize(
+    ("game", "message"),
+    [
+        ({"key": "info:action_mask", "given": lambda step: step != 1}, "'action_mask' is in some infos"),
+        ({"key": "info:legal_moves"}, "'legal_moves'"),
+        ({"key": "legal_actions", "mask": (1, 1)}, "'legal_actions'.* does not fit"),
+    ],
+)
+def test_masks_that_are_not_always_used_are_named(game: dict[str, Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=message):
+        make_team_env(MaskedGame, seed=0, **game)
+
+
+def test_masks_that_come_after_the_trial_are_named() -> None:
+    game = MaskedGame("info:action_mask", given=lambda step: step > 32)
+    game.length = 40
+    env = make_team_env(game, seed=0, active=False)
+    env.reset()
+    for _ in range(32):
+        env.step(np.ones(2, int))
+    with pytest.warns(UserWarning, match="not used; give them from the first reset on"):
+        env.step(np.ones(2, int))
+
+
+class TwoKinds(Game):
+    """Agents with spaces of their own, and masks by the method that MaskablePPO calls."""
+
+    actions_of: ClassVar[dict[str, Any]] = {"a": spaces.Discrete(3), "b": spaces.Discrete(4)}
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return self.actions_of[agent]
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        assert all(action in self.actions_of[agent] for agent, action in actions.items()), actions
+        return super().step(actions)
+
+
+def test_maskable_ppo_on_agents_with_different_actions() -> None:
+    class Masked(TwoKinds):
+        def action_masks(self) -> dict[str, Any]:
+            return {a: np.arange(self.actions_of[a].n) != 1 for a in self.agents}
+
+        def step(self, actions: dict[str, Any]) -> Any:
+            assert all(action != 1 for action in actions.values()), actions
+            return super().step(actions)
+
+    MaskablePPO("MAPPOMaskablePolicy", make_team_env(Masked, seed=0), n_steps=8, batch_size=16, n_epochs=1).learn(16)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "common"),
+    [
+        (spaces.MultiDiscrete([2, 3]), spaces.MultiDiscrete([4, 1]), spaces.MultiDiscrete([4, 3])),
+        (spaces.MultiDiscrete([2, 3, 2]), spaces.MultiDiscrete([3, 2]), spaces.MultiDiscrete([3, 3, 2])),
+        (spaces.Discrete(5), spaces.MultiDiscrete([2, 3]), spaces.MultiDiscrete([5, 3])),
+        (spaces.Discrete(2, start=3), spaces.MultiDiscrete([2, 3], start=[1, -1]), spaces.MultiDiscrete([2, 3])),
+    ],
+    ids=str,
+)
+def test_discrete_actions_of_every_form_are_padded_and_masked(one: Any, other: Any, common: Any) -> None:
+    class Kinds(TwoKinds):
+        actions_of: ClassVar[dict[str, Any]] = {"a": one, "b": other}
+
+    env = make_team_env(Kinds, 2, seed=0)
+    assert env.action_space == common
+    ppo(env).learn(64)
+    evaluate_team(RandomPolicy(env, seed=0), env, 4)
+
+
+def test_discrete_beside_box_says_what_to_do() -> None:
+    class Kinds(TwoKinds):
+        actions_of: ClassVar[dict[str, Any]] = {"a": spaces.Discrete(3), "b": BOX}
+
+    with pytest.raises(ValueError, match=r"a: Discrete.*b: Box.*in a wrapper"):
+        make_team_env(Kinds)
+
+
+# --- rewards of agents that do not act --------------------------------------------------------------------------------
+
+
+class Leaving(Game):
+    """
+    Agent ``a`` is out in some steps, and the game pays by a table.
+
+    :param out: steps after which ``a`` does not act
+    :param paid: rewards of ``a`` in the four steps
+    :param dies: whether ``a`` ends when it leaves; otherwise it waits
+    """
+
+    def __init__(self, out: tuple[int, ...], paid: tuple[float, ...], dies: bool) -> None:
+        self.out, self.paid, self.dies = out, paid, dies
+
+    def change(self, out: list[Any]) -> None:
+        out[1] = {"a": self.paid[self.t - 1], "b": 0.0}
+        if self.dies and self.t == self.out[0]:
+            out[2]["a"] = True
+        self.agents = [a for a in self.possible_agents if a == "b" or self.t not in self.out]
+        out[0] = {a: self.see(a) for a in self.agents}
+
+
+def returns_of_a(game: Game, **kwargs: Any) -> list[float]:
+    """Return the returns of agent ``a`` in one episode with gamma 0.5, for a critic that says 0."""
+    model = ppo(make_team_env(game, **kwargs))
+    with th.no_grad():
+        for parameter in model.policy.value_net.parameters():
+            parameter.zero_()
+    model.learn(16)
+    buffer = model.rollout_buffer
+    assert isinstance(buffer, TeamRolloutBuffer) and buffer.active is not None
+    active = buffer.active.reshape(8, 2)[:4, 0] != 0
+    return [round(float(r), 6) for r in buffer.returns[:4, 0][active]]
+
+
+@pytest.mark.parametrize(
+    ("out", "paid", "dies", "expected"),
+    [
+        ((1, 2, 3), (0, 0, 0, 8), True, [1.0]),  # after death: 8 / 2^3
+        ((1, 2, 3), (0, 0, 0, 8), False, [1.0]),  # never returns
+        ((1, 2), (0, 0, 4, 0), False, [1.0, 0.0]),  # when it returns: in step 3, it did not act
+        ((1,), (0, 2, 0, 8), False, [2.0, 4.0, 8.0]),  # a skipped turn, and the return goes on
+        ((1, 2, 3), (3, 0, 0, 0), True, [3.0]),
+    ],
+)
+def test_an_agent_learns_from_all_that_the_game_pays_it(
+    out: tuple[int, ...], paid: tuple[float, ...], dies: bool, expected: list[float]
+) -> None:
+    game = Leaving(out, paid, dies)
+    assert returns_of_a(game) == expected
+    env = make_team_env(game)
+    assert evaluate_team(RandomPolicy(env, seed=0), env, 2).returns == [sum(paid)] * 2
+
+
+class Alone(Game):
+    """Agent ``a`` is stopped by a time limit in step 2."""
+
+    def change(self, out: list[Any]) -> None:
+        out[1] = dict.fromkeys(out[1], 0.0)
+        if self.t == 2:
+            out[0]["a"] = np.full(2, 0.5, np.float32)
+            out[3]["a"] = True
+            self.agents.remove("a")
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_an_agent_stopped_alone_is_bootstrapped_with_its_own_last_observation(normalised: bool) -> None:
+    env = make_team_env(Alone, time_limit="bootstrap")
+    if normalised:
+        normal = VecNormalize(env.venv, norm_obs_keys=["obs"], norm_reward=False, training=False)
+        normal.obs_rms["obs"].mean[:] = 1.5
+        env = CentralizedValueWrapper(normal, time_limit="bootstrap")
+    model = ppo(env).learn(16)
+    env.reset()
+    env.step(np.zeros(2, int))
+    _, _, dones, infos = env.step(np.zeros(2, int))
+    assert dones.tolist() == [True, False]
+    last = infos[0]["terminal_observation"]
+    expected = [-1, -1] if normalised else [0.5, 0.5]
+    np.testing.assert_allclose(last["obs"], expected, atol=1e-3)
+    np.testing.assert_allclose(last["team"][0], expected, atol=1e-3)
+    assert last["active"].tolist() == [1, 1] and last["agent"] == 0
+    buffer = model.rollout_buffer
+    np.testing.assert_array_equal(buffer.episode_starts[:5, 0], [1, 0, 1, 0, 1])
+    assert evaluate_team(RandomPolicy(env, seed=0), env, 3).lengths == [4] * 3
+
+
+def test_bootstrapped_value_of_an_agent_stopped_alone() -> None:
+    env = make_team_env(Alone, time_limit="bootstrap")
+    model = ppo(env, learning_rate=0.0).learn(16)
+    env.reset()
+    for _ in range(2):
+        infos = env.step(np.zeros(2, int))[3]
+    last, _ = model.policy.obs_to_tensor(infos[0]["terminal_observation"])
+    value = model.policy.predict_values(last).item()
+    assert abs(value) > 1e-3
+    np.testing.assert_allclose(model.rollout_buffer.returns[:2, 0], [value / 4, value / 2], rtol=1e-4)
+    ended = ppo(make_team_env(Alone), learning_rate=0.0).learn(16)
+    np.testing.assert_array_equal(ended.rollout_buffer.returns[:2, 0], [0, 0])
+
+
+# --- ends -------------------------------------------------------------------------------------------------------------
+
+
+class GymTeam(gym.Env[Any, Any]):
+    """
+    Two agents.
+
+    :param ends: what step ``t`` returns as terminated and truncated
+    :param old: whether resets return observations only
+    """
+
+    observation_space, action_space = spaces.Tuple([BOX] * 2), spaces.Tuple([spaces.Discrete(2)] * 2)
+
+    def __init__(self, ends: Callable[[int], tuple[Any, ...]], old: bool = False) -> None:
+        self.ends, self.old = ends, old
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.t = 0
+        return (ZEROS, ZEROS) if self.old else ((ZEROS, ZEROS), {})
+
+    def step(self, actions: Any) -> Any:
+        self.t += 1
+        return (ZEROS, ZEROS), [1.0, 1.0], *self.ends(self.t), {}
+
+
+@pytest.mark.parametrize(
+    ("ends", "over_in"),
+    [
+        (lambda t: (t >= 3, False), 3),
+        (lambda t: (np.bool_(t >= 3), np.False_), 3),
+        (lambda t: ([t >= 3, False], [False, t >= 5]), 5),
+        (lambda t: ([t == 3, False], [False, t == 5]), 5),
+        (lambda t: (np.array([t >= 2, t >= 4]), np.zeros(2, bool)), 4),
+        (lambda t: ({0: t >= 2, 1: t >= 4}, {0: False, 1: False}), 4),
+        (lambda t: ({"agent_0": t >= 2, "agent_1": t >= 4}, False), 4),
+        (lambda t: ({"agent_0": False, "agent_1": False, "__all__": t >= 3}, {"__all__": False}), 3),
+    ],
+)
+def test_gymnasium_teams_end_as_they_say(ends: Any, over_in: int) -> None:
+    env = make_team_env(GymTeam(ends))
+    env.reset()
+    dones = [bool(env.step(np.zeros(2, int))[2][0]) for _ in range(over_in)]
+    assert dones == [False] * (over_in - 1) + [True]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GymTeam(lambda t: ([True], [False])), "terminated of 2 agents"),
+        (lambda: GymTeam(lambda t: ("no", "no")), "True or False in terminated"),
+        (lambda: GymTeam(lambda t: (False,)), "terminated, truncated, info.*older gym"),
+        (lambda: GymTeam(lambda t: (False, False), old=True), r"\(observations, info\).*older gym"),
+    ],
+)
+def test_other_forms_of_ends_are_refused(make: Callable[[], Any], message: str) -> None:
+    def play() -> None:
+        env = GymnasiumTeam(make())
+        env.reset()
+        env.step({"agent_0": 0, "agent_1": 0})
+
+    with pytest.raises(ValueError, match=message):
+        play()
+
+
+def test_all_ends_a_parallel_game() -> None:
+    class RayGame(Game):
+        def change(self, out: list[Any]) -> None:
+            out[2] = {"__all__": self.t == 3}
+            out[3] = {"__all__": False}
+
+    env = make_team_env(RayGame)
+    env.reset()
+    assert [bool(env.step(np.zeros(2, int))[2][0]) for _ in range(3)] == [False, False, True]
+
+
+def test_respawned_agents_are_named() -> None:
+    class Respawning(Game):
+        def change(self, out: list[Any]) -> None:
+            out[2]["a"] = self.t == 1
+
+    env = make_team_env(Respawning)
+    env.reset()
+    env.step(np.zeros(2, int))
+    with pytest.warns(UserWarning, match="a has ended and is in agents again in game 0 at step 2"):
+        env.step(np.zeros(2, int))
+    env.step(np.zeros(2, int))  # once: warnings are errors
+
+
+# --- seeds, statistics, names, types ----------------------------------------------------------------------------------
+
+
+class GlobalGame(Game):
+    def see(self, agent: Any) -> Any:
+        return np.random.uniform(-1, 1, 2).astype(np.float32)  # noqa: NPY002
+
+
+def test_games_on_the_global_generator_differ_between_processes_and_repeat() -> None:
+    def first() -> Any:
+        env = make_team_env(GlobalGame, 4, seed=3, n_cpus=2)
+        obs = env.reset()["obs"]
+        env.close()
+        return obs
+
+    obs = first()
+    assert len({row.tobytes() for row in obs}) == 8
+    np.testing.assert_array_equal(obs, first())
+
+
+@pytest.mark.parametrize("draws", [True, False])
+def test_a_game_that_ignores_its_seed_is_named(draws: bool) -> None:
+    class Stubborn(Game):
+        def __init__(self) -> None:
+            self.rng = np.random.default_rng(0)
+
+        def see(self, agent: Any) -> Any:
+            return self.rng.uniform(-1, 1, 2).astype(np.float32) if draws else ZEROS
+
+    env = make_team_env(Stubborn(), 2, seed=0)
+    env.reset()
+    for _ in range(35):
+        env.step(np.zeros(4, int))
+    if draws:
+        with pytest.warns(UserWarning, match=r"ignore reset\(seed"):
+            env.step(np.zeros(4, int))
+    else:
+        env.step(np.zeros(4, int))  # a game without chance: warnings are errors
+
+
+def test_statistics_of_observations_leave_out_the_dead() -> None:
+    class Dying(Game):
+        length = 20
+
+        def observation_space(self, agent: Any) -> spaces.Space[Any]:
+            return spaces.Box(-99, 99, (1,), np.float32)
+
+        def see(self, agent: Any) -> Any:
+            return np.random.normal(10, 1, 1).astype(np.float32)  # noqa: NPY002
+
+        def change(self, out: list[Any]) -> None:
+            if self.t == 1:
+                out[2]["a"] = True
+                self.agents.remove("a")
+
+    normal = VecNormalize(make_team_env(Dying, 2).venv, norm_obs_keys=["obs"], norm_reward=False)
+    env = CentralizedValueWrapper(normal)
+    env.reset()
+    for _ in range(300):
+        obs: Any = env.step(np.zeros(4, int))[0]
+        assert (obs["obs"][obs["active"][:, 0] == 0][::2] == 0).all(), "policies see zeros"
+    assert normal.obs_rms["obs"].mean == pytest.approx(10, abs=0.2)
+    assert normal.obs_rms["obs"].var == pytest.approx(1, abs=0.2)
+
+
+AGENTS: list[Any] = [np.array(["a", "b"]), {"a": 1, "b": 2}.keys(), ("a", "b"), ["agent", "b"], [0, 1]]
+
+
+@pytest.mark.parametrize("agents", AGENTS)
+def test_names_of_agents(agents: Any) -> None:
+    class Named(Game):
+        possible_agents = agents
+
+    env = make_team_env(Named, 2, seed=0)
+    assert env.team_spaces.names == tuple(agents)
+    model = ppo(env).learn(32)
+    names = list(agents)
+    assert set(model.predict(dict.fromkeys(names, ZEROS))[0]) == set(names)
+
+
+def test_one_list_for_agents_and_possible_agents_is_named() -> None:
+    class Same(Game):
+        def __init__(self) -> None:
+            self.possible_agents = ["a", "b"]
+
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            result = super().reset(seed, options)
+            self.agents = self.possible_agents
+            return result
+
+        def change(self, out: list[Any]) -> None:
+            if self.t == 2:
+                out[2]["a"] = True
+                self.agents.remove("a")
+
+    with pytest.raises(ValueError, match=r"possible_agents at all times.*list\(self.possible_agents\)"):
+        make_team_env(Same)
+    with pytest.raises(ValueError, match="possible_agents at all times"):
+        check_team_env(Same())
+
+
+def test_float64_becomes_float32_unless_asked() -> None:
+    class Double(Game):
+        def observation_space(self, agent: Any) -> spaces.Space[Any]:
+            return spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+        def see(self, agent: Any) -> Any:
+            return np.full(2, 1 / 3)
+
+    assert make_team_env(Double).reset()["team"].dtype == np.float32
+    kept = make_team_env(Double, float64=True).reset()
+    assert kept["obs"].dtype == np.float64 and kept["obs"][0, 0] == 1 / 3
+
+
+def test_the_audit_accepts_a_good_game_and_raises_the_errors_of_the_game() -> None:
+    check_team_env(Game())
+    check_team_env(GymTeam(lambda t: (t >= 3, False)))
+
+    class Broken(Game):
+        def change(self, out: list[Any]) -> None:
+            raise ArithmeticError("the game broke")
+
+    with pytest.raises(ArithmeticError):
+        check_team_env(Broken())
