@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
+from examples import warehouse
 from examples.train_pettingzoo import ENVIRONMENTS, main
 
 NEEDS = {"multiwalker": "Box2D", "pursuit": "pettingzoo.sisl.pursuit_v5", "hanabi": "pyspiel"}
@@ -23,3 +25,13 @@ def test_environments_of_others_train(
     main(["--env", name, "--game-steps", "40", "--episodes", "2"])
     printed = capsys.readouterr().out
     assert re.search(r"trained  -?\d+\.\d\d \[.*2 team episodes\)\n  random   -?\d+\.\d\d \[", printed), printed
+
+
+def test_two_kinds_of_agents_from_rules_to_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    warehouse.main(["--game-steps", "64", "--episodes", "2", "--output", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert re.search(
+        r"trained  .* 2 team episodes\)\nrandom   .*\nby itself: \d orders left after \d+ steps\n", printed
+    )
+    assert "exported actor of packer_0: calls" in printed
+    assert (tmp_path / "actor" / "actor.onnx").exists() and (tmp_path / "replay.html").exists()
