@@ -266,19 +266,6 @@ def mixture_log_prob(
     return (log_weights + policy_log_probs(action_space, parameters, actions)).logsumexp(dim=1)
 
 
-def mixture_sample(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-    """
-    Draw a policy by its weight, then its action.
-
-    :param action_space: the action space
-    :param log_weights: (B, U)
-    :param parameters: (B, U, P)
-    :return: (B, D)
-    """
-    drawn = th.multinomial(log_weights.exp(), 1).squeeze(1)
-    return distribution_of(action_space, policy_parameters(parameters, drawn)).sample()
-
-
 def is_enumerable(action_space: spaces.Space[Any]) -> bool:
     """Return whether a mixture's entropy and most likely action are computed by enumerating joint actions."""
     choices = choices_of(action_space)
@@ -300,20 +287,6 @@ def mixture_mode(action_space: spaces.Space[Any], log_weights: th.Tensor, parame
     joint_actions = th.tensor(list(product(*map(range, choices_of(action_space)))), device=best.device)
     # SB3's MultiBinary actions are floats.
     return joint_actions[best].to(parameters.dtype if isinstance(action_space, spaces.MultiBinary) else th.int64)
-
-
-def mixture_entropy(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor | None:
-    """
-    Return the entropy of a mixture by enumeration; None if actions cannot be enumerated.
-
-    :param action_space: the action space
-    :param log_weights: (B, U)
-    :param parameters: (B, U, P)
-    :return: (B,) or None
-    """
-    if not is_enumerable(action_space):
-        return None
-    return _over_joint_actions(action_space, log_weights, parameters, lambda joint: -(joint.exp() * joint).sum(dim=1))
 
 
 def _over_joint_actions(
@@ -417,11 +390,16 @@ class PoolDistribution(_FromPool):
 
     def entropy(self) -> th.Tensor | None:
         """Return exact entropies (B,) by enumeration, or None."""
-        return mixture_entropy(self.action_space, self.log_weights, self.parameters)
+        if not is_enumerable(self.action_space):
+            return None
+        return _over_joint_actions(
+            self.action_space, self.log_weights, self.parameters, lambda joint: -(joint.exp() * joint).sum(dim=1)
+        )
 
     def sample(self) -> th.Tensor:
         """Draw a policy, then its action: (B, D)."""
-        return mixture_sample(self.action_space, self.log_weights, self.parameters)
+        policy = th.multinomial(self.log_weights.exp(), 1).squeeze(1)
+        return distribution_of(self.action_space, policy_parameters(self.parameters, policy)).sample()
 
     def mode(self) -> th.Tensor:
         """Return the most likely joint action (B, D), or the likeliest policy's mode if they cannot be enumerated."""

@@ -225,12 +225,8 @@ class _FlattenPictures(nn.Flatten):
     def forward(self, pictures: th.Tensor) -> th.Tensor:
         """Flatten (K, C, H, W) to (K, C * H * W)."""
         if pictures.requires_grad:
-            pictures.register_hook(_channels_last)
+            pictures.register_hook(lambda gradient: gradient.contiguous(memory_format=th.channels_last))
         return super().forward(pictures)
-
-
-def _channels_last(gradient: th.Tensor) -> th.Tensor:
-    return gradient.contiguous(memory_format=th.channels_last)
 
 
 class PaperCNN(Encoder):
@@ -447,12 +443,17 @@ class PartsEncoder(Encoder):
             raise ValueError(f"expected pictures beside vectors in one PartsSpace, got {observation_space}")
         super().__init__(observation_space, features_dim)
         self.parts = observation_space.parts
-        pictures = [spaces.Box(0, 255, part.picture, np.uint8) for part in self.parts if part.picture is not None]
-        self.pictures = nn.ModuleList(_picture_encoder_class(space)(space, features_dim) for space in pictures)
+        encoders: list[Encoder] = []
+        for part in self.parts:
+            if part.picture is not None:
+                space = spaces.Box(0, 255, part.picture, np.uint8)
+                is_tiny = sorted(part.picture)[1] < PAPER_PIXELS  # the smallest axis are channels
+                encoders.append((MLPEncoder if is_tiny else _encoder_class(space))(space, features_dim))
+        self.pictures = nn.ModuleList(encoders)
         rest = [i for part in self.parts if part.picture is None for i in range(part.start, part.stop)]
         bounds = observation_space.low[rest], observation_space.high[rest]
         self.rest = MLPEncoder(spaces.Box(*bounds, dtype=np.float32), features_dim) if rest else None
-        n_encoders = len(pictures) + bool(rest)
+        n_encoders = len(encoders) + bool(rest)
         self.join = nn.Sequential(nn.Linear(n_encoders * features_dim, features_dim), nn.ReLU())
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -485,46 +486,34 @@ class ObservationEncoder(Encoder):
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
         super().__init__(observation_space, features_dim)
-        self.encoder: BaseFeaturesExtractor = _encoder_class(observation_space)(observation_space, features_dim)
-        if not isinstance(self.encoder, (MLPEncoder, PartsEncoder)):
-            _warn_if_large(self.encoder, observation_space)
+        self.encoder = _encoder_class(observation_space)(observation_space, features_dim)
+        picture = picture_of(observation_space)
+        if picture is None:
+            return
+        _, height, width = picture.shape
+        n_weights = sum(parameter.numel() for parameter in self.encoder.parameters())
+        if height * width > _MANY_PIXELS or n_weights > _MANY_WEIGHTS:
+            warnings.warn(
+                f"observations of {observation_space} have {height} x {width} pixels, for which "
+                f"{type(self.encoder).__name__} has {n_weights:,} weights and is slow. Shrink them in the environment "
+                '(supersuit.resize_v1(env, 84, 84), supersuit.color_reduction_v0(env, "B")), or choose another '
+                'encoder, policy_kwargs={"features_extractor_class": ...}: sb3_saf.LightEncoder with '
+                'features_extractor_kwargs={"tile_size": ...} for pictures made of tiles, or one of your own',
+                UserWarning,
+                stacklevel=2,
+            )
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, ...) as (K, features_dim)."""
         return self.encoder(observations)
 
 
-def _encoder_class(observation_space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:
-    if isinstance(observation_space, PartsSpace):
+def _encoder_class(space: spaces.Space[Any]) -> type[Encoder]:
+    if isinstance(space, PartsSpace):
         return PartsEncoder
-    picture = picture_of(observation_space)
+    picture = picture_of(space)
     if picture is None:
         return MLPEncoder
     _, height, width = picture.shape
     is_small = height * width <= _PAPERS_PIXELS or min(height, width) < NATURE_PIXELS
     return PaperCNN if is_small else NatureEncoder
-
-
-def _picture_encoder_class(space: spaces.Box) -> type[BaseFeaturesExtractor]:
-    """As :func:`_encoder_class`, but an MLP for pictures too small for convolutions."""
-    picture = picture_of(space)
-    assert picture is not None
-    return MLPEncoder if min(picture.shape[1:]) < PAPER_PIXELS else _encoder_class(space)
-
-
-def _warn_if_large(encoder: BaseFeaturesExtractor, space: spaces.Space[Any]) -> None:
-    picture = picture_of(space)
-    assert picture is not None
-    _, height, width = picture.shape
-    n_weights = sum(parameter.numel() for parameter in encoder.parameters())
-    if height * width <= _MANY_PIXELS and n_weights <= _MANY_WEIGHTS:
-        return
-    warnings.warn(
-        f"observations of {space} have {height} x {width} pixels, for which {type(encoder).__name__} has "
-        f"{n_weights:,} weights and is slow. Shrink them in the environment (supersuit.resize_v1(env, 84, 84), "
-        'supersuit.color_reduction_v0(env, "B")), or choose another encoder, policy_kwargs={"features_extractor_class":'
-        ' ...}: sb3_saf.LightEncoder with features_extractor_kwargs={"tile_size": ...} for pictures made of tiles, or '
-        "one of your own",
-        UserWarning,
-        stacklevel=3,
-    )
