@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import io
 import multiprocessing as mp
 import os
 import random
@@ -26,6 +27,7 @@ import signal
 import sys
 import tempfile
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -111,7 +113,7 @@ class Watch:
     @contextmanager
     def on(self, run: Run) -> Iterator[None]:
         """Watch a run."""
-        model, env = run.model, run.model.env
+        model, kind, env = run.model, type(run.model), run.model.env
         step = env.step_wait
 
         def counted_step() -> Any:
@@ -122,8 +124,9 @@ class Watch:
         model.policy.optimizer.register_step_post_hook(lambda *_: self.event("update"))
         with (
             mock.patch.object(env, "step_wait", counted_step),
-            mock.patch.object(model, "collect_rollouts", self.during("rollout", model.collect_rollouts)),
-            mock.patch.object(model, "train", self.during("update", model.train)),
+            # Of the class, since models are saved with their attributes.
+            mock.patch.object(kind, "collect_rollouts", self.during("rollout", kind.collect_rollouts)),
+            mock.patch.object(kind, "train", self.during("update", kind.train)),
             mock.patch.object(run.evaluation, "_evaluate", self.during("evaluation", run.evaluation._evaluate)),
             mock.patch.object(TeamCheckpointCallback, "_take", self.during("writing", TeamCheckpointCallback._take)),
             mock.patch.object(CheckpointFolder, "write", self.during("writing", CheckpointFolder.write)),
@@ -207,10 +210,18 @@ def kill(algo: str, games: Games, folder: Path, rollouts: int, moment: Moment) -
 
 
 def same(one: Path, other: Path) -> bool:
-    """Whether finished runs are equal: weights and replay buffer bit for bit, evaluations, episodes except times."""
-    return all(_same_arrays(one / name, other / name) for name in ("weights.npz", "evaluations.npz")) and (
-        _episodes(one) == _episodes(other) != []
+    """Whether finished runs are equal: weights, replay buffer, best model, evaluations, episodes except times."""
+    return (
+        all(_same_arrays(one / name, other / name) for name in ("weights.npz", "evaluations.npz"))
+        and _episodes(one) == _episodes(other) != []
+        and _best(one) == _best(other) != {}
     )
+
+
+def _best(folder: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(folder / "best_model.zip") as file:
+        weights = th.load(io.BytesIO(file.read("policy.pth")), weights_only=True)
+    return {name: tensor.numpy().tobytes() for name, tensor in weights.items()}
 
 
 def _same_arrays(one: Path, other: Path) -> bool:

@@ -124,7 +124,13 @@ def make_run(algo: str, folder: Path | None, games: Games = Games()) -> Run:  # 
     env = games.make(N_GAMES, 0, where)
     eval_env = games.make(2, 99)
     evaluation = sb3_saf.TeamEvalCallback(
-        eval_env, n_eval_episodes=2, eval_freq=200, log_path=where, deterministic=False, verbose=0
+        eval_env,
+        n_eval_episodes=2,
+        eval_freq=200,
+        log_path=where,
+        best_model_save_path=where,
+        deterministic=False,
+        verbose=0,
     )
     tensorboard = None if folder is None else str(folder / "tb")
     make, every = (_saf, 1) if algo == "saf" else (_qplex, 100)

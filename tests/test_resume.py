@@ -222,10 +222,6 @@ def test_checkpoints_do_not_change_the_run(tmp_path: Path) -> None:
 
 
 def test_what_is_normalised_goes_on(tmp_path: Path) -> None:
-    def normalised() -> Any:
-        native = sb3_saf.make_team_env("TeamTogether", N_GAMES, **TASK).venv
-        return make(env=sb3_saf.CentralizedValueWrapper(VecNormalize(native, norm_obs=False), n_agents=N_AGENTS))
-
     whole = go_on(tmp_path / "whole", normalised())
     struck(tmp_path / "run", normalised, after_calls=30)
     assert weights(go_on(tmp_path / "run", normalised())) == weights(whole)
@@ -316,6 +312,114 @@ def test_another_run_is_named_before_anything_is_touched(name: str, finished_run
     with pytest.raises(CheckpointError, match=message):
         resumable_learn(make_other(folder), 2 * ROLLOUT, folder / "ck", make_callback(folder))
     assert fingerprint(folder) == before
+
+
+def native(**arguments: Any) -> Callable[[], Any]:
+    return lambda: make(env=sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=3, **TASK | arguments))
+
+
+def counting(**arguments: Any) -> Callable[[], Any]:
+    """Make a model of somebody else's game, whose arguments only a function knows."""
+    game: Any = lambda: LazyEnv(**arguments)  # noqa: E731
+    return lambda: make(env=sb3_saf.make_team_env(game, N_GAMES, seed=3), policy_kwargs={"net_arch": [8]})
+
+
+def normalised(**arguments: Any) -> Any:
+    rows = sb3_saf.make_team_env("TeamTogether", N_GAMES, **TASK).venv
+    return make(env=sb3_saf.CentralizedValueWrapper(VecNormalize(rows, norm_obs=False, **arguments), N_AGENTS))
+
+
+def staged(game_steps: int = 30, **params: Any) -> Callable[[], Any]:
+    stages = [sb3_saf.Stage(24, {"n_treasures": 1}), sb3_saf.Stage(game_steps, {"n_treasures": 2, **params})]
+    return native(curriculum=stages)
+
+
+CHANGES: dict[str, tuple[Callable[[], Any], Callable[[], Any], str]] = {
+    "time limit": (native(), native(time_limit="bootstrap"), "CentralizedValueWrapper.time_limit was 'terminal'"),
+    "reward": (native(team_reward="sum"), native(team_reward="mean"), "SharedReward.team_reward was 'sum', now 'mean'"),
+    "game of others": (counting(max_cycles=5), counting(max_cycles=6), "max_cycles was 5, now 6"),
+    "wrapper": (normalised, lambda: normalised(clip_reward=2.0), "VecNormalize.clip_reward was 10.0, now 2.0"),
+    "later stage": (staged(), staged(coordination=2), "Curriculum.stage 1.*coordination was 1, now 2"),
+    "length of a stage": (staged(), staged(60), r"Curriculum.ends was \[24, 54\], now \[24, 84\]"),
+    "schedule": (make, lambda: make(clip_range=lambda left: 0.2 * left), "model.clip_range was"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_another_game_reward_wrapper_or_stage_is_named(name: str, tmp_path: Path) -> None:
+    before, after, difference = CHANGES[name]
+    resumable_learn(before(), ROLLOUT, tmp_path)
+    with pytest.raises(CheckpointError, match=f"{difference}"):
+        resume(tmp_path, after())
+    resume(tmp_path, before())
+
+
+@pytest.mark.parametrize("end", [0.0, 0.001])
+def test_another_argument_of_a_callback_is_named(end: float, tmp_path: Path) -> None:
+    def coefficient() -> Any:
+        return make(ent_coef=0.01)
+
+    resumable_learn(coefficient(), ROLLOUT, tmp_path, sb3_saf.EntropySchedule())
+    if end:
+        with pytest.raises(CheckpointError, match=r"EntropySchedule.end was 0.0, now 0.001"):
+            resume(tmp_path, coefficient(), sb3_saf.EntropySchedule(end))
+    else:
+        resume(tmp_path, coefficient(), sb3_saf.EntropySchedule(end))
+
+
+#: Runs whose parts have no state yet at the first checkpoint.
+EMPTY: dict[str, Callable[[], Any]] = {
+    "normalised": normalised,
+    "curriculum": staged(),
+    "masks": MODELS["MaskablePPO"],
+    "memory": MODELS["RecurrentPPO"],
+    "replay": MODELS["QPLEX with memory"],
+    "staggered": native(stagger=True),
+    "game of others": counting(max_cycles=5),
+}
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_a_run_that_is_killed_before_its_second_checkpoint_resumes(name: str, tmp_path: Path) -> None:
+    def learn(folder: str, *others: BaseCallback) -> Any:
+        evaluations = [evaluation()] if name in ("curriculum", "memory", "replay", "staggered") else []
+        callbacks = [*evaluations, *others]
+        return resumable_learn(EMPTY[name](), 2 * ROLLOUT, tmp_path / folder, callbacks, every_game_steps=10**9)
+
+    with pytest.raises(RuntimeError):
+        learn("killed", Lightning(3))
+    assert [path.name for path in (tmp_path / "killed").glob("*.ckpt")] == [f"checkpoint-{0:012d}.ckpt"]
+    assert weights(learn("killed", Lightning(-1))) == weights(learn("whole", Lightning(-1)))
+
+
+class InUpdate(BaseCallback):
+    """Ctrl-C in the second update."""
+
+    def _on_training_start(self) -> None:
+        steps = itertools.count(1)
+
+        def strike(*_: object) -> None:
+            if next(steps) == 6:
+                raise KeyboardInterrupt
+
+        self.hook = self.model.policy.optimizer.register_step_post_hook(strike)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_ctrl_c_in_an_update_leaves_the_models_settings(tmp_path: Path) -> None:
+    """The same model goes on in the same process, as a cell of a notebook that is run again."""
+    model, in_update = make(ent_coef=0.01), InUpdate()
+    with pytest.raises(KeyboardInterrupt):
+        resumable_learn(model, 4 * ROLLOUT, tmp_path, [sb3_saf.EntropySchedule(), in_update])
+    in_update.hook.remove()
+    assert model.ent_coef == 0.01
+    again = InUpdate()
+    again._on_training_start = lambda: None  # type: ignore[method-assign]
+    resumable_learn(model, 4 * ROLLOUT, tmp_path, [sb3_saf.EntropySchedule(), again])
+    whole = resumable_learn(make(ent_coef=0.01), 4 * ROLLOUT, tmp_path / "whole", sb3_saf.EntropySchedule())
+    assert weights(model) == weights(whole)
 
 
 def test_a_folder_without_checkpoints_cannot_be_resumed(tmp_path: Path) -> None:
