@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import supersuit
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO
 
 from sb3_saf import (
     QPLEX,
@@ -127,12 +128,40 @@ def test_sb3s_own_policy_warns_that_it_sees_the_team() -> None:
         PPO("MlpPolicy", "CartPole-v1", **settings | {"n_steps": 8}).learn(8, GameStepsCallback())
 
 
-def test_sb3s_own_buffer_warns_once_and_names_the_remedy() -> None:
+def test_sb3s_own_buffer_warns_when_the_model_is_made_and_names_the_remedy() -> None:
     env = make_team_env(CounterEnv, n_envs=2, seed=0)
-    model = PPO("SAFPolicy", env, n_steps=4, batch_size=8, device="cpu")
     with pytest.warns(UserWarning, match=r"SAFPolicy is trained on .*ppo_settings\(env\)") as told:
-        model.learn(32)
+        model = PPO("SAFPolicy", env, n_steps=4, batch_size=8, device="cpu")
     assert sum("ppo_settings" in str(warning.message) for warning in told) == 1
+    assert str(told[0].filename) == __file__, "the warning points at the line that made the model"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for algorithm in (PPO, A2C, TRPO):
+            algorithm("SAFPolicy", env, rollout_buffer_class=TeamRolloutBuffer, n_steps=32, device="cpu")
+        type(model.policy)(env.observation_space, env.action_space, lambda _: 0.0)
+    with pytest.warns(UserWarning, match="is trained on"):  # again, on the same environment
+        A2C("SAFPolicy", env, n_steps=4, device="cpu")
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, MaskablePPO, RecurrentPPO])
+@pytest.mark.parametrize("method", ["saf", "mappo", "ippo"])
+def test_settings_fit_the_algorithm(algorithm: Any, method: str) -> None:
+    env = make_team_env("TeamSupport", 2, seed=0, n_agents=2, grid_size=7, n_treasures=2, max_cycles=10)
+    settings = ppo_settings(env, method, algorithm, n_steps=8)
+    has_own_buffer = algorithm in (PPO, A2C, TRPO)
+    assert ("rollout_buffer_class" in settings) == has_own_buffer
+    assert ("normalize_values" in settings["policy_kwargs"]) == has_own_buffer
+    model = algorithm(method, env, **settings, device="cpu")
+    with pytest.raises(ValueError, match=r"algorithm that trains .* 'DQN'"):
+        ppo_settings(env, method, DQN)  # type: ignore[arg-type]
+    if algorithm is not MaskablePPO:  # which needs masks
+        model.learn(8 * 4)
+
+
+def test_settings_of_another_method_are_named() -> None:
+    env = make_team_env(CounterEnv, seed=0)
+    with pytest.raises(TypeError, match=r"MAPPOPolicy has no argument 'n_policies'.*ppo_settings\(env, 'mappo'\)"):
+        PPO("MAPPOPolicy", env, **ppo_settings(env, "saf"))
 
 
 @pytest.mark.parametrize("policy", ["SAF", "MAPPO", "IPPO"])

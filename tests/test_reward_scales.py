@@ -66,7 +66,13 @@ class Arms(ParallelEnv[str, Any, Any]):
 
 def make(policy: str, scales: Sequence[float], normalize_values: bool = False, **kwargs: Any) -> PPO:
     env = make_team_env(partial(Arms, scales), 4, seed=0)
-    settings = {"n_steps": 32, "batch_size": 64 * len(scales), "learning_rate": 5e-3, "gamma": 0.5, "device": "cpu"}
+    settings: dict[str, Any] = {
+        "n_steps": 32,
+        "batch_size": 64 * len(scales),
+        "learning_rate": 5e-3,
+        "gamma": 0.5,
+        "device": "cpu",
+    }
     networks = {"net_arch": [32], "normalize_values": normalize_values}
     return PPO(policy, env, **ppo_settings(env, policy.lower(), policy_kwargs=networks, **settings | kwargs), seed=0)
 

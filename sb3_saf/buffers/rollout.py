@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Generator, ItemsView
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
+from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -155,6 +156,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     :raises ValueError: if the space is not that of teams, the rows are not whole teams, or ``ends`` is invalid
     """
 
+    #: Buffers without a policy, by the identity of their space: SB3 makes an algorithm's buffer, then its policy.
+    _waiting: ClassVar[WeakValueDictionary[int, TeamRolloutBuffer]] = WeakValueDictionary()
+
     def __init__(
         self,
         buffer_size: int,
@@ -178,7 +182,13 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._allocated = False
         self._returns = RolloutReturns(np.zeros(0), self._agents[:0])
         self._later: list[tuple[int, LaterValues[Any]]] = []
+        self._waiting[id(observation_space)] = self
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
+
+    @classmethod
+    def waits_for(cls, observation_space: spaces.Space[Any]) -> bool:
+        """Return whether a buffer was made for a space whose policy is not made yet; asked by the policy, once."""
+        return cls._waiting.pop(id(observation_space), None) is not None
 
     def reset(self) -> None:
         """Clear the rollout; the arrays are reused, since touching new memory takes as long as the encoder."""

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
+from inspect import signature
 from typing import Any, ClassVar, Final, Literal, NamedTuple, NoReturn
 
 import numpy.typing as npt
@@ -25,7 +26,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.buffers.later import LaterValues
-from sb3_saf.buffers.rollout import TeamMinibatch
+from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.distributions import masked_parameters
@@ -102,7 +103,7 @@ class TeamPolicy(TeamRowsPolicy):
         ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
         and variance of each agent's own returns, for agents whose rewards differ in scale. The policy's values,
         ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in all cases
-    :param use_sde: must be False; present because SB3's algorithms pass it
+    :param use_sde: must not be True. SB3's algorithms pass False: their policy warns if they have a buffer of SB3's own
     :param share_features_extractor: must be True: actor and critic always share the encoder
     :param features_extractor_class: encoder, built for the space of ``obs``
     :param features_extractor_kwargs: its further arguments
@@ -135,13 +136,22 @@ class TeamPolicy(TeamRowsPolicy):
         encode_once: bool | None = None,
         chunk_size: ChunkSize = "auto",
         normalize_values: bool | Literal["agent"] = False,
-        use_sde: bool = False,
+        use_sde: bool | None = None,
         share_features_extractor: bool = True,
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ):
-        _refuse(use_sde=use_sde, share_features_extractor=share_features_extractor)
+        _refuse(bool(use_sde), share_features_extractor)
+        if use_sde is not None and self.normalizes_values and not TeamRolloutBuffer.waits_for(observation_space):
+            warnings.warn(
+                f"{type(self).__name__} is trained on minibatches of SB3's own rollout buffer, which stores each "
+                "observation once more for every agent and splits teams: slower, with the same result. Train with "
+                "rollout_buffer_class=sb3_saf.TeamRolloutBuffer; PPO(policy, env, **sb3_saf.ppo_settings(env)) sets "
+                "it, with a batch size of whole teams instead of SB3's 64 rows",
+                UserWarning,
+                stacklevel=5,
+            )
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
         self._warned_of_minibatch = False
         self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
@@ -152,6 +162,7 @@ class TeamPolicy(TeamRowsPolicy):
                 "take; leave normalize_values=False, or use PPO with SAFPolicy, MAPPOPolicy or IPPOPolicy"
             )
         self.normalize_values = normalize_values
+        self._check_arguments(kwargs)
         # The next class in the MRO is SB3's or sb3-contrib's, which has more arguments than BasePolicy.
         super().__init__(
             observation_space,
@@ -162,6 +173,18 @@ class TeamPolicy(TeamRowsPolicy):
             features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # SB3 modifies it
             **kwargs,
         )
+
+    def _check_arguments(self, kwargs: Mapping[str, Any]) -> None:
+        """Raise TypeError for arguments of neither this policy nor SB3's."""
+        known = {name for base in type(self).__mro__ if "__init__" in vars(base) for name in signature(base).parameters}
+        unknown = [name for name in kwargs if name not in known]
+        if unknown:
+            own, name = [field.name for field in fields(self.parts_class)], type(self).__name__
+            raise TypeError(
+                f"{name} has no argument {unknown[0]!r}, which may be one of another method; it takes "
+                f"{', '.join(own)}, and those of SB3's policies. Settings of the method are "
+                f"sb3_saf.ppo_settings(env, {self.parts_class.__name__.removesuffix('Parts').lower()!r})"
+            )
 
     # --- construction -----------------------------------------------------------------------------------------------
 
@@ -278,34 +301,24 @@ class TeamPolicy(TeamRowsPolicy):
         return self._values(obs, self._encoded(obs))
 
     def _check_minibatch(self, obs: PyTorchObs) -> None:
-        """Warn once about minibatches for which TeamRolloutBuffer is the better choice."""
+        """Warn once about minibatches with rows of agents that take no part."""
         if self._warned_of_minibatch or not self.training or isinstance(obs, TeamMinibatch):
             return
         active, takes_part = self._active(obs), self._takes_part(obs)
-        if active is not None and takes_part is not None and (active.any(dim=1) & ~takes_part.squeeze(1)).any():
-            # Padding rows have no team.
-            message = (
-                "The minibatch has rows of agents that take no part (dead, or not joined yet); they enter the loss, "
-                f"the entropy and the normalisation of advantages. {self._advice()}"
-            )
-        elif self.normalizes_values:
-            message = (
-                f"{type(self).__name__} is trained on minibatches of SB3's own rollout buffer, which stores "
-                f"{self.team_spaces.n_agents + 1} observations per row and splits teams: slower, with the same result. "
-                "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer; PPO(policy, env, "
-                "**sb3_saf.ppo_settings(env)) sets it, with a batch size of whole teams"
-            )
-        else:
-            return
-        self._warned_of_minibatch = True
-        warnings.warn(message, UserWarning, stacklevel=3)
-
-    def _advice(self) -> str:
-        if self.normalizes_values:
-            return "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which leaves them out."
-        return (
-            f"The buffers of {type(self).__name__}'s algorithms cannot leave them out; PPO with "
+        if active is None or takes_part is None or not (active.any(dim=1) & ~takes_part.squeeze(1)).any():
+            return  # padding rows have no team
+        advice = (
+            "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which leaves them out."
+            if self.normalizes_values
+            else f"The buffers of {type(self).__name__}'s algorithms cannot leave them out; PPO with "
             "sb3_saf.TeamRolloutBuffer can."
+        )
+        self._warned_of_minibatch = True
+        warnings.warn(
+            "The minibatch has rows of agents that take no part (dead, or not joined yet); they enter the loss, the "
+            f"entropy and the normalisation of advantages. {advice}",
+            UserWarning,
+            stacklevel=3,
         )
 
     def _encoded(self, obs: PyTorchObs, of_step: bool = False) -> Encoded:
