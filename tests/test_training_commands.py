@@ -173,6 +173,15 @@ def test_frequencies_count_game_steps(tmp_path: Path) -> None:
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 400 * 4
 
 
+def test_short_runs_train_more_than_they_evaluate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At most one evaluation for each of the ten rollouts, at any frequency."""
+    run = train(tmp_path, "--eval-freq", "1", "-n", "400")
+    with np.load(run / "evaluations.npz") as arrays:
+        steps = arrays["game_steps"]
+    assert len(steps) == 11 and len(set((steps[:-1] - 1) // 40)) == 10 and steps[-1] == 400
+    assert re.search(r"^Evaluation took \d+% of \d+ s", capsys.readouterr().out, re.MULTILINE)
+
+
 def test_the_level_reaches_evaluation(tmp_path: Path) -> None:
     run = train(tmp_path, "--env-kwargs", "max_cycles:6", "coordination:2", "--eval-freq", "400")
     with np.load(run / "evaluations.npz") as arrays:

@@ -111,6 +111,42 @@ def test_other_settings_begin_another_run(tmp_path: Path, monkeypatch: pytest.Mo
     assert Run(run).seed is not None
 
 
+def test_another_initial_model_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(tmp_path / "models", "saf", "--seed", "1", "-n", "40")
+    train(tmp_path / "models", "saf", "--seed", "2", "-n", "40")
+    a, b = (str(tmp_path / "models" / "saf" / f"{ENV}_{number}" / f"{ENV}.zip") for number in (1, 2))
+    struck(monkeypatch, RuntimeError)
+    with pytest.raises(RuntimeError):
+        train(tmp_path, "saf", "--seed", "3", "-i", a)
+    monkeypatch.undo()
+    for other in (["-i", b], []):
+        given = ["--algo", "saf", *OPTIONS, "-f", str(tmp_path), "-tb", str(tmp_path / "tb"), "--resume", *other]
+        assert f"began with the model {a}, got " in failed(given, capsys)
+    train(tmp_path, "saf", "--seed", "3", "-i", a, "--resume")
+    assert "Going on with" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("when", [1, 3])
+def test_a_monitor_that_is_moved_takes_nothing_with_it(
+    when: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compressing or moving the file of a running training leaves the finished run as it is."""
+    evaluate = SeededEvalCallback._evaluate
+
+    def move(self: SeededEvalCallback) -> bool:
+        if self._n_evaluations == when:
+            (tmp_path / "saf" / f"{ENV}_1" / "monitor.csv").rename(tmp_path / "moved.csv")
+        return evaluate(self)
+
+    monkeypatch.setattr(SeededEvalCallback, "_evaluate", move)
+    train(tmp_path, "saf", "--seed", "3")
+    files = {path.name for path in (tmp_path / "saf" / f"{ENV}_1").iterdir()}
+    assert {f"{ENV}.zip", "best_model.zip", "evaluations.npz", "run.json", "finished.json"} <= files
+    assert (tmp_path / "moved.csv").is_file()
+
+
 def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = failed([*OPTIONS, "-f", str(tmp_path), "--hyperparams", "learning_rate:1.0e30"], capsys)
     # Where the difference first shows depends on the seed.

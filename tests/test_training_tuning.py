@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import os
+import socket
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,7 @@ from sb3_saf import LightEncoder
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run
 from sb3_saf.training.settings import ALGOS, load_settings
-from sb3_saf.training.tune import TrialCallback, sample_overrides, to_overrides
+from sb3_saf.training.tune import TrialCallback, open_storage, sample_overrides, to_overrides
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
@@ -134,6 +138,21 @@ def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[st
     tune(tmp_path)
     line = failed(given(tmp_path, "--algo", "mappo"), capsys)
     assert f"the trials of the study 's' are of saf on {ENV}, not of mappo on {ENV}" in line
+
+
+@pytest.mark.parametrize("storage", ["study.log", "study.db"])
+def test_a_killed_trial_does_not_count(storage: str, tmp_path: Path) -> None:
+    """SIGKILL leaves it RUNNING; a trial of a process that runs is left alone."""
+    path = tmp_path / storage
+    url = str(path) if storage.endswith(".log") else f"sqlite:///{path}"
+    study = optuna.create_study(study_name="s", storage=open_storage(url), direction="maximize")
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    for process in (int(dead.stdout), os.getpid()):
+        study.ask().set_user_attr("process", (socket.gethostname(), process))
+    words = ["--storage", url, "--max-total-trials", "2", "--n-evaluations", "1"]
+    zoo_train.main(given(tmp_path, *words))
+    states = [trial.state for trial in load_study(url).trials]
+    assert states == [TrialState.FAIL, TrialState.RUNNING, TrialState.COMPLETE]
 
 
 def _sampled(algo: str, fixed: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
+import socket
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import closing
@@ -29,6 +31,8 @@ _COUNTED: Final = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
 _SQLITE: Final = "sqlite:///"
 _JOURNAL: Final = ".log"
 _ATTEMPTS: Final = 10
+#: Attribute of a trial: host and number of its process.
+_PROCESS: Final = "process"
 
 # --- search spaces ----------------------------------------------------------------------------------------------------
 
@@ -174,6 +178,7 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
         study.set_user_attr("goal", goal)
+    _fail_dead_trials(study)
     callbacks: list[MaxTrialsCallback] = []
     n_trials: int | None = tuning.n_trials
     if tuning.max_total_trials is not None:
@@ -190,12 +195,33 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
     return study
 
 
+def _fail_dead_trials(study: optuna.Study) -> None:
+    """End the trials of killed processes of this machine, which would stay RUNNING and count for ever."""
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        host, process = trial.user_attrs.get(_PROCESS, ("", 0))
+        if host == socket.gethostname() and not _is_running(process):
+            study.tell(trial.number, state=TrialState.FAIL)
+
+
+def _is_running(process: int) -> bool:
+    if os.name != "posix":  # elsewhere the question itself would end the process
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
+
+
 def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
     """
     Train and evaluate a trial with its own seed, and return the mean team return of the last evaluation.
 
     :raises optuna.TrialPruned: if the pruner stops it, training fails, or the value is not finite
     """
+    trial.set_user_attr(_PROCESS, (socket.gethostname(), os.getpid()))
     seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
     options = tuning.options
     folder = None if tuning.log_path is None else str(tuning.log_path / f"trial_{trial.number}")
