@@ -20,7 +20,7 @@ from tests.test_training_commands import failed
 ENV = "TeamTogether-v0"
 OPTIONS = (
     *("--env", ENV, "--size", "smoke", "-n", "200"),
-    *("--eval-episodes", "2", "--checkpoint-freq", "1", "--inspect-freq", "-1"),
+    *("--eval-freq", "10", "--eval-episodes", "2", "--checkpoint-freq", "1", "--inspect-freq", "-1"),
 )
 
 

@@ -120,7 +120,11 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_evaluation(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--eval-freq", type=int, help="game steps between evaluations, -1 for none; by default 20 a run")
+    group.add_argument(
+        "--eval-freq",
+        type=int,
+        help="game steps between evaluations, -1 for none; by default 20 a run, 1 for the size smoke",
+    )
     group.add_argument(
         "--eval-episodes", type=at_least(1), help="team episodes of an evaluation; by default 32, 2 for the size smoke"
     )
@@ -234,8 +238,11 @@ def _fixed(options: argparse.Namespace) -> dict[str, Any]:
 
 def _run_options(options: argparse.Namespace, settings: Settings, **more: Any) -> RunOptions:
     log, folder_name = options.tensorboard_log, settings.environment.folder_name
+    same = {name: getattr(options, name) for name in _SAME_NAMES}
+    if options.size == "smoke" and options.eval_freq is None:
+        same["eval_freq"] = settings.game_steps  # at the end only: episodes may be longer than the whole training
     return RunOptions(
-        **{name: getattr(options, name) for name in _SAME_NAMES},
+        **same,
         tensorboard_log=None if log is None else log / folder_name,
         model_name=folder_name,
         initial_model=options.trained_agent,
