@@ -104,9 +104,11 @@ class TeamEvalCallback(EvalCallback):
             self._next_evaluation = (self._game_steps() // self.eval_freq + 1) * self.eval_freq
 
     def _on_step(self) -> bool:
-        if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation or self._is_done_for_rollout:
+        if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation:
             return True
         self._plan_next()
+        if self._is_done_for_rollout:
+            return True
         self._is_done_for_rollout = True  # the model does not change before the next rollout
         begin = time.monotonic()
         go_on = self._evaluate()

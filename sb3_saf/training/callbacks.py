@@ -25,36 +25,20 @@ from sb3_saf.teams.vec_env import require_n_agents
 
 
 class SeededEvalCallback(TeamEvalCallback):
-    """
-    Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy.
-
-    There is at most one evaluation for each rollout, in which the policy stays the same.
-    """
+    """Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy."""
 
     def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._seed = evaluation_seed(seed)
         self._n_evaluations = 0
         self._evaluated_at = -1
-        self._is_evaluated = False
-        #: Seconds of all evaluations.
+        #: Seconds of all evaluations of this process.
         self.seconds = 0.0
-
-    def _on_rollout_start(self) -> None:
-        self._is_evaluated = False
-
-    def _on_step(self) -> bool:
-        if not self._is_evaluated:
-            return super()._on_step()
-        if self._game_steps() >= self._next_evaluation:
-            self._plan_next()
-        return True
 
     def _evaluate(self) -> bool:
         began = time.perf_counter()
         self._n_evaluations += 1
         self._evaluated_at = self._game_steps()
-        self._is_evaluated = True
         with own_randomness(self._seed + self._n_evaluations, self.model.device):
             go_on = super()._evaluate()
         self.seconds += time.perf_counter() - began
