@@ -162,8 +162,7 @@ class Actor:
                 )
                 for agent, (own, mask) in team.items()
             }
-        conversion = self._conversion_of(observation)
-        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        inputs, is_batch, conversion = self._inputs(observation, action_mask, memory)
         is_drawn = not deterministic and not self.description["greedy"]
         names = ["drawn" if is_drawn else "most_likely", *(f"next_{name}" for name in self.description["states"])]
         actions, *states = self._run(names, inputs, self._generator(rng) if is_drawn else None)
@@ -209,7 +208,7 @@ class Actor:
 
         Arguments as in :meth:`act`; the memory is not updated.
         """
-        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        inputs, is_batch, _ = self._inputs(observation, action_mask, memory)
         self._check_is_drawn()
         if "log_probs" not in {output.name for output in self.session.get_outputs()}:
             raise ValueError("only Discrete actions have a list of probabilities: use log_prob")
@@ -222,7 +221,7 @@ class Actor:
 
         Arguments as in :meth:`act`; the memory is not updated.
         """
-        inputs, is_batch = self._inputs(observation, action_mask, memory)
+        inputs, is_batch, _ = self._inputs(observation, action_mask, memory)
         self._check_is_drawn()
         actions, choices = np.asarray(action), np.asarray(self.description["choices"])
         actions = actions.reshape(len(inputs["observation"]), -1)
@@ -266,8 +265,10 @@ class Actor:
         outputs: list[Array] = self.session.run(names, feeds)
         return outputs
 
-    def _inputs(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[dict[str, Array], bool]:
-        """Return the checked inputs of the graph by name, and whether they are a batch."""
+    def _inputs(
+        self, observation: Any, action_mask: Any, memory: Memory | None
+    ) -> tuple[dict[str, Array], bool, AgentConversion | None]:
+        """Return the checked inputs of the graph by name, whether they are a batch, and their conversion, if any."""
         conversion, mask_of_observation = self._conversion_of(observation), None
         if conversion is not None:
             observation, mask_of_observation = conversion.split(observation)
@@ -286,7 +287,7 @@ class Actor:
             if self.agent is None:
                 raise ValueError(f"this actor needs agent= of Actor.load, 0 to {self.n_agents - 1}: it reads who acts")
             inputs["agent"] = np.full(len(batch), self.agent)
-        return inputs, is_batch
+        return inputs, is_batch, conversion
 
     def _batch(self, observation: Any) -> tuple[Array, bool]:
         """Return own observations (K, *shape) of the space's dtype, and whether they were a batch."""
