@@ -183,11 +183,11 @@ def main(arguments: list[str] | None = None) -> None:
     for name, team in (("trained", model), ("random", sb3_saf.RandomPolicy(test_env, seed=0))):
         print(f"{name:<8} {sb3_saf.evaluate_team(team, test_env, options.episodes, deterministic=False)}")
 
-    # Every agent acts on what the game gives it.
+    # Every agent acts on what the game gives it, with actions drawn as in training.
     game = Warehouse()
     given: Any = game.reset(seed=2)  # observations and infos, with the masks
     while game.agents:
-        actions: Any = model.predict(given, deterministic=True)[0]
+        actions: Any = model.predict(given)[0]
         observations, _, _, _, infos = game.step(actions)
         given = observations, infos
     print(f"by itself: {sum(map(len, game.orders))} orders left after {game.steps} steps")
