@@ -106,6 +106,8 @@ def make_team_env(
     """
     check_count("n_envs", n_envs)
     check_count("n_cpus", n_cpus)
+    if monitor_dir is not None and os.path.exists(monitor_dir) and not os.path.isdir(monitor_dir):
+        raise ValueError(f"monitor_dir must be a folder, which is created if missing; {monitor_dir} is a file")
     if backend is not None:
         check_choice("backend", backend, get_args(Backend))
     if team_reward is not None:
@@ -170,6 +172,9 @@ def _in_stages(
     curriculum: Sequence[Stage],
 ) -> Curriculum:
     """Make the games of all stages and join them to a curriculum."""
+    for stage in curriculum:
+        if not isinstance(stage, Stage):
+            raise ValueError(f"curriculum must list sb3_saf.Stage(game_steps, params), got {stage!r}")
     games: list[VecEnv] = []
     try:
         for of_stage in [*(stage.params for stage in curriculum), {}]:

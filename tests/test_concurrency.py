@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import multiprocessing
 import pickle
 from collections.abc import Callable
@@ -92,6 +93,17 @@ def test_copies_in_the_middle_of_an_episode_share_nothing(copied: Callable[[Any]
     other = copied(venv)
     expected = played(venv)
     assert played(other) == expected
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_games_in_worker_processes_refuse_copies_and_play_on(copied: Callable[[Any], Any]) -> None:
+    venv = sb3_saf.make_team_env(LazyEnv, 2, seed=0, n_cpus=2)
+    venv.reset()
+    with pytest.raises(TypeError, match="n_cpus=1"):
+        copied(venv)
+    gc.collect()
+    venv.step(np.zeros(venv.num_envs, dtype=np.int64))
+    venv.close()
 
 
 @MAKERS

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import errno
+import itertools
 import math
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -461,6 +464,29 @@ class TestTeamEvalCallback:
         assert (callback.best_mean_reward, callback.last_mean_reward) == (12, 12)
         assert PPO.load(tmp_path / "best_model").num_timesteps == 42
         assert best.model is after.model is callback.model
+
+    def test_a_full_disk_keeps_the_files_of_before_and_names_the_file(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        rewards = itertools.count(1.0)
+        eval_env = teams(lengths=(1,), reward=lambda game, agent, step: next(rewards))
+        folder = str(tmp_path)
+        callback = TeamEvalCallback(
+            eval_env, n_eval_episodes=1, eval_freq=2, log_path=folder, best_model_save_path=folder, verbose=0
+        )
+        self.learn(callback, 4, tmp_path)
+        files = {name: (tmp_path / name).read_bytes() for name in ("best_model.zip", "evaluations.npz")}
+
+        def full(_: int) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match=r"cannot write .*evaluations\.npz"):
+            self.learn(callback, 4, tmp_path)
+        callback.log_path = None
+        with pytest.raises(OSError, match=r"cannot write .*best_model\.zip"):
+            self.learn(callback, 4, tmp_path)
+        assert {name: (tmp_path / name).read_bytes() for name in files} == files
 
     def test_callbacks_can_stop_the_training(self, tmp_path: Path) -> None:
         eval_env = teams(lengths=(1,), reward=constant(1))

@@ -150,6 +150,8 @@ class Walk(gym.Env[Array, int]):
         (lambda: make_team_env(3), "ParallelEnv"),
         (lambda: make_team_env("TeamSupport", stagger=True, backend="supersuit"), "stagger=True .*TeamSupport-v0"),
         (lambda: make_team_env(CounterEnv, stagger=True), "stagger=True .*CounterEnv"),
+        (lambda: make_team_env(CounterEnv, curriculum=[(10, {})]), r"curriculum .*Stage.*got \(10, \{\}\)"),  # type: ignore[list-item]
+        (lambda: make_team_env(CounterEnv, monitor_dir=__file__), f"monitor_dir .*{__file__} is a file"),
     ],
 )
 def test_wrong_calls(make: Callable[[], VecEnv], named: str) -> None:

@@ -331,8 +331,8 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
     assert own.shape == (6,) and own.dtype == np.float32  # two frames of three numbers, converted
     assert model.num_timesteps < 400 * 2  # stopped by the callback
     with np.load(run / "vecnormalize.npz") as statistics:
-        assert set(statistics) == {"obs", "returns"} and statistics["obs"].shape == (1 + 2 * 6,)
-        assert statistics["obs"][0] > 10
+        assert set(statistics) == {f"{name} {part}" for name in ("obs", "returns") for part in ("mean", "var", "count")}
+        assert statistics["obs mean"].shape == (6,) and statistics["obs count"] > 10
     gif = str(tmp_path / "game.gif")
     zoo_enjoy.enjoy(["--env", COUNTER, "-f", str(tmp_path), "--episodes", "2", "--gif", gif])
 

@@ -14,6 +14,7 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from hecogrid_envs.params import HECOGridParams
 from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
@@ -305,3 +306,12 @@ def test_every_file_is_installed_with_the_packages() -> None:
     config.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
     assert config["options.package_data"]["zoo_configs"] == "*.yml"
     assert "zoo_configs*" in config["options.packages.find"]["include"].split()
+
+
+def test_normalize_without_arguments_normalises() -> None:
+    values: tuple[Any, ...] = (True, {})
+    for value in values:
+        settings = load_settings("saf", "TeamTogether-v0", "smoke", overrides={"normalize": value})
+        assert unwrap_vec_normalize(settings.make_env(0)) is not None
+    with pytest.raises(ValueError, match="normalize is for"):
+        load_settings("qplex", "TeamTogether-v0", "smoke", overrides={"normalize": {}})

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import partial
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import cloudpickle
 import gymnasium
@@ -110,6 +110,13 @@ class WorkerGames:
         # Runs at the interpreter's exit, or when the environment is garbage collected.
         self._finalizer = weakref.finalize(self, _close_workers, self._venv, os.getpid())
         self._run("build")
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse copies and pickles, which would share the pipes of this object and end its processes."""
+        raise TypeError(
+            "games in worker processes cannot be copied or pickled: make another environment in the same way, or use "
+            "n_cpus=1"
+        )
 
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """Begin an episode in every game (see :class:`TeamConcatVecEnv`)."""

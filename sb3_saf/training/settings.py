@@ -336,7 +336,7 @@ def _build(
         del own["algorithm"]
     env_kwargs = environment.complete(own.get("env_kwargs", {}))
     wrapping = {key: own[key] for key in WRAPPER_KEYS if key in own}
-    if wrapping.get("normalize") and issubclass(spec.algorithm, OffPolicyAlgorithm):
+    if wrapping.get("normalize", False) is not False and issubclass(spec.algorithm, OffPolicyAlgorithm):
         raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {algo}")
     if "frame_stack" in wrapping and env_kwargs.get("observation") == "tiles":
         raise ValueError("frame_stack stacks pictures, not tile codes; give the game observation: rgb in env_kwargs")

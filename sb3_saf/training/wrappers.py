@@ -90,8 +90,8 @@ def wrap_rows(
     :param is_training: whether statistics are updated and rewards normalised
     :return: ``env`` itself if there is nothing to do
     """
-    normalize = wrapping.get("normalize") or None
-    if "vec_env_wrapper" not in wrapping and normalize is None:
+    normalize = wrapping.get("normalize", False)  # {} for the defaults of VecNormalize, as True
+    if "vec_env_wrapper" not in wrapping and normalize is False:
         return env
     rows: VecEnv = env
     while not isinstance(rows, (TeamMonitor, SharedReward)):
@@ -104,7 +104,7 @@ def wrap_rows(
             rows = wrapper(rows, **arguments)
         except (TypeError, AssertionError) as error:
             raise ValueError(f"vec_env_wrapper: {error}") from error
-    if normalize is not None:
+    if normalize is not False:
         rows = _normalized(rows, {} if normalize is True else dict(normalize), gamma, is_training)
     return CentralizedValueWrapper(rows, time_limit=env.time_limit)
 
