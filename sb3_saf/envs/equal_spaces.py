@@ -48,6 +48,12 @@ def make_team_game(make: Callable[[], Any]) -> Any:
     return team_game(make())
 
 
+def masks_are_inside(env: Any) -> bool:
+    """Return whether observations of a ParallelEnv hold action masks."""
+    agents = agents_of(env)
+    return any(mask_key_of(env.observation_space(one), env.action_space(one))[0] is not None for one in agents)
+
+
 def trial_of(game: Any) -> Trial:
     """Play a trial episode of a game; agents with different spaces are checked against their own."""
     trial = Trial(game.env if isinstance(game, EqualSpaces) else game)

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.checkpoints.environments import load_normalization_statistics, normalization_statistics
 from sb3_saf.envs.curriculum import Stage
+from sb3_saf.envs.equal_spaces import EqualSpaces, masks_are_inside
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.team_reward import SharedReward, TeamReward
@@ -70,6 +71,8 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
     if "frame_stack" in wrapping:
         import supersuit
 
+        if masks_are_inside(game):
+            game = EqualSpaces(game)  # gives masks in infos, beside observations that can be stacked
         game = supersuit.frame_stack_v1(game, wrapping["frame_stack"])
     return game
 
