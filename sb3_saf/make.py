@@ -15,9 +15,8 @@ from sb3_saf.envs.curriculum import Curriculum, Stage
 from sb3_saf.envs.equal_spaces import make_team_game, team_game
 from sb3_saf.envs.game_reader import AnyParallelEnv, AskMasks
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
-from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.envs.monitor import SharedReward, TeamMonitor, TeamReward
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-from sb3_saf.envs.team_reward import SharedReward, TeamReward
 from sb3_saf.suites.registry import TeamEnvironment, find_environment
 from sb3_saf.teams.checks import check_choice, check_count
 from sb3_saf.teams.rows import TeamSpaces

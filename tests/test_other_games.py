@@ -24,6 +24,7 @@ from sb3_saf import (
     evaluate_team,
     make_team_env,
 )
+from sb3_saf.training.wrappers import wrap_game
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
 ZEROS = np.zeros(2, np.float32)
@@ -552,3 +553,10 @@ def test_the_audit_accepts_a_good_game_and_raises_the_errors_of_the_game() -> No
 
     with pytest.raises(ArithmeticError):
         check_team_env(Broken())
+
+
+def test_frames_are_stacked_beside_masks_in_observations() -> None:
+    game = wrap_game(MaskedGame("action_mask"), {"frame_stack": 3})
+    env = make_team_env(game, seed=0)
+    assert env.team_spaces.own_shape == (6,) and env.team_spaces.n_masked_actions == 3
+    assert evaluate_team(RandomPolicy(env, seed=0), env, 3).mean == 8

@@ -32,7 +32,7 @@ from sb3_saf import (
 )
 from sb3_saf.envs.equal_spaces import EqualSpaces
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
-from sb3_saf.envs.team_reward import SharedReward
+from sb3_saf.envs.monitor import SharedReward
 from sb3_saf.networks.encoders import PaperCNN, PartsEncoder, PartsSpace
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam

@@ -10,7 +10,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_saf.envs.joint_observation import DictRows
-from sb3_saf.envs.team_reward import SharedReward
+from sb3_saf.envs.monitor import SharedReward
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.rows import OBS_KEY
 from sb3_saf.teams.trees import Tree

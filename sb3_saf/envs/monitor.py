@@ -1,4 +1,8 @@
-"""Monitor of team episodes and team returns; SB3's monitors would count every agent as a separate episode."""
+"""
+Monitor of team episodes and team returns, and rewards that a team shares.
+
+SB3's monitors would count every agent as a separate episode.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import time
 import warnings
 import weakref
 from collections.abc import Mapping, Sequence
-from typing import IO, Any, Final, Literal
+from typing import IO, Any, ClassVar, Final, Literal
 
 import numpy as np
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
@@ -18,6 +22,8 @@ from sb3_saf.teams.rows import IS_SUCCESS
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, episode_value, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
+#: Each agent its own reward; each the sum, or the mean, over the agents of its team.
+TeamReward = Literal["given", "sum", "mean"]
 
 
 class TeamMonitor(TeamVecEnvWrapper):
@@ -243,3 +249,26 @@ def _cut(file: IO[Any], size: int) -> None:
         )
         return
     os.truncate(file.fileno(), size)
+
+
+class SharedReward(TeamVecEnvWrapper):
+    """
+    Give every agent the sum or the mean of its team's rewards. Wrap it around a TeamMonitor, which logs unchanged
+    returns.
+
+    :param venv: rows of flattened teams
+    :param team_reward: ``"sum"`` or ``"mean"`` over the agents of a team
+    """
+
+    shares_reward: ClassVar[bool] = True
+
+    def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"]) -> None:
+        super().__init__(venv)
+        self.team_reward = team_reward
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Wait for the step of all games; rewards (B,) are equal within a team."""
+        obs, rewards, dones, infos = self.venv.step_wait()
+        by_game = np.asarray(rewards).reshape(self.n_games, self.n_agents)
+        shared = by_game.sum(axis=1) if self.team_reward == "sum" else by_game.mean(axis=1)
+        return obs, np.repeat(shared, self.n_agents), dones, infos

@@ -24,8 +24,7 @@ from sb3_saf.checkpoints.environments import load_normalization_statistics, norm
 from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.equal_spaces import EqualSpaces, masks_are_inside
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.envs.team_reward import SharedReward, TeamReward
+from sb3_saf.envs.monitor import SharedReward, TeamMonitor, TeamReward
 from sb3_saf.teams.checks import import_by_name
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import OBS_KEY
