@@ -77,6 +77,8 @@ def test_the_table_has_a_row_for_each_cell_and_level(undisturbed: Path) -> None:
         returns = [float(value) for value in row["returns"].split(" ")]
         assert len(returns) == int(row["episodes"]) == 32
         assert float(row["return_mean"]) == pytest.approx(sum(returns) / 32)
+        own = [float(value) for value in row["agent_returns"].split(" ")]
+        assert len(own) == 4 and sum(own) == pytest.approx(float(row["return_mean"]))
         assert float(row["return_low"]) <= float(row["return_mean"]) <= float(row["return_high"])
         assert float(row["score"]) == pytest.approx(float(row["return_mean"]) / 6)
         assert row["game_steps"] == ("0" if row["method"] == "random" else "400")

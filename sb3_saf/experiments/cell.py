@@ -160,6 +160,7 @@ def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | Non
         result.returns,
         result.lengths,
         list(result.successes),
+        [list(returns) for returns in result.agent_returns],
         time.perf_counter() - clock,
     )
 

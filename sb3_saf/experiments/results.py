@@ -54,6 +54,7 @@ class LevelResult:
     :param returns: team return of each episode
     :param lengths: game steps of each episode
     :param successes: whether each episode was won; empty if the games do not report it
+    :param agent_returns: own return of each agent in each episode
     :param wall_seconds: cost
     """
 
@@ -64,12 +65,14 @@ class LevelResult:
     returns: list[float]
     lengths: list[int]
     successes: list[bool]
+    agent_returns: list[list[float]]
     wall_seconds: float
 
     @property
     def evaluation(self) -> EvaluationResult:
         """Mean, interval and success rate."""
-        return EvaluationResult(self.returns, self.lengths, tuple(self.successes))
+        own = tuple(tuple(returns) for returns in self.agent_returns)
+        return EvaluationResult(self.returns, self.lengths, tuple(self.successes), own)
 
 
 @dataclass(frozen=True)

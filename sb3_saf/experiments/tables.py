@@ -14,6 +14,7 @@ Tables of tests have one row per cell and test level, and are always computed fr
 ``success_rate``                     fraction of episodes won; empty if the games do not report it
 ``score``                            fraction of the largest return; if that is unknown, of the range of all returns
                                      in the table on this task and level
+``agent_returns``                    mean own return of every agent, separated by spaces
 ``returns``                          team return of every episode, separated by spaces
 ``processor_seconds``,               cost of training and test
 ``wall_seconds_training``, ``wall_seconds_test``
@@ -113,6 +114,7 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
             "return_high": high,
             "success_rate": float("nan") if evaluation.success_rate is None else evaluation.success_rate,
             "score": float("nan"),
+            "agent_returns": " ".join(f"{value:.12g}" for value in evaluation.agent_means),
             "returns": " ".join(f"{value:.12g}" for value in test.returns),
             "processor_seconds": cost["processor_seconds"],
             "wall_seconds_training": cost["wall_seconds"],
