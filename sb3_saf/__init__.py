@@ -50,9 +50,9 @@ if find_spec("stable_baselines3") is not None:
         PaperCNN,
         PartsEncoder,
     )
-    from sb3_saf.policies.ippo import IPPOLstmPolicy, IPPOMaskablePolicy, IPPOPolicy
-    from sb3_saf.policies.mappo import MAPPOLstmPolicy, MAPPOMaskablePolicy, MAPPOPolicy
-    from sb3_saf.policies.saf import SAFLstmPolicy, SAFMaskablePolicy, SAFPolicy
+    from sb3_saf.policies.ippo import IPPOMaskablePolicy, IPPOPolicy
+    from sb3_saf.policies.mappo import MAPPOMaskablePolicy, MAPPOPolicy
+    from sb3_saf.policies.saf import SAFMaskablePolicy, SAFPolicy
     from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
@@ -84,13 +84,11 @@ __all__ = [
     "FiniteCallback",
     "GameStepsCallback",
     "GymnasiumTeam",
-    "IPPOLstmPolicy",
     "IPPOMaskablePolicy",
     "IPPOPolicy",
     "Inspection",
     "InspectionCallback",
     "LightEncoder",
-    "MAPPOLstmPolicy",
     "MAPPOMaskablePolicy",
     "MAPPOPolicy",
     "MLPEncoder",
@@ -103,7 +101,6 @@ __all__ = [
     "QPLEXPolicy",
     "QPLEXPoolPolicy",
     "RandomPolicy",
-    "SAFLstmPolicy",
     "SAFMaskablePolicy",
     "SAFPolicy",
     "Stage",

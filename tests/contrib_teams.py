@@ -1,15 +1,14 @@
-"""Toy teams for the algorithms of sb3-contrib: some actions are masked, some rewards need memory."""
+"""Toy teams for MaskablePPO: some actions are masked."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from tests.toy_teams import VECTOR, ToyTeams
+from tests.toy_teams import ToyTeams
 
 Array = npt.NDArray[Any]
 
@@ -68,46 +67,3 @@ class MaskedTeams(ToyTeams):
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         return list(getattr(self, method_name)(*args, **kwargs))
-
-
-class CueTeams(ToyTeams):
-    """
-    Each agent sees a cue of -1 or 1 at the first of three steps, then only the time. Only the last step is rewarded.
-
-    :param pays: ``"own"``: 1 for the action that matches the own cue (0 for -1, 1 for 1), else 0; ``"mate"``: the next
-        agent's cue, regardless of the action
-    :param n_agents: N
-    :param n_games: E
-    """
-
-    def __init__(self, pays: Literal["own", "mate"], n_agents: int = 2, n_games: int = 16):
-        self.pays = pays
-        super().__init__(VECTOR, spaces.Discrete(2), n_agents, n_games, length=3)
-
-    def _observe(self) -> dict[str, Array]:
-        step = self._time % self.length
-        if step == 0:
-            self.cues = self._rng.choice([-1.0, 1.0], size=(self.n_games, self.n_agents)).astype(np.float32)
-        views = np.zeros((self.n_games, self.n_agents, 5), np.float32)
-        views[:, :, 0] = self.cues if step == 0 else 0.0
-        views[:, :, 1 + step] = 1.0
-        return {
-            "obs": views.reshape(-1, 5),
-            "team": np.repeat(views, self.n_agents, axis=0),
-            "agent": np.tile(np.arange(self.n_agents), self.n_games),
-        }
-
-    def step_wait(self) -> VecEnvStepReturn:
-        is_last = self._time % self.length == self.length - 1
-        if self.pays == "own":
-            paid = (self._actions[:, 0] == (self.cues.reshape(-1) + 1) / 2).astype(np.float32)
-        else:
-            paid = np.roll(self.cues, -1, axis=1).reshape(-1).astype(np.float32)
-        self._time += 1
-        done = self._time % self.length == 0
-        obs = self._observe()
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if done:
-            for row, info in enumerate(infos):
-                info["terminal_observation"] = {key: value[row] for key, value in obs.items()}
-        return obs, paid * is_last, np.full(self.num_envs, done), infos

@@ -56,12 +56,14 @@ def test_rows_tell_who_is_active_what_is_legal_and_the_state(masks: str, n_cpus:
     assert (
         env.observation_space
         == TeamSpaces.of(
-            spaces.Box(0, np.inf, (3,)), N_AGENTS, True, N_ACTIONS, spaces.Box(0, 100, (2,))
+            spaces.Box(0, np.inf, (3,)), N_AGENTS, True, N_ACTIONS, spaces.Box(0, 100, (2,)), has_starts=True
         ).to_dict_space()
     )
     obs: Any = env.reset()
     for step in range(5):
         assert obs["active"].tolist() == [ACTIVE[step]] * 6
+        played = ACTIVE[step - 1] if step else [0] * N_AGENTS
+        assert obs["episode_start"].tolist() == [1 - flag for flag in played] * 2
         assert obs["action_mask"].tolist() == expected_masks(step) * 2
         assert obs["state"].tolist() == [[step, sum(ACTIVE[step])]] * 6
         # An inactive agent sees zeros, and other agents see zeros in its place.
@@ -96,14 +98,14 @@ def test_whoever_ends_with_the_last_step_is_not_active_after_it() -> None:
 def test_agents_that_join_in_an_environment_without_masks() -> None:
     env = make_team_env(LateEnv, seed=0, n_agents=2)
     obs: Any = env.reset()
-    assert set(obs) == {"obs", "team", "agent", "active"}
+    assert set(obs) == {"obs", "team", "agent", "episode_start", "active"}
     assert obs["active"].tolist() == [[1, 0]] * 2
     obs, *_ = env.step(np.zeros(2, dtype=int))
     assert obs["active"].tolist() == [[1, 1]] * 2
 
 
 def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
-    names = {"obs", "team", "agent"}
+    names = {"obs", "team", "agent", "episode_start"}
     small: dict[str, Any] = {"n_agents": 2, "grid_size": 10, "n_treasures": 5, "view_size": 5}
     assert set(make_team_env("TeamSupport", **small).observation_space.spaces) == names  # type: ignore[attr-defined]
     plain = make_team_env(TellingEnv, active=False, action_masks=False, **LIVES)

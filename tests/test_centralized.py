@@ -236,6 +236,7 @@ class SeeRollout(BaseCallback):
             "obs": np.array([[1, agent, 0, 2] for agent in range(3)], dtype=np.float32),
             "team": np.array([[[1, agent, 0, 2] for agent in range(3)]] * 3, dtype=np.float32),
             "agent": np.arange(3),
+            "episode_start": np.zeros(3, dtype=np.int64),
         }
         with th.no_grad():
             self.values = policy.predict_values(policy.obs_to_tensor(last)[0])
@@ -253,6 +254,19 @@ def test_ppo_adds_the_value_of_the_rows_own_last_observation(time_limit: Any, ga
     expected = np.array([102, 112, 122]) + gamma * seen.values.numpy().flatten()
     np.testing.assert_allclose(seen.rewards[1, 3:], expected, rtol=1e-6)
     np.testing.assert_allclose(seen.rewards[1, :3], [2, 12, 22])
+
+
+def test_rows_say_where_episodes_begin_and_last_rows_which_row_they_are_of() -> None:
+    env = CentralizedValueWrapper(TeamVenv(lengths=(3, 5, 7)))
+    obs: Any = env.reset()
+    for step in range(20):
+        starts = [step % length == 0 for length in (3, 5, 7) for _ in range(3)]
+        assert obs["episode_start"].tolist() == starts
+        obs, _, dones, infos = env.step(still(env))
+        for row in np.flatnonzero(dones):
+            last = infos[row]["terminal_observation"]
+            assert last["episode_start"] == 0 and last.row == row
+    assert env.reset()["episode_start"].all()
 
 
 def test_team_size_is_seen_through_further_wrappers() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3 import PPO
 
-from sb3_saf import SAFLstmPolicy, SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.networks.value_normalizer import ValueNormalizer
 from tests.toy_envs import TellingEnv
@@ -55,62 +55,6 @@ def learn(model: Any, n_rows: int) -> Any:
 
 def active_rows(obs: Any) -> Any:
     return obs["active"][np.arange(len(obs["agent"])), obs["agent"]] == 1
-
-
-@pytest.mark.parametrize("critic_lstm", [True, False])
-def test_memory_with_masks_and_agents_that_die(critic_lstm: bool) -> None:
-    """The environment fails the test at the first illegal action."""
-    env = lively_env()
-    model = RecurrentPPO(
-        "SAFLstmPolicy",
-        env,
-        n_steps=10,
-        batch_size=30,
-        n_epochs=2,
-        seed=0,
-        device="cpu",
-        policy_kwargs=small_policy(lstm_hidden_size=8, enable_critic_lstm=critic_lstm),
-    )
-    learn(model, 120)
-    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-    assert evaluate_team(model, lively_env(), 4).lengths == [5] * 4
-    policy, obs = model.policy, env.reset()
-    assert isinstance(policy, SAFLstmPolicy) and isinstance(obs, dict)
-    rows, _ = policy.obs_to_tensor(obs)
-    zeros = th.zeros(1, 6, 8)
-    values = policy.predict_values(rows, (zeros, zeros), th.ones(6)).flatten()
-    assert (values[~active_rows(obs)] == 0).all(), "an agent that takes no part expects nothing"
-    assert (values[active_rows(obs)] != 0).all()
-
-
-def test_rollouts_of_memory_with_masks_are_evaluated_alike() -> None:
-    """PPO's ratio is 1 before the first step, independently of padding and idle agents in the sequences."""
-    model = RecurrentPPO(
-        "SAFLstmPolicy",
-        lively_env(),
-        n_steps=10,
-        batch_size=30,
-        n_epochs=1,
-        learning_rate=0.0,
-        seed=0,
-        device="cpu",
-        policy_kwargs=small_policy(lstm_hidden_size=8, ortho_init=False),
-    )
-    learn(model, 60)
-    n_rows = 0
-    policy, batches = model.policy, model.rollout_buffer.get(30)
-    assert isinstance(policy, SAFLstmPolicy)
-    batch: Any  # the annotations of sb3-contrib do not name its samples
-    for batch in batches:
-        actions = batch.actions.long().flatten()
-        values, log_prob, _ = policy.evaluate_actions(
-            batch.observations, actions, batch.lstm_states, batch.episode_starts
-        )
-        real = batch.mask > 1e-8
-        n_rows += int(real.sum())
-        assert ((log_prob - batch.old_log_prob).exp() - 1)[real].abs().max() < 1e-5
-        th.testing.assert_close(values.flatten()[real], batch.old_values[real], rtol=1e-4, atol=1e-5)
-    assert n_rows == 60
 
 
 def test_an_action_must_be_allowed_by_both_masks() -> None:

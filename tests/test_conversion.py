@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, make_team_env, ppo_settings
@@ -102,10 +102,10 @@ class Kinds(ParallelEnv[str, Any, Any]):
         return observations, dict.fromkeys(team, 1.0), ends, dict.fromkeys(team, False), infos
 
 
-def make(algorithm: Any, policy: str, env: Any) -> Any:
+def make(algorithm: Any, policy: str, env: Any, **kwargs: Any) -> Any:
     if algorithm is QPLEX:
         return QPLEX(policy, env, buffer_size=100, seed=0)
-    settings = ppo_settings(env, n_steps=8) if algorithm is PPO else {"n_steps": 8, "batch_size": 24}
+    settings = ppo_settings(env, n_steps=8, **kwargs) if algorithm is PPO else {"n_steps": 8, "batch_size": 24}
     return algorithm(policy, env, **settings, seed=0)
 
 
@@ -144,11 +144,16 @@ def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "policy"),
-    [(QPLEX, "QPLEXPolicy"), (QPLEX, "QPLEXLstmPolicy"), (RecurrentPPO, "IPPOLstmPolicy"), (PPO, "MAPPOPolicy")],
+    ("algorithm", "policy", "kwargs"),
+    [
+        (QPLEX, "QPLEXPolicy", {}),
+        (QPLEX, "QPLEXLstmPolicy", {}),
+        (PPO, "IPPOPolicy", {"memory": "lstm"}),
+        (PPO, "MAPPOPolicy", {}),
+    ],
 )
-def test_every_algorithm_acts_on_the_games_observations(algorithm: Any, policy: str) -> None:
-    model = make(algorithm, policy, make_team_env(partial(Kinds, "vectors", "info"), seed=0))
+def test_every_algorithm_acts_on_the_games_observations(algorithm: Any, policy: str, kwargs: dict[str, Any]) -> None:
+    model = make(algorithm, policy, make_team_env(partial(Kinds, "vectors", "info"), seed=0), policy_kwargs=kwargs)
     game: Any = Kinds("vectors", "info")
     state = None
     given = game.reset(seed=0)
@@ -156,7 +161,7 @@ def test_every_algorithm_acts_on_the_games_observations(algorithm: Any, policy: 
         actions, state = model.predict(given, state, np.full(3, step == 0))
         observations, _, _, _, infos = game.step(actions)
         given = observations, infos
-        assert (state is None) == ("Lstm" not in policy)
+        assert (state is None) == ("Lstm" not in policy and not kwargs)
 
 
 def test_masks_are_passed_by_agent() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch as th
-from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, LightEncoder, TeamRolloutBuffer, make_team_env
@@ -45,9 +44,10 @@ def test_the_gradient_repeats() -> None:
     assert all(th.equal(gradient(), gradient()) for _ in range(10))
 
 
-def _trained(algorithm: type[Any], policy: str, **kwargs: Any) -> th.Tensor:
+def _trained(algorithm: type[Any], policy: str, memory: str | None = None, **kwargs: Any) -> th.Tensor:
     env = make_team_env("TeamSupport", n_envs=32, seed=0, n_agents=5, grid_size=12, n_treasures=20)
-    policy_kwargs = {"features_extractor_class": LightEncoder}
+    policy_kwargs: dict[str, Any] = {"features_extractor_class": LightEncoder}
+    policy_kwargs |= {} if memory is None else {"memory": memory}
     model = algorithm(policy, env, seed=0, policy_kwargs=policy_kwargs, device="cpu", **kwargs)
     parameters = list(model.policy.parameters())
     before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
@@ -58,7 +58,6 @@ def _trained(algorithm: type[Any], policy: str, **kwargs: Any) -> th.Tensor:
 
 
 _PPO = {"n_steps": 25, "batch_size": 4_000, "n_epochs": 1, "rollout_buffer_class": TeamRolloutBuffer}
-_RECURRENT: dict[str, Any] = {"n_steps": 25, "batch_size": 4_000, "n_epochs": 1}
 _QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 600}
 
 
@@ -67,7 +66,7 @@ _QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 600}
     ("algorithm", "policy", "kwargs"),
     [
         (PPO, "SAFPolicy", _PPO),
-        (RecurrentPPO, "SAFLstmPolicy", _RECURRENT),
+        (PPO, "SAFPolicy", _PPO | {"memory": "gru"}),
         (QPLEX, "QPLEXPolicy", _QPLEX),
     ],
 )

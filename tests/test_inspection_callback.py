@@ -14,7 +14,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from PIL import Image
-from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -218,7 +218,6 @@ def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settin
         (A2C, "SAFPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
         (PPO, "SAFPolicy", {"n_policies": 1}, {"knowledge_source", "message"}),
         (PPO, "SAFPolicy", {"knowledge_source": False}, {"pool"}),
-        (RecurrentPPO, "SAFLstmPolicy", {"enable_critic_lstm": False}, {"pool", "knowledge_source", "message"}),
         (PPO, "IPPOPolicy", {}, set()),
         (MaskablePPO, "SAFMaskablePolicy", {}, {"pool", "knowledge_source", "message"}),
     ],

@@ -86,9 +86,10 @@ def test_who_uses_them_has_them_computed_once() -> None:
 
     def compute(steps: Any) -> list[th.Tensor]:
         asked.append(len(steps))
-        return [th.full((3, 1), float(step)) for step in steps]
+        return [th.full((3, 1), step) for step in steps]
 
-    one, other, third = (LaterValues.of(step, th.zeros(3), compute) for step in (1, 2, 3))
+    steps: Any = (1.0, 2.0, 3.0)
+    one, other, third = (LaterValues.of(step, th.zeros(3), compute) for step in steps)
     assert one.shape == (3, 1) and asked in ([], [1])
     assert (one + one).tolist() == [[2.0]] * 3
     assert th.cat([one, one]).sum() == 6.0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import supersuit
 from gymnasium import spaces
-from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 
 from sb3_saf import (
@@ -143,7 +143,7 @@ def test_sb3s_own_buffer_warns_when_the_model_is_made_and_names_the_remedy() -> 
         A2C("SAFPolicy", env, n_steps=4, device="cpu")
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, MaskablePPO, RecurrentPPO])
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, MaskablePPO])
 @pytest.mark.parametrize("method", ["saf", "mappo", "ippo"])
 def test_settings_fit_the_algorithm(algorithm: Any, method: str) -> None:
     env = make_team_env("TeamSupport", 2, seed=0, n_agents=2, grid_size=7, n_treasures=2, max_cycles=10)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -192,7 +192,9 @@ MODELS: dict[str, Callable[[], Any]] = {
     ),
     "QPLEX": lambda: qplex("QPLEXPolicy"),
     "QPLEX with memory": lambda: qplex("QPLEXLstmPolicy", sequence_length=4, burn_in=2),
-    "RecurrentPPO": lambda: make(algorithm=RecurrentPPO, policy="SAFLstmPolicy", batch_size=ROLLOUT, n_epochs=1),
+    "PPO with memory": lambda: make(
+        rollout_buffer_class=sb3_saf.TeamRolloutBuffer, policy_kwargs=LIGHT | {"memory": "lstm", "memory_size": 8}
+    ),
 }
 
 
@@ -372,7 +374,7 @@ EMPTY: dict[str, Callable[[], Any]] = {
     "normalised": normalised,
     "curriculum": staged(),
     "masks": MODELS["MaskablePPO"],
-    "memory": MODELS["RecurrentPPO"],
+    "memory": MODELS["PPO with memory"],
     "replay": MODELS["QPLEX with memory"],
     "staggered": native(stagger=True),
     "game of others": counting(max_cycles=5),

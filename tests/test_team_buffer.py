@@ -134,10 +134,10 @@ def test_minibatches_say_which_teams_they_hold() -> None:
     for sample in team.get(12):
         batch = sample.observations
         assert isinstance(batch, TeamMinibatch)
-        assert set(batch) == {"obs", "agent"}, "the joint observation is made for those who ask"
+        assert set(batch) == {"obs", "agent", "episode_start"}, "the joint observation is made for those who ask"
         assert batch.teams.rows is None and batch.teams.active is None
         assert th.equal(batch.teams.observations.flatten(0, 1), batch["obs"])
-        assert set(dict(batch.items())) == {"obs", "agent", "team"}
+        assert set(dict(batch.items())) == {"obs", "agent", "episode_start", "team"}
         with pytest.raises(KeyError, match="other"):
             batch["other"]
 
@@ -169,15 +169,15 @@ def test_order_is_drawn_anew_from_the_generator_that_sb3_seeds() -> None:
     assert order() != first
 
 
-def test_memory_is_one_observation_per_row_and_32_bytes() -> None:
+def test_memory_is_one_observation_per_row_and_33_bytes() -> None:
     own = spaces.Box(0, 99, (7, 7), np.uint8)
     parts = CentralizedValueWrapper(TeamVenv((9,) * 4, 10, own, lambda *_: np.zeros((7, 7)))).observation_space
     team = TeamRolloutBuffer(50, parts, spaces.Discrete(7), "cpu", n_envs=40)  # type: ignore[arg-type]
-    assert team.nbytes == 50 * 40 * (49 + 32)
+    assert team.nbytes == 50 * 40 * (49 + 33)
     assert list(team.observations) == ["obs"]
     stock = DictRolloutBuffer(50, parts, spaces.Discrete(7), "cpu", n_envs=40)  # type: ignore[arg-type]
     stock_bytes = sum(value.nbytes for value in stock.observations.values()) + 50 * 40 * 32
-    assert stock_bytes == 50 * 40 * 579
+    assert stock_bytes == 50 * 40 * 587
 
 
 def test_arrays_are_reused_and_hold_the_new_rollout() -> None:

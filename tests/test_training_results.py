@@ -42,7 +42,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         train("saf", "--seed", "0", "--env-kwargs", f"coordination:{coordination}", "--save-freq", "80")
         train("saf", "--seed", "1", "--env-kwargs", f"coordination:{coordination}")
         train("mappo", "--seed", "0", "--env-kwargs", f"coordination:{coordination}")
-    train("saf-lstm", "--seed", "0")
+    train("saf-gru", "--seed", "0")
     return folder
 
 
@@ -85,7 +85,7 @@ def test_another_level(logs: Path) -> None:
 
 
 def test_a_team_with_memory(logs: Path, tmp_path: Path) -> None:
-    assert len(enjoy(logs, "--algo", "saf-lstm", "--gif", str(tmp_path / "g.gif")).returns) == 6
+    assert len(enjoy(logs, "--algo", "saf-gru", "--gif", str(tmp_path / "g.gif")).returns) == 6
 
 
 def test_gif_mp4_and_text_show_every_step_of_the_first_game(

@@ -17,7 +17,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -92,7 +92,10 @@ TRAININGS: Final[dict[str, Callable[[], Any]]] = {
         **BUFFER,
     ),
     "supersuit": lambda: trained(PPO, "SAFPolicy", hecogrid(2, backend="supersuit", time_limit="bootstrap"), **BUFFER),
-    "lstm": lambda: trained(RecurrentPPO, "MAPPOLstmPolicy", hecogrid(2)),
+    "lstm": lambda: trained(PPO, "MAPPOPolicy", hecogrid(2), policy_kwargs={"memory": "lstm"}, **BUFFER),
+    "gru, dying": lambda: trained(
+        PPO, "SAFPolicy", sb3_saf.make_team_env(DyingGame, 3, seed=0), policy_kwargs={"memory": "gru"}, **BUFFER
+    ),
     "qplex": lambda: sb3_saf.QPLEX("QPLEXPoolPolicy", hecogrid(2), learning_starts=60, buffer_size=600, seed=0).learn(
         600
     ),

@@ -8,11 +8,27 @@ overhead of calling the critic dominates; evaluating many steps together takes a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import torch as th
 
-Step = TypeVar("Step")
+#: Rows whose values are computed at once: enough to amortise the calls, few enough for the cache.
+ROWS_AT_ONCE: Final = 1024
+
+
+class AnyStep(Protocol):
+    """Input of a critic."""
+
+    @property
+    def memory(self) -> th.Tensor | None:
+        """
+        The memory (E, M) of games before the step; None for policies without memory.
+
+        It is complete when the values of the step are computed.
+        """
+
+
+Step = TypeVar("Step", bound=AnyStep)
 #: Maps the critic's inputs of several steps to the values of each, (B, 1).
 Compute = Callable[[Sequence[Step]], list[th.Tensor]]
 

@@ -14,10 +14,20 @@ from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.buffers.later import LaterValues, compute_together
+from sb3_saf.buffers.later import ROWS_AT_ONCE, LaterValues, compute_together
 from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
-from sb3_saf.teams.checks import check_choice, check_whole_teams
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, TEAM_KEY, Array, TeamSpaces
+from sb3_saf.teams.checks import check_choice, check_count, check_whole_teams
+from sb3_saf.teams.rows import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    AGENT_KEY,
+    EPISODE_START_KEY,
+    OBS_KEY,
+    STATE_KEY,
+    TEAM_KEY,
+    Array,
+    TeamSpaces,
+)
 
 #: Arrays with one entry per step and row, without the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
@@ -25,9 +35,6 @@ _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values
 
 #: Where the return of an agent ends.
 Ends = Literal["own", "team"]
-
-#: Rows whose values are computed at once: enough to amortise the calls, few enough for the cache.
-_ROWS_AT_ONCE: Final = 1024
 
 
 class RolloutReturns:
@@ -53,6 +60,18 @@ class RolloutReturns:
         return self._rescaling
 
 
+class Sequences(NamedTuple):
+    """
+    Order in time of the teams of a minibatch: S sequences of L steps, where team ``t * S + s`` is step t of sequence s.
+
+    :param starts: (L, S, N) bool, agents whose episode begins with the step
+    :param memory: (S, M) memory of the games before the first step
+    """
+
+    starts: th.Tensor
+    memory: th.Tensor
+
+
 class WholeTeams(NamedTuple):
     """
     Teams of the rows of a minibatch.
@@ -60,11 +79,13 @@ class WholeTeams(NamedTuple):
     :param observations: (G, N, *shape) own observations, agents in index order
     :param rows: (B,) index of each row's agent among the G N agents; None if rows are these agents in order
     :param active: (G, N) bool, agents that take part; None if all do
+    :param sequences: order in time of the teams, for policies with memory; None for single steps
     """
 
     observations: th.Tensor
     rows: th.Tensor | None = None
     active: th.Tensor | None = None
+    sequences: Sequences | None = None
 
 
 class TeamMinibatch(dict[str, th.Tensor]):
@@ -106,7 +127,7 @@ class TeamMinibatch(dict[str, th.Tensor]):
         """Make ``"team"``, (B, N, *shape)."""
         if key != TEAM_KEY:
             raise KeyError(key)
-        observations, rows, _ = self.teams
+        observations, rows = self.teams.observations, self.teams.rows
         n_teams, n_agents = observations.shape[:2]
         teams = th.arange(n_teams * n_agents, device=observations.device) if rows is None else rows
         self[TEAM_KEY] = observations[teams // n_agents]
@@ -123,8 +144,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     SB3 rollout buffer for the observations of ``CentralizedValueWrapper``, passed as ``rollout_buffer_class``.
 
     - **Memory**: own observations are stored once, ``(T, E, N, *shape)`` in their own dtype. SB3's buffer stores N + 1
-      observations per row. A row of HECOGrid with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 32 bytes
-      of action, reward, value etc.; SB3's buffer takes 579 (or 25,912); see :attr:`nbytes`. Rollouts reuse the arrays.
+      observations per row. A row of HECOGrid with 10 agents takes 49 bytes of tiles (or 2,352 of pixels) and 33 bytes
+      of action, reward, value etc.; SB3's buffer takes 587 (or 25,920); see :attr:`nbytes`. Rollouts reuse the arrays.
     - **Minibatches** hold whole teams, agents in index order (:class:`TeamMinibatch`), so that each team is encoded in
       one minibatch only, and critics need no search. ``batch_size`` counts rows and is rounded down to whole teams, at
       least one: SB3's default of 64 is 60 for 5 agents. The last minibatch may be smaller.
@@ -134,6 +155,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     - **Inactive agents** (if observations have ``"active"``): minibatches omit their rows, so that loss, entropy and
       the normalisation of advantages use active rows only; ``batch_size`` is then an upper bound. Rewards paid while an
       agent waits or after its end count for its last action, see :meth:`compute_returns_and_advantage`.
+    - **Memory of policies** (``policy_kwargs={"memory": "gru"}``): minibatches are sequences of ``sequence_length``
+      steps of whole teams, through which gradients run. The memory before each sequence is that of the rollout.
     - ``"action_mask"`` is stored for each row, ``"state"`` once per game.
     - Adding rows that are not whole teams in index order raises a ValueError.
 
@@ -153,7 +176,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         rollout, for agents whose own rewards differ in scale: PPO normalises over the rows of all agents, where the one
         that is paid more drowns the others. A rollout in which agents of a team were paid alike stays as it is, and so
         does every one with None
-    :raises ValueError: if the space is not that of teams, the rows are not whole teams, or ``ends`` is invalid
+    :param sequence_length: L, steps of a sequence for policies with memory, a divisor of ``buffer_size``; None for
+        whole rollouts
+    :raises ValueError: if the space is not that of teams, the rows are not whole teams, ``ends`` is invalid, or
+        ``sequence_length`` does not divide the rollout
     """
 
     #: Buffers without a policy, by the identity of their space: SB3 makes an algorithm's buffer, then its policy.
@@ -170,11 +196,19 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         n_envs: int = 1,
         ends: Ends = "own",
         normalize_advantage: Literal["agent"] | None = None,
+        sequence_length: int | None = None,
     ) -> None:
         check_choice("ends", ends, get_args(Ends))
         check_choice("normalize_advantage", normalize_advantage, ("agent", None))
         self.ends = ends
         self.normalize_advantage = normalize_advantage
+        self.sequence_length = buffer_size if sequence_length is None else sequence_length
+        check_count("sequence_length", self.sequence_length)
+        if buffer_size % self.sequence_length:
+            raise ValueError(
+                f"expected sequence_length to divide the {buffer_size} steps of a rollout (n_steps), got "
+                f"{sequence_length}; choose a divisor, or None for whole rollouts"
+            )
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)
         self.n_agents = self.team_spaces.n_agents
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
@@ -183,6 +217,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._returns = RolloutReturns(np.zeros(0), self._agents[:0])
         self._later: list[tuple[int, LaterValues[Any]]] = []
         self._waiting[id(observation_space)] = self
+        #: (T / L, E, M), the memory of games before each sequence, of policies that have one.
+        self.memories: th.Tensor | None = None
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
     @classmethod
@@ -201,6 +237,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             self._allocated = True
         self.generator_ready = False
         self._later.clear()
+        self.memories = None
         BaseBuffer.reset(self)
 
     def _allocate_by_game(self) -> None:
@@ -208,7 +245,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._agents_of_steps = th.arange(self.n_agents, device=self.device).repeat(self.buffer_size * self.n_games, 1)
         self.active: Array | None = None
         self.states: Array | None = None
+        self.starts: Array | None = None
         shape = (self.buffer_size, self.n_games)
+        if self.team_spaces.has_starts:
+            self.starts = np.zeros((self.buffer_size, self.n_envs, 1), dtype=np.int8)
         if self.team_spaces.active is not None:
             self.active = np.ones((*shape, self.n_agents), dtype=np.int8)
         if self.team_spaces.state is not None:
@@ -218,8 +258,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     @property
     def nbytes(self) -> int:
         """Size of the rollout in bytes."""
-        by_game = [array for array in (self.active, self.states) if array is not None]
-        arrays = [*self.observations.values(), *by_game, *(getattr(self, name) for name in _ROW_ARRAYS)]
+        optional = [array for array in (self.active, self.states, self.starts) if array is not None]
+        arrays = [*self.observations.values(), *optional, *(getattr(self, name) for name in _ROW_ARRAYS)]
         return sum(array.nbytes for array in arrays)
 
     def add(  # type: ignore[override]
@@ -246,17 +286,22 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
                 array[self.pos] = self._of_games(obs, key, array)
+        if self.starts is not None:
+            self.starts[self.pos] = np.reshape(obs[EPISODE_START_KEY], (-1, 1))
         if isinstance(value, LaterValues):
             self._later.append((self.pos, value))
             value = log_prob  # placeholder: compute_returns_and_advantage overwrites it
         super().add(obs, action, reward, episode_start, value, log_prob)
 
     def _compute_later_values(self) -> None:
-        at_once = max(1, _ROWS_AT_ONCE // self.n_envs)
+        at_once = max(1, ROWS_AT_ONCE // self.n_envs)
         for start in range(0, len(self._later), at_once):
             positions, steps = zip(*self._later[start : start + at_once], strict=True)
             for position, values in zip(positions, compute_together(steps), strict=True):
                 self.values[position] = values.reshape(-1).cpu().numpy()
+        cuts = [value.step.memory for _, value in self._later[:: self.sequence_length]]
+        memories = [memory for memory in cuts if memory is not None]
+        self.memories = th.stack(memories) if memories else None
         self._later.clear()
 
     def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
@@ -381,11 +426,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         teams_per_batch = self.buffer_size * self.n_games
         if batch_size is not None:
             teams_per_batch = max(1, batch_size // self.n_agents)
-        teams = self._playing_teams()
+        sequences = self._playing_teams()[:, np.newaxis]
+        if self.memories is not None:
+            stride = self.sequence_length * self.n_games
+            firsts = np.unique(sequences // stride * stride + sequences % self.n_games)
+            sequences = firsts[:, np.newaxis] + np.arange(0, stride, self.n_games)
         # SB3 seeds only NumPy's global generator from the run's seed.
-        order = teams[np.random.permutation(len(teams))]  # noqa: NPY002
-        for start in range(0, len(order), teams_per_batch):
-            yield self._get_samples(order[start : start + teams_per_batch])
+        order = sequences[np.random.permutation(len(sequences))]  # noqa: NPY002
+        per_batch = max(1, teams_per_batch // sequences.shape[1])
+        for start in range(0, len(order), per_batch):
+            yield self._get_samples(order[start : start + per_batch].T)
 
     def _playing_teams(self) -> npt.NDArray[np.int64]:
         """Return team steps with at least one active agent, each ``step * E + game``."""
@@ -405,10 +455,12 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         Return the active rows of the given team steps.
 
-        :param batch_inds: (K,) each is ``step * E + game``
+        :param batch_inds: (L, S) team steps of S sequences, each ``step * E + game``
         :param env: unused, as in SB3's buffers for rollouts
-        :return: K * N rows without those of inactive agents
+        :return: L * S * N rows without those of inactive agents
         """
+        sequences = None if self.memories is None else self._sequences(batch_inds)
+        batch_inds = batch_inds.reshape(-1)
         parts = {
             name: self._gather(getattr(self, name), batch_inds).flatten(end_dim=1)
             for name in ("actions", "values", "log_probs", "advantages", "returns")
@@ -424,6 +476,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             own.reshape(*own.shape[:2], *self.team_spaces.own_shape),
             rows,
             None if active is None else self.to_torch(active != 0, copy=False),
+            sequences,
         )
         return DictRolloutBufferSamples(
             observations=TeamMinibatch(teams, entries, self._returns, parts["values"]),
@@ -433,6 +486,14 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             advantages=parts["advantages"],
             returns=parts["returns"],
         )
+
+    def _sequences(self, team_steps: npt.NDArray[np.int64]) -> Sequences:
+        """Return beginnings and memories of the sequences of team steps (L, S)."""
+        assert self.memories is not None and self.starts is not None
+        starts = self._gather(self.starts, team_steps.reshape(-1)).view(*team_steps.shape, self.n_agents) != 0
+        cut, game = team_steps[0] // (self.sequence_length * self.n_games), team_steps[0] % self.n_games
+        rows = th.as_tensor(cut * self.n_games + game, device=self.memories.device)
+        return Sequences(starts, self.memories.flatten(0, 1)[rows].to(self.device))
 
     def _of_team_steps(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
         """Select team steps: (T, E, ...) -> (K, ...)."""
@@ -448,6 +509,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         entries = {AGENT_KEY: self._agents_of_steps[: len(team_steps)].reshape(-1, 1)}
         if ACTION_MASK_KEY in self.observations:
             entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
+        if self.starts is not None:
+            entries[EPISODE_START_KEY] = self._gather(self.starts, team_steps).flatten(end_dim=1).long()
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
                 by_game = self.to_torch(self._of_team_steps(array, team_steps), copy=False)

@@ -11,7 +11,7 @@ import random
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch as th
@@ -20,6 +20,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
 from sb3_saf.checkpoints.runs import constructor_arguments
+from sb3_saf.policies.memory import RememberingPolicy
 from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.trees import Tree
@@ -36,7 +37,7 @@ def require_resumable(model: BaseAlgorithm) -> None:
     """Raise CheckpointError for algorithms whose complete state is not accessible, naming the supported ones."""
     if not isinstance(model, (OnPolicyAlgorithm, QPLEX)):
         raise CheckpointError(
-            "exact resume is for PPO, A2C, TRPO, RecurrentPPO, MaskablePPO and QPLEX, got "
+            "exact resume is for PPO, A2C, TRPO, MaskablePPO and QPLEX, got "
             f"{type(model).__name__}; train it with model.learn and SB3's CheckpointCallback, which begins new episodes"
         )
 
@@ -49,13 +50,12 @@ def is_off_policy(model: BaseAlgorithm) -> bool:
 def model_state(model: BaseAlgorithm) -> dict[str, Tree]:
     """Return weights, optimiser, counters, last observations, memories, averages and replay at a rollout's start."""
     replay = getattr(model, "replay_buffer", None)
-    lstm = getattr(model, "_last_lstm_states", None)
     return {
         "weights": dict(model.policy.state_dict()),
         "optimizer": model.policy.optimizer.state_dict(),
         "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
         "last": {name: getattr(model, name) for name in _LAST},
-        "lstm": None if lstm is None else [list(pair) for pair in lstm],  # of actor and critic
+        "memory": model.policy.checkpoint_state() if isinstance(model.policy, RememberingPolicy) else None,
         "agent_state": getattr(model, "agent_state", None),
         "replay": None if replay is None else replay.checkpoint_state(),
         **{name: [dict(i) if isinstance(i, dict) else i for i in getattr(model, name) or ()] for name in _INFO_BUFFERS},
@@ -78,10 +78,8 @@ def load_model_state(model: BaseAlgorithm, state: Tree) -> None:
         assert isinstance(model.replay_buffer, TeamReplayBuffer)
         model.replay_buffer.load_checkpoint_state(state["replay"])
         model.agent_state = state["agent_state"]
-    if state["lstm"] is not None:
-        own: Any = model._last_lstm_states  # type: ignore[attr-defined]
-        pairs = (tuple(tensor.to(model.device) for tensor in pair) for pair in state["lstm"])
-        model._last_lstm_states = type(own)(*pairs)  # type: ignore[attr-defined]
+    if isinstance(model.policy, RememberingPolicy):
+        model.policy.load_checkpoint_state(state["memory"])
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
     AGENT_KEY,
+    EPISODE_START_KEY,
     OBS_KEY,
     STATE_KEY,
     TEAM_KEY,
@@ -27,6 +28,7 @@ from sb3_saf.teams.rows import (
     TRUNCATED,
     Array,
     TeamSpaces,
+    TerminalRow,
     allows_nothing,
     channels_first,
     first_choices,
@@ -45,13 +47,14 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
 
     The observation of a row becomes a Dict:
 
-    ========= ================ ======================================================================
-    key       shape of a row   content
-    ========= ================ ======================================================================
-    ``obs``   ``(*shape)``     the agent's own observation, the only input of its policy
-    ``team``  ``(N, *shape)``  own observations of all agents of its team, in index order (always a Box)
-    ``agent`` ``()``           index of the agent in its team, Discrete(N)
-    ========= ================ ======================================================================
+    ================= ================ ======================================================================
+    key               shape of a row   content
+    ================= ================ ======================================================================
+    ``obs``           ``(*shape)``     the agent's own observation, the only input of its policy
+    ``team``          ``(N, *shape)``  own observations of all agents of its team, in index order (always a Box)
+    ``agent``         ``()``           index of the agent in its team, Discrete(N)
+    ``episode_start`` ``()``           1 if the agent took no part in the step before, Discrete(2): where memory begins
+    ================= ================ ======================================================================
 
     Environments with signals have more keys (:class:`TeamSpaces` defines how a VecEnv provides them; ``make_team_env``
     does so for any PettingZoo environment):
@@ -89,7 +92,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         conversions: tuple[AgentConversion, ...] | None = getattr(venv, "conversions", None)
         if conversions is not None and own is not raw.own:
             conversions = tuple(one.with_channels_first() for one in conversions)
-        team = TeamSpaces.of(own, n_agents, raw.has_active, raw.n_masked_actions, state, names, conversions)
+        team = TeamSpaces.of(own, n_agents, raw.has_active, raw.n_masked_actions, state, names, conversions, True)
         if _sb3_would_transpose(team):
             venv = _protected_from_transposition(venv, n_agents)
             raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
@@ -100,6 +103,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
         self._normalization = unwrap_vec_normalize(venv)
         self._is_monitored = is_vecenv_wrapped(venv, TeamMonitor)
+        #: (E, N), the agents that took part in the last step of episodes that go on.
+        self._playing = np.zeros((self.n_games, team.n_agents), dtype=np.int8)
         self._n_steps = 0
         self._masks_shown: Array | None = None
         self._has_asked_for_masks = False
@@ -131,15 +136,17 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return method_name == _ACTION_MASKS and self.team_spaces.action_mask is not None
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the step count and the present action masks."""
-        return {"n_steps": self._n_steps, "masks_shown": self._masks_shown}
+        """Return the step count, the present action masks and the agents that take part."""
+        return {"n_steps": self._n_steps, "masks_shown": self._masks_shown, "playing": self._playing}
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a state (see :meth:`checkpoint_state`)."""
         self._n_steps, self._masks_shown = state["n_steps"], state["masks_shown"]
+        self._playing = state["playing"]
 
     def reset(self) -> dict[str, Array]:
         """Start new episodes in all games and return the Dict observation of all rows."""
+        self._playing = np.zeros_like(self._playing)
         return self._joint_observation(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -158,8 +165,9 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         if not self._is_monitored:
             check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
-        joint, row_dones = self._joint_observation(obs), np.repeat(ended, self.n_agents)
         infos = self._complete_infos(infos, ended)
+        self._playing = self._playing * ~ended[:, np.newaxis]
+        joint, row_dones = self._joint_observation(obs), np.repeat(ended, self.n_agents)
         if self.time_limit == "bootstrap" and self.team_spaces.has_active:
             self._end_alone(joint, row_dones, infos)
         # Copies, because SB3 adds bootstrapped values to the rewards in place.
@@ -185,7 +193,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             last = {key: part[row].copy() for key, part in joint.items()}
             last[OBS_KEY] = own if own.shape == self.team_spaces.own_shape else np.moveaxis(own, -1, 0)
             last[TEAM_KEY][agent], last[ACTIVE_KEY][agent] = last[OBS_KEY], 1
-            row_dones[row], infos[row] = True, {**info, TERMINAL_OBSERVATION: last}
+            row_dones[row], infos[row] = True, {**info, TERMINAL_OBSERVATION: TerminalRow(last, row)}
 
     def _warn_of_unused_masks(self) -> None:
         """Warn if games have action masks that are neither in the rows nor queried."""
@@ -205,6 +213,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             parts[OBS_KEY][parts[ACTIVE_KEY].reshape(-1) == 0] = 0
         teams = parts[OBS_KEY].reshape(self.n_games, *self.team_spaces.team.shape)
         joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0), AGENT_KEY: self._agents.copy()}
+        joint[EPISODE_START_KEY] = (self._playing == 0).reshape(-1).astype(np.int64)
+        self._playing = parts.get(ACTIVE_KEY, np.ones_like(self._playing))
         if ACTIVE_KEY in parts:
             joint[ACTIVE_KEY] = np.repeat(parts[ACTIVE_KEY], self.n_agents, axis=0)
         self._masks_shown = parts.get(ACTION_MASK_KEY)
@@ -271,7 +281,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         rows = np.flatnonzero(ended.repeat(self.n_agents)).tolist()
         last = self._terminal_parts([infos[row] for row in rows], np.flatnonzero(ended).tolist())
         for index, row in enumerate(rows):
-            infos[row] = self._terminal_info(infos[row], last, index)
+            infos[row] = self._terminal_info(infos[row], last, index, row)
         return infos
 
     def _terminal_parts(self, infos: list[dict[str, Any]], games: list[int]) -> dict[str, Array]:
@@ -307,10 +317,11 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"got {sorted(set(shapes))}; make the environment return what its space promises"
             ) from None
 
-    def _terminal_info(self, info: dict[str, Any], last: dict[str, Array], index: int) -> dict[str, Any]:
+    def _terminal_info(self, info: dict[str, Any], last: dict[str, Array], index: int, row: int) -> dict[str, Any]:
         game, agent = divmod(index, self.n_agents)
-        row = {key: part[game if key in (TEAM_KEY, ACTIVE_KEY) else index] for key, part in last.items()}
-        info = {**info, TERMINAL_OBSERVATION: {**row, AGENT_KEY: np.int64(agent)}}
+        entries = {key: part[game if key in (TEAM_KEY, ACTIVE_KEY) else index] for key, part in last.items()}
+        entries |= {AGENT_KEY: np.int64(agent), EPISODE_START_KEY: np.int64(self._playing.flat[row] == 0)}
+        info = {**info, TERMINAL_OBSERVATION: TerminalRow(entries, row)}
         if self.time_limit == "terminal" and TRUNCATED in info:
             info[TRUNCATED] = False
         return info

@@ -38,7 +38,6 @@ from sb3_saf.networks.distributions import (
 )
 from sb3_saf.networks.encoders import encoded
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
-from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.errors import ExportError
@@ -70,7 +69,7 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
     reads the folder. Actors of models with action masks need a mask with each observation, those of models with memory
     a memory (see :class:`~sb3_saf.Actor`). Files of an earlier export are replaced, each atomically.
 
-    :param model: an algorithm with a SAF, MAPPO or IPPO policy, also recurrent or maskable; QPLEX without memory; or
+    :param model: an algorithm with a SAF, MAPPO or IPPO policy, also with memory or maskable; QPLEX without memory; or
         the policy itself
     :param folder: output folder
     :return: the folder
@@ -110,10 +109,10 @@ def _checked_policy(model: object) -> ExportablePolicy:
             f"expected model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got {type(policy).__name__}; "
             "policies of Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
-    if getattr(policy, "memory", None) is not None:
+    if isinstance(policy, QPLEXPolicy) and policy.memory is not None:
         raise ExportError(
             f"{type(policy).__name__} cannot be exported: its memory reads the agent's last action, too; act with "
-            "model.predict, which carries the state, or train RecurrentPPO's policies, whose memory can be exported"
+            "model.predict, which carries the state, or train PPO with memory, which can be exported"
         )
     if type(policy.actor) not in (SinglePolicy, PolicyPool):
         raise ExportError(f"expected the actor SinglePolicy or PolicyPool, got {type(policy.actor).__name__}")
@@ -166,26 +165,6 @@ def _script() -> str:
 # --- the network ------------------------------------------------------------------------------------------------------
 
 
-class LstmStep(nn.Module):
-    """
-    One step of an LSTM; the states of rows are (K, layers, H).
-
-    :param lstm: the LSTM
-    """
-
-    def __init__(self, lstm: nn.LSTM):
-        super().__init__()
-        self.lstm = lstm
-        shape = lstm.num_layers, lstm.hidden_size
-        self.state_shapes: dict[str, tuple[int, ...]] = {"hidden": shape, "cell": shape}
-
-    def forward(self, features: th.Tensor, states: list[th.Tensor]) -> tuple[th.Tensor, list[th.Tensor]]:
-        """Return outputs (K, H) of features (K, d), and the next states."""
-        hidden, cell = (state.transpose(0, 1).contiguous() for state in states)
-        outputs, after = self.lstm(features.unsqueeze(0), (hidden, cell))
-        return outputs.squeeze(0), [state.transpose(0, 1) for state in after]
-
-
 class ActingNetwork(nn.Module):
     """
     From raw own observations of an agent to its actions; random numbers are inputs.
@@ -210,9 +189,11 @@ class ActingNetwork(nn.Module):
         self.n_agents, self.normalize_images = policy.team_spaces.n_agents, policy.normalize_images
         self.greedy = isinstance(policy, QPLEXPolicy)
         self.has_masks = policy.team_spaces.action_mask is not None or isinstance(policy, TeamMaskablePolicy)
-        memory = LstmStep(policy.lstm_actor) if isinstance(policy, TeamRecurrentPolicy) else None
+        memory = policy.actor_memory if isinstance(policy, TeamPolicy) else None
         self.extractor, self.actor, self.memory = copy.deepcopy((policy.features_extractor, policy.actor, memory))
-        self.state_shapes = {} if self.memory is None else self.memory.state_shapes
+        self.state_shapes: dict[str, tuple[int, ...]] = {}
+        if self.memory is not None:
+            self.state_shapes["memory"] = (self.memory.state_dim,)
         if isinstance(self.action_space, spaces.Box):
             self.register_buffer("low", th.as_tensor(self.action_space.low, dtype=th.float32))
             self.register_buffer("high", th.as_tensor(self.action_space.high, dtype=th.float32))
@@ -264,7 +245,8 @@ class ActingNetwork(nn.Module):
         """Return the outputs for features (rows, d) of the observations, and the other inputs."""
         states: list[th.Tensor] = []
         if self.memory is not None:
-            features, states = self.memory(features, [inputs[name] for name in self.state_shapes])
+            features, after = self.memory.step(features, inputs["memory"])
+            states.append(after)
         output = self.actor.evaluate(features, inputs.get("agent"))
         if "action_mask" in inputs:
             output = output._replace(

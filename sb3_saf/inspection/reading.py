@@ -17,17 +17,16 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.networks.actor import PolicyPool
-from sb3_saf.networks.critic import JointStates, TeamStates
 from sb3_saf.networks.distributions import mixture_log_probs
 from sb3_saf.policies.base import TeamPolicy
-from sb3_saf.policies.recurrent import LstmStates, RecurrentCritic, TeamRecurrentPolicy
-from sb3_saf.policies.saf import SAFStates
+from sb3_saf.policies.memory import RunningMemory
+from sb3_saf.policies.saf import SAFCritic
 from sb3_saf.qplex.learning import greedy_q_tot
 from sb3_saf.qplex.policies import QPLEXPolicy, State
+from sb3_saf.teams.rows import EPISODE_START_KEY, TerminalRow
 
 Tensors = dict[str, th.Tensor]
 Bools = npt.NDArray[np.bool_]
@@ -85,16 +84,14 @@ def reader_of(policy: OurPolicy, n_rows: int, deterministic: bool = False) -> Po
     """
     if isinstance(policy, QPLEXPolicy):
         return QReader(policy)
-    if isinstance(policy, TeamRecurrentPolicy):
-        return RecurrentPolicyReader(policy, n_rows, deterministic)
     return PolicyReader(policy, deterministic)
 
 
 class PolicyReader:
     """
-    Act with an actor-critic policy and read its outputs.
+    Act with an actor-critic policy and read its outputs. Its memory of the games of a training is left alone.
 
-    :param policy: policy of SAF, MAPPO or IPPO, with or without action masks
+    :param policy: policy of SAF, MAPPO or IPPO, with or without action masks or memory
     :param deterministic: whether it takes its most likely actions
     """
 
@@ -104,7 +101,11 @@ class PolicyReader:
     def __init__(self, policy: TeamPolicy, deterministic: bool = False):
         self.policy = policy
         self.deterministic = deterministic
-        self.source = _saf_states(policy)
+        critic = policy.value_net
+        self.source = critic if isinstance(critic, SAFCritic) else None
+        self._memory = RunningMemory()
+        # Messages are replaced at every step, so that the critic's memory depends on them, too.
+        self._without = {name: RunningMemory() for name in REPLACEMENTS}
 
     def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
         """
@@ -115,8 +116,13 @@ class PolicyReader:
         :param action_masks: (B, M) for policies of MaskablePPO
         """
         arguments = {} if action_masks is None else {"action_masks": action_masks}
-        actions, values, _ = self.policy(obs, deterministic=self.deterministic, **arguments)
-        return self._reading(obs, actions, values, self.policy.extract_features(obs), action_masks)
+        latents, before = self.policy.extract_features(obs), self._memory.actor
+        with self.policy.remembering(self._memory):
+            actions, values, _ = self.policy(obs, deterministic=self.deterministic, **arguments)
+            values = values.flatten()
+        if self.policy.actor_memory is not None:
+            latents, _ = self.policy.remember(latents, before, obs[EPISODE_START_KEY] != 0)
+        return self._reading(obs, actions, values, latents, action_masks)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """
@@ -126,7 +132,8 @@ class PolicyReader:
         :param rows: (K,) their indices among the rows of the last step
         :return: (K,)
         """
-        values: th.Tensor = self.policy.predict_values(obs)
+        with self.policy.remembering(self._memory):
+            values: th.Tensor = self.policy.predict_values(TerminalRow(obs, rows))
         return values.flatten()
 
     def _reading(
@@ -138,7 +145,7 @@ class PolicyReader:
         probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
         array = actions.cpu().numpy()
         clipped = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
-        reading = StepReading(clipped, values.flatten(), probabilities)
+        reading = StepReading(clipped, values, probabilities)
         if isinstance(policy.actor, PolicyPool):
             reading = reading._replace(pool_weights=log_weights.exp(), pool_actions=parameters)
         if self.source is None:
@@ -161,12 +168,15 @@ class PolicyReader:
 
     def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
         """Compute values (B,) with replaced messages."""
-        values: th.Tensor = self.policy.predict_values(obs)
-        return values.flatten()
+        if self.policy.actor_memory is None:
+            return self.policy.predict_values(obs).flatten()
+        with self.policy.remembering(self._without[name]):
+            values: th.Tensor = self.policy(obs, deterministic=True)[1]
+            return values.flatten()
 
 
 @contextmanager
-def _other_messages(source: SAFStates, replacement: Replacement) -> Iterator[None]:
+def _other_messages(source: SAFCritic, replacement: Replacement) -> Iterator[None]:
     """Replace the messages that a critic reads."""
 
     def replaced(_: th.nn.Module, inputs: tuple[th.Tensor, ...]) -> th.Tensor:
@@ -178,46 +188,6 @@ def _other_messages(source: SAFStates, replacement: Replacement) -> Iterator[Non
         yield
     finally:
         hook.remove()
-
-
-class RecurrentPolicyReader(PolicyReader):
-    """
-    Reader of a policy with memory. Messages are replaced at every step, so the critic's memory depends on them, too.
-
-    :param policy: policy of RecurrentPPO
-    :param n_rows: B
-    :param deterministic: whether it takes its most likely actions
-    """
-
-    policy: TeamRecurrentPolicy
-
-    def __init__(self, policy: TeamRecurrentPolicy, n_rows: int, deterministic: bool = False):
-        super().__init__(policy, deterministic)
-        lstm = policy.lstm_actor
-        blank = th.zeros(lstm.num_layers, n_rows, lstm.hidden_size, device=policy.device)
-        self._before = self._states = RNNStates((blank, blank), (blank, blank))
-        self._starts = th.ones(n_rows, device=policy.device)
-        self._without: dict[Replacement, LstmStates] = dict.fromkeys(REPLACEMENTS, (blank, blank))
-
-    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
-        """See :class:`PolicyReader`."""
-        policy, self._before = self.policy, self._states
-        self._starts = th.as_tensor(starts, dtype=th.float32, device=policy.device)
-        actions, values, _, self._states = policy(obs, self._before, self._starts, deterministic=self.deterministic)
-        latent, _ = policy.remember(policy.extract_features(obs), self._before.pi, self._starts)
-        return self._reading(obs, actions, values, latent, None)
-
-    def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
-        """See :class:`PolicyReader`."""
-        hidden, cell = (states[:, rows].contiguous() for states in self._states.vf)
-        going_on = th.zeros(len(rows), device=self.policy.device)
-        return self.policy.predict_values(obs, (hidden, cell), going_on).flatten()
-
-    def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
-        states = RNNStates(self._before.pi, self._without[name])
-        _, values, _, following = self.policy(obs, states, self._starts, deterministic=True)
-        self._without[name] = following.vf
-        return values.flatten()
 
 
 class QReader:
@@ -253,12 +223,3 @@ class QReader:
         """See :class:`PolicyReader`."""
         state = None if self._state is None else tuple(part[rows] for part in self._state)
         return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state).values)
-
-
-def _saf_states(policy: TeamPolicy) -> SAFStates | None:
-    """Return the part of the critic that has a knowledge source, if any."""
-    critic: Any = policy.value_net
-    states: TeamStates | None = critic.team_states if isinstance(critic, RecurrentCritic) else critic
-    if isinstance(states, JointStates):
-        states = states.members
-    return states if isinstance(states, SAFStates) else None

@@ -13,75 +13,57 @@ from typing import Literal, cast
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.layers import AgentHeads, NetworkSpec, Rows, gather, mlp, side_by_side
+from sb3_saf.networks.layers import AgentHeads, NetworkSpec, Rows, mlp, side_by_side
+from sb3_saf.networks.memory import Memory
 
 #: One head for all agents, or one for each.
 Heads = Literal["shared", "per_agent"]
 
 
 class TeamCritic(nn.Module, ABC):
-    """Base of critics that read the observations of the whole team."""
+    """
+    Base of critics that read the observations of the whole team: states of the agents, or one of the team, then values.
+
+    A memory is between the two: values depend on what it returns for the states of successive steps.
+
+    :param n_states: U, states of a team: N, or 1
+    :param memory: the memory of each state; None for none
+    """
+
+    memory: Memory | None
+
+    def __init__(self, n_states: int, memory: Memory | None = None):
+        super().__init__()
+        self.n_states = n_states
+        self.memory = memory
 
     @abstractmethod
-    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+        """
+        Return the states of every team.
+
+        :param features: (K, d) features of own observations
+        :param teams: (G, N), index into ``features`` of each agent of a team
+        :param active: (G, N) bool, agents that take part; all if None
+        :return: (G, U, S)
+        """
+
+    @abstractmethod
+    def values(self, states: th.Tensor) -> th.Tensor:
         """
         Return the value of every agent of every team.
 
-        :param features: (K, d) features of own observations
-        :param teams: (G, N), index into ``features`` of each agent of a team
-        :param active: (G, N) bool, agents that take part; all if None
+        :param states: (G, U, S) states, or (G, U, H) of their memory
         :return: (G, N)
         """
 
-
-class TeamStates(nn.Module, ABC):
-    """
-    Base of modules that compute a critic's state of each agent: the input of its value head, or of its LSTM.
-
-    :param states_dim: S, size of a state
-    """
-
-    def __init__(self, states_dim: int):
-        super().__init__()
-        self.states_dim = states_dim
-
-    @abstractmethod
-    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """
-        Return the state of every agent of every team.
+        Return the value of every agent of every team, without memory; arguments as in :meth:`states`.
 
-        :param features: (K, d) features of own observations
-        :param teams: (G, N), index into ``features`` of each agent of a team
-        :param active: (G, N) bool, agents that take part; all if None
-        :return: (G, N, S)
+        :return: (G, N)
         """
-
-
-class JointStates(TeamStates):
-    """
-    An agent's state is the concatenation of its team's states and its one-hot index.
-
-    :param features_dim: d
-    :param n_agents: N
-    :param agent_identity: False omits the one-hot index: all agents of a team then have the same state
-    :param members: computes each agent's own state, of size d; None for the features of its own observation
-    """
-
-    def __init__(self, features_dim: int, n_agents: int, agent_identity: bool, members: TeamStates | None = None):
-        super().__init__(features_dim * n_agents + (n_agents if agent_identity else 0))
-        self.agent_identity = agent_identity
-        self.members = members
-
-    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`TeamStates`; inactive agents are read as zeros."""
-        members = gather(features, teams) if self.members is None else self.members.states(features, teams, active)
-        if active is not None:
-            members = members * active.unsqueeze(2)
-        n_teams, n_agents, _ = members.shape
-        joint = members.flatten(1).unsqueeze(1).expand(-1, n_agents, -1)
-        if not self.agent_identity:
-            return joint
-        return th.cat([joint, th.eye(n_agents, device=joint.device).expand(n_teams, -1, -1)], dim=2)
+        return self.values(self.states(features, teams, active))
 
 
 class StateCritic(nn.Module, ABC):

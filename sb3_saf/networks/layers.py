@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 import torch as th
 from torch import nn
 
+from sb3_saf.networks.memory import Memory, MemoryName
 from sb3_saf.networks.tanh import Tanh
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ class NetworkSpec(NamedTuple):
     :param activation_fn: activation of hidden layers
     :param log_std_init: first log standard deviation, Box actions only
     :param state_space: space of the game's state if rows have it
+    :param memory: kind of the critic's memory; None for none
+    :param memory_size: size of the critic's memory
     """
 
     features_dim: int
@@ -46,6 +49,12 @@ class NetworkSpec(NamedTuple):
     activation_fn: type[nn.Module]
     log_std_init: float
     state_space: spaces.Space[Any] | None = None
+    memory: MemoryName | None = None
+    memory_size: int = 0
+
+    def critic_memory(self, inputs_dim: int) -> Memory | None:
+        """Make the critic's memory over states of size ``inputs_dim``, if it has one."""
+        return None if self.memory is None else Memory(self.memory, inputs_dim, self.memory_size)
 
 
 class InOrder(NamedTuple):
@@ -157,7 +166,7 @@ def _deeper(group: Sequence[nn.Sequential], hidden: th.Tensor) -> th.Tensor:
 
 def orthogonal_init(module: nn.Module) -> None:
     """
-    Initialise every linear and convolutional layer: orthogonal weights, zero bias.
+    Initialise every linear and convolutional layer, and every memory: orthogonal weights, zero bias.
 
     :param module: layers of type :class:`Linear` use their own gain, others that of hidden layers
     """
@@ -166,6 +175,8 @@ def orthogonal_init(module: nn.Module) -> None:
             nn.init.orthogonal_(layer.weight, gain=layer.gain if isinstance(layer, Linear) else HIDDEN_GAIN)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
+        elif isinstance(layer, Memory):
+            layer.orthogonal_init()
 
 
 class AgentHeads(nn.Module):

@@ -13,9 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from inspect import signature
-from typing import Any, ClassVar, Final, Literal, NamedTuple, NoReturn
+from typing import Any, ClassVar, Final, Literal, NoReturn
 
-import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
@@ -28,19 +27,19 @@ from torch import nn
 from sb3_saf.buffers.later import LaterValues
 from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
-from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
+from sb3_saf.networks.critic import StateCritic, TeamCritic
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
-from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, joined_rows, joined_teams
+from sb3_saf.networks.memory import Memory, MemoryName
+from sb3_saf.networks.row_encoder import EncodedRows, joined_rows, joined_teams
 from sb3_saf.networks.value_normalizer import ValueNormalizer
+from sb3_saf.policies.memory import Encoded, Masks, RememberingPolicy, Step, step_of
 from sb3_saf.policies.parts import TeamParts
-from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, entry_of, pop_named
+from sb3_saf.policies.rows import ChunkSize, entry_of, pop_named
 from sb3_saf.teams.checks import check_choice
-from sb3_saf.teams.rows import ACTIVE_KEY, AGENT_KEY, STATE_KEY
+from sb3_saf.teams.rows import STATE_KEY
 
-#: Action masks of MaskablePPO, (B, M).
-Masks = npt.NDArray[Any] | th.Tensor
 #: A head of the actor: (K, d) features and (K,) agents or None, to (K, ...).
 Head = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
@@ -50,31 +49,7 @@ NetArch = list[int] | dict[str, list[int]]
 _SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
 
 
-class Encoded(NamedTuple):
-    """
-    Encoded rows.
-
-    :param own: encoded own observations of the rows
-    :param teams: encoded teams of the rows; None if the critic does not read them
-    """
-
-    own: EncodedRows
-    teams: EncodedTeams | None
-
-
-class Step(NamedTuple):
-    """
-    Critic's input of one step of all games.
-
-    :param obs: entries of the rows (agent indices, active agents)
-    :param encoded: their encoded observations
-    """
-
-    obs: dict[str, th.Tensor]
-    encoded: Encoded
-
-
-class TeamPolicy(TeamRowsPolicy):
+class TeamPolicy(RememberingPolicy):
     """
     Base of policies on rows of teams: one row is one agent in one game at one step.
 
@@ -87,6 +62,12 @@ class TeamPolicy(TeamRowsPolicy):
     With ``action_mask`` in observations, illegal actions have probability zero in every policy of a pool, hence in the
     mixture; entropies are over legal actions. ``predict`` then needs the mask beside ``obs``. With ``active``, critics
     ignore inactive agents, and the value of an inactive agent is exactly zero.
+
+    With ``memory``, the actor's heads (the selection of a pool, too) read a GRU or an LSTM over the agent's own
+    observations in its episode, and the critic has one of its own over its states. It needs
+    ``rollout_buffer_class=TeamRolloutBuffer``, whose minibatches are then sequences. The memory of the games that are
+    played advances with every :meth:`forward`, and begins where rows have ``episode_start``; :meth:`predict` takes and
+    returns it as SB3's ``state``, (B, Ma).
 
     A policy also takes the fields of its ``parts_class`` by keyword.
 
@@ -103,6 +84,9 @@ class TeamPolicy(TeamRowsPolicy):
         ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
         and variance of each agent's own returns, for agents whose rewards differ in scale. The policy's values,
         ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in all cases
+    :param memory: ``"gru"``, ``"lstm"``, or None for policies of the present observation
+    :param memory_size: H, size of the actor's memory and of the critic's
+    :param critic_memory: whether the critic of a policy with memory has one, too
     :param use_sde: must not be True. SB3's algorithms pass False: their policy warns if they have a buffer of SB3's own
     :param share_features_extractor: must be True: actor and critic always share the encoder
     :param features_extractor_class: encoder, built for the space of ``obs``
@@ -116,15 +100,12 @@ class TeamPolicy(TeamRowsPolicy):
     parts_class: ClassVar[type[TeamParts]]
 
     actor: ActorNetwork
-    value_net: OwnValueHead | TeamCritic | StateCritic
     value_normalizer: ValueNormalizer | None
     features_dim: int
     net_arch: NetArch
     activation_fn: type[nn.Module]
     log_std_init: float
     ortho_init: bool
-    #: Whether the algorithm supports TeamRolloutBuffer, which ``normalize_values`` needs.
-    normalizes_values: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -136,6 +117,9 @@ class TeamPolicy(TeamRowsPolicy):
         encode_once: bool | None = None,
         chunk_size: ChunkSize = "auto",
         normalize_values: bool | Literal["agent"] = False,
+        memory: MemoryName | None = None,
+        memory_size: int = 64,
+        critic_memory: bool = True,
         use_sde: bool | None = None,
         share_features_extractor: bool = True,
         features_extractor_class: type[BaseFeaturesExtractor] = ObservationEncoder,
@@ -163,6 +147,7 @@ class TeamPolicy(TeamRowsPolicy):
             )
         self.normalize_values = normalize_values
         self._check_arguments(kwargs)
+        self._read_memory(memory, memory_size, critic_memory)
         # The next class in the MRO is SB3's or sb3-contrib's, which has more arguments than BasePolicy.
         super().__init__(
             observation_space,
@@ -194,15 +179,24 @@ class TeamPolicy(TeamRowsPolicy):
         self._build_critic(lr_schedule)
 
     def _build_actor(self) -> None:
-        self.actor = self._make_actor()
+        spec = self._network_spec()
+        if self.memory is not None:
+            self.actor_memory = Memory(self.memory, self.features_dim, self.memory_size)
+            spec = spec._replace(features_dim=self.memory_size)
+        self.actor = self.parts.actor(spec)
         if self.ortho_init:
             self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
             orthogonal_init(self.actor)
+            if self.actor_memory is not None:
+                orthogonal_init(self.actor_memory)
 
     def _build_critic(self, lr_schedule: Schedule) -> None:
         """Make the critic, and the optimizer of all parameters."""
         # TRPO identifies the critic's parameters by "value" in their name, as in all names below value_net.
-        self.value_net = self._make_critic()
+        spec = self._network_spec()
+        if self.critic_memory:
+            spec = spec._replace(memory=self.memory, memory_size=self.memory_size)
+        self.value_net = self.parts.critic(spec)
         if self.ortho_init:
             orthogonal_init(self.value_net)
         n_scales = self.team_spaces.n_agents if self.normalize_values == "agent" else None
@@ -210,12 +204,6 @@ class TeamPolicy(TeamRowsPolicy):
         learning_rate = lr_schedule(1)
         kwargs = _with_fused_steps(self.optimizer_class, self.optimizer_kwargs)
         self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **kwargs)  # type: ignore[call-arg]
-
-    def _make_actor(self) -> ActorNetwork:
-        return self.parts.actor(self._network_spec())
-
-    def _make_critic(self) -> OwnValueHead | TeamCritic | StateCritic:
-        return self.parts.critic(self._network_spec())
 
     def _network_spec(self) -> NetworkSpec:
         actor_hidden, value_hidden = _hidden_sizes(self.net_arch)
@@ -234,8 +222,8 @@ class TeamPolicy(TeamRowsPolicy):
         data = super()._get_constructor_parameters()
         for name in _SDE_ARGUMENTS:
             data.pop(name, None)
-        own = {name: getattr(self, name) for name in ("encode_once", "chunk_size", "normalize_values")}
-        return data | asdict(self.parts) | own
+        names = ("encode_once", "chunk_size", "normalize_values", "memory", "memory_size", "critic_memory")
+        return data | asdict(self.parts) | {name: getattr(self, name) for name in names}
 
     @property
     def log_std(self) -> th.Tensor:
@@ -260,11 +248,12 @@ class TeamPolicy(TeamRowsPolicy):
         :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In a rollout, values are computed lazily
         """
         encoded = self._encoded(obs, of_step=True)
-        distribution = self._distribution(obs, encoded.own, action_masks)
+        step, latents = (None, None) if self.actor_memory is None else self._advance(obs, encoded)
+        distribution = self._distribution(obs, encoded.own, action_masks, latents)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
         actions = actions.reshape((-1, *(self.action_space.shape or ())))
-        return actions, self._values_of_step(obs, encoded), log_prob
+        return actions, self._values_of_step(obs, encoded, step), log_prob
 
     def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: Masks | None = None
@@ -279,25 +268,41 @@ class TeamPolicy(TeamRowsPolicy):
         """
         self._check_minibatch(obs)
         encoded = self._encoded(obs)
-        distribution = self._distribution(obs, encoded.own, action_masks)
+        latents = None if self.actor_memory is None else self._latents_of_sequences(obs, encoded)
+        distribution = self._distribution(obs, encoded.own, action_masks, latents)
         return self._values(obs, encoded), self._likelihood(distribution, actions), distribution.entropy()
 
     def get_distribution(self, obs: PyTorchObs, action_masks: Masks | None = None) -> Distribution:
         """
         Return the action distribution; ``team`` is not read and may be missing.
 
+        With memory, minibatches are sequences; in other rows, the agents' episodes begin.
+
         :param obs: rows, or only own observations (B, ...)
         :param action_masks: (B, M) of MaskablePPO; None allows everything
         """
-        return self._distribution(obs, self.encode_own(obs), action_masks)
+        if self.actor_memory is None:
+            return self._distribution(obs, self.encode_own(obs), action_masks)
+        if not isinstance(obs, TeamMinibatch):
+            own = self.encode_own(obs)
+            return self._distribution(obs, own, action_masks, self.remember(own.of_rows())[0])
+        encoded = Encoded(*self.encode_teams(obs))
+        latents = self._latents_of_sequences(obs, encoded, twice=True)
+        return self._distribution(obs, encoded.own, action_masks, latents)
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
         """
         Estimate values.
 
+        A critic with memory remembers the steps of the running games (:meth:`forward`), which are not changed: rows are
+        those of the next step of all games, or a last observation (:class:`~sb3_saf.teams.rows.TerminalRow`). Other
+        rows are those of games that begin.
+
         :param obs: rows
         :return: (B, 1)
         """
+        if self._remembering_critic is not None and not isinstance(obs, TeamMinibatch):
+            return self._values_of_running_games(obs, self._remembering_critic)
         return self._values(obs, self._encoded(obs))
 
     def _check_minibatch(self, obs: PyTorchObs) -> None:
@@ -335,10 +340,18 @@ class TeamPolicy(TeamRowsPolicy):
         """Return log-likelihoods (B,); sb3-contrib's buffers give MultiBinary actions as integers."""
         return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
 
-    def _distribution(self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None = None) -> Distribution:
-        """Return the distribution over actions allowed by both the rows' own masks and ``action_masks``, (B, M)."""
+    def _distribution(
+        self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None = None, latents: th.Tensor | None = None
+    ) -> Distribution:
+        """
+        Return the distribution over actions allowed by both the rows' own masks and ``action_masks``, (B, M).
+
+        With memory, heads read ``latents`` (B, H) instead of own observations.
+        """
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._legal(obs, action_masks, own.features.device)
+        if latents is not None:
+            return self._distribution_of(lambda module: module(latents, agent), masks)
         return self._distribution_of(lambda module: self.row_encoder.apply(module, own, agent), masks)
 
     def _legal(self, obs: PyTorchObs, action_masks: Masks | None, device: th.device) -> th.Tensor | None:
@@ -375,26 +388,33 @@ class TeamPolicy(TeamRowsPolicy):
         critic, teams = self.value_net, encoded.teams
         if isinstance(critic, TeamCritic):
             assert teams is not None
-            values = teams.of_rows(critic(teams.features, teams.members, teams.active))
+            states = critic.states(teams.features, teams.members, teams.active)
+            if critic.memory is not None:
+                states = self._over_time(critic.memory, states, obs, teams.active)
+            values = teams.of_rows(critic.values(states))
         elif isinstance(critic, StateCritic):
             values = self._values_of_states(obs, critic)
         else:
             values = self.row_encoder.apply(critic, encoded.own, self._agent(obs) if critic.reads_agent else None)
         return self._raw_values(obs, values)
 
-    def _values_of_step(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
+    def _values_of_step(self, obs: PyTorchObs, encoded: Encoded, step: Step | None) -> th.Tensor:
         """Return values (B, 1) of a step of all games; in a rollout, many steps are evaluated together."""
-        if self.training or th.is_grad_enabled() or isinstance(self.value_net, StateCritic):
+        if step is None and (self.training or th.is_grad_enabled() or isinstance(self.value_net, StateCritic)):
             return self._values(obs, encoded)
-        entries = {} if isinstance(obs, th.Tensor) else obs
-        read: dict[str, th.Tensor] = {key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}
+        step = step_of(obs, encoded) if step is None else step
+        if isinstance(self.value_net, StateCritic):
+            step.values = self._values(obs, encoded)
         features = encoded.own.features
-        # Critics read features only: the observations can be dropped.
-        encoded = encoded._replace(own=encoded.own._replace(observations=features.new_empty(0)))
-        return LaterValues.of(Step(read, encoded), features.new_empty(encoded.own.n_rows, 0), self._values_of_steps)
+        return LaterValues.of(step, features.new_empty(encoded.own.n_rows, 0), self._values_of_steps)
 
     def _values_of_steps(self, steps: Sequence[Step]) -> list[th.Tensor]:
         """Return values (B, 1) of each step."""
+        if self._remembering_critic is not None:
+            self._compute_waiting(self._remembering_critic)
+        known = [step.values for step in steps if step.values is not None]
+        if len(known) == len(steps):
+            return known
         with th.no_grad():
             obs = {key: th.cat([step.obs[key] for step in steps]) for key in steps[0].obs}
             own = joined_rows([step.encoded.own for step in steps])

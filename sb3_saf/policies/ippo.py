@@ -9,14 +9,34 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
-from sb3_contrib import RecurrentPPO
+import torch as th
 from stable_baselines3 import PPO
 
-from sb3_saf.networks.critic import OwnValueHead
-from sb3_saf.networks.layers import NetworkSpec
+from sb3_saf.networks.critic import Heads, OwnValueHead, TeamCritic
+from sb3_saf.networks.layers import NetworkSpec, Rows, gather
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
-from sb3_saf.policies.parts import AlgorithmSpec, Declaration, PaperTable, TeamParts, team_policies
-from sb3_saf.policies.recurrent import TeamRecurrentPolicy
+from sb3_saf.policies.parts import AlgorithmSpec, Declaration, PaperTable, TeamParts, memory_variants, team_policies
+
+
+class OwnCritic(TeamCritic):
+    """
+    V_i from the memory of z_i, of all agents of a team at once.
+
+    :param spec: of the policy, with a memory
+    :param heads: one head for all agents, or one for each
+    """
+
+    def __init__(self, spec: NetworkSpec, heads: Heads):
+        super().__init__(spec.n_agents, spec.critic_memory(spec.features_dim))
+        self.value_head = OwnValueHead(spec, spec.memory_size, heads)
+
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamCritic`; (G, N, d)."""
+        return gather(features, teams)
+
+    def values(self, states: th.Tensor) -> th.Tensor:
+        """See :class:`TeamCritic`."""
+        return self.value_head.of_teams(states)
 
 
 @dataclass(frozen=True)
@@ -28,19 +48,13 @@ class IPPOParts(TeamParts):
     :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector
     """
 
-    def critic(self, spec: NetworkSpec) -> OwnValueHead:
+    def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic:
         """Make the critic: V_i from z_i."""
-        return OwnValueHead(spec, spec.features_dim, self.heads)
+        return OwnValueHead(spec, spec.features_dim, self.heads) if spec.memory is None else OwnCritic(spec, self.heads)
 
 
 class IPPOPolicy(TeamActorCriticPolicy):
     """Policy of independent PPO, ``PPO("IPPOPolicy", env)``; takes the fields of :class:`IPPOParts` by keyword."""
-
-    parts_class: ClassVar[type[TeamParts]] = IPPOParts
-
-
-class IPPOLstmPolicy(TeamRecurrentPolicy):
-    """IPPO's parts for RecurrentPPO; takes the fields of :class:`IPPOParts` by keyword."""
 
     parts_class: ClassVar[type[TeamParts]] = IPPOParts
 
@@ -53,12 +67,12 @@ class IPPOMaskablePolicy(TeamMaskablePolicy):
 
 DECLARATION: Final = Declaration(
     "IPPO",
-    team_policies(IPPOPolicy, IPPOLstmPolicy, IPPOMaskablePolicy),
+    team_policies(IPPOPolicy, IPPOMaskablePolicy),
     {
         "ippo": AlgorithmSpec(PPO, "IPPOPolicy", "ippo"),
         # The paper's IPPO: an actor and a critic for each agent.
         "ippo-separate": AlgorithmSpec(PPO, "IPPOPolicy", "ippo", {"heads": "per_agent"}),
-        "ippo-lstm": AlgorithmSpec(RecurrentPPO, "IPPOLstmPolicy", "ippo-lstm"),
+        **memory_variants(AlgorithmSpec(PPO, "IPPOPolicy", "ippo"), "ippo"),
     },
     PaperTable({"heads": "per_agent"}, 1_740_016),
 )

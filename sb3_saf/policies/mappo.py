@@ -11,16 +11,13 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import torch as th
-from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_saf.networks.critic import (
-    JointStates,
     JointValueHead,
     OwnValueHead,
     StateCritic,
     TeamCritic,
-    TeamStates,
 )
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import NetworkSpec, Rows, gather
@@ -31,9 +28,9 @@ from sb3_saf.policies.parts import (
     Declaration,
     PaperTable,
     TeamParts,
+    memory_variants,
     team_policies,
 )
-from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.rows import STATE_KEY
 
@@ -47,16 +44,21 @@ class JointCritic(TeamCritic):
     """
 
     def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
-        super().__init__()
         joint_dim = spec.n_agents * spec.features_dim
-        self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
+        super().__init__(1, spec.critic_memory(joint_dim))
+        head_dim = joint_dim if self.memory is None else spec.memory_size
+        self.value_head = JointValueHead(spec, head_dim, parts.heads, parts.agent_identity)
 
-    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`TeamCritic`; features of inactive agents are read as zeros."""
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamCritic`; (G, 1, N d), features of inactive agents are read as zeros."""
         members = gather(features, teams)
         if active is not None:
             members = members * active.unsqueeze(2)
-        return self.value_head(members)
+        return members.flatten(1).unsqueeze(1)
+
+    def values(self, states: th.Tensor) -> th.Tensor:
+        """See :class:`TeamCritic`."""
+        return self.value_head(states)
 
 
 class JointStateCritic(StateCritic):
@@ -65,11 +67,15 @@ class JointStateCritic(StateCritic):
 
     :param spec: of the policy; an encoded state is as large as an encoded observation
     :param parts: ``heads`` and ``agent_identity``
-    :raises ValueError: if rows have no state
+    :raises ValueError: if rows have no state, or the critic is to have a memory
     """
 
     def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
         super().__init__()
+        if spec.memory is not None:
+            raise ValueError(
+                "critic_input='state' has no critic with memory; pass critic_memory=False, or leave critic_input out"
+            )
         if spec.state_space is None:
             raise ValueError(
                 f"critic_input='state' needs observations with {STATE_KEY!r}, and these have none; build the "
@@ -110,27 +116,9 @@ class MAPPOParts(TeamParts):
         """Make the critic: V_i from [z_1, ..., z_N], or from the state."""
         return JointStateCritic(spec, self) if self.critic_input == "state" else JointCritic(spec, self)
 
-    def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """Make the states [z_1, ..., z_N], with the agent's index for a shared head."""
-        if self.critic_input == "state":
-            raise ValueError(
-                "critic_input='state' has no critic with memory; pass enable_critic_lstm=False, or leave critic_input "
-                "out"
-            )
-        return self._joint(spec.features_dim, spec.n_agents)
-
-    def _joint(self, features_dim: int, n_agents: int, members: TeamStates | None = None) -> JointStates:
-        return JointStates(features_dim, n_agents, self.agent_identity and self.heads == "shared", members)
-
 
 class MAPPOPolicy(TeamActorCriticPolicy):
     """Policy of PPO with a central critic, ``PPO("MAPPOPolicy", env)``; takes the fields of :class:`MAPPOParts`."""
-
-    parts_class: ClassVar[type[TeamParts]] = MAPPOParts
-
-
-class MAPPOLstmPolicy(TeamRecurrentPolicy):
-    """MAPPO's parts for RecurrentPPO; takes the fields of :class:`MAPPOParts` by keyword."""
 
     parts_class: ClassVar[type[TeamParts]] = MAPPOParts
 
@@ -143,12 +131,12 @@ class MAPPOMaskablePolicy(TeamMaskablePolicy):
 
 DECLARATION: Final = Declaration(
     "MAPPO",
-    team_policies(MAPPOPolicy, MAPPOLstmPolicy, MAPPOMaskablePolicy),
+    team_policies(MAPPOPolicy, MAPPOMaskablePolicy),
     {
         "mappo": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo"),
         # An actor and a critic for each agent: MAPPO of the paper's parameter table.
         "mappo-separate": AlgorithmSpec(PPO, "MAPPOPolicy", "mappo", {"heads": "per_agent"}),
-        "mappo-lstm": AlgorithmSpec(RecurrentPPO, "MAPPOLstmPolicy", "mappo-lstm"),
+        **memory_variants(AlgorithmSpec(PPO, "MAPPOPolicy", "mappo"), "mappo"),
     },
     PaperTable({"heads": "per_agent"}, 2_477_296),
 )

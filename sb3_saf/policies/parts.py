@@ -1,7 +1,7 @@
 """
 Base classes for algorithm files: the parts (actor and critic), and a declaration (policies and names).
 
-Policy classes implement SB3's interfaces (PPO's, recurrent, maskable ...); parts implement the algorithm. A policy
+Policy classes implement SB3's interfaces (PPO's, maskable ...); parts implement the algorithm. A policy
 class names its parts and takes their fields as constructor arguments, so that each default is written once.
 
 Registration, command lines, the paper's table and the tests of all algorithms read the declaration: a new algorithm is
@@ -12,18 +12,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, get_args
 
-from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
+from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_saf.networks.actor import ActorNetwork, SinglePolicy
-from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic, TeamStates
+from sb3_saf.networks.critic import Heads, OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import NetworkSpec
+from sb3_saf.networks.memory import MEMORY_NAMES
 from sb3_saf.teams.checks import check_choice, check_flag
 
 #: Input of a critic: the agent's own features, the whole team's, or the state of the game.
@@ -72,10 +73,6 @@ class TeamParts(ABC):
     @abstractmethod
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """Make the critic."""
-
-    def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """Make the input of a critic with memory; None for the features of the agent's own observation."""
-        return None
 
 
 @dataclass(frozen=True)
@@ -135,12 +132,17 @@ class Declaration:
     paper_table: PaperTable | None = None
 
 
-def team_policies(policy: type[BasePolicy], recurrent: type[BasePolicy], maskable: type[BasePolicy]) -> Policies:
+def team_policies(policy: type[BasePolicy], maskable: type[BasePolicy]) -> Policies:
     """Return the policies of one set of parts by the algorithms that train them."""
-    return {
-        PPO: (policy,),
-        A2C: (policy,),
-        TRPO: (policy,),
-        RecurrentPPO: (recurrent,),
-        MaskablePPO: (maskable,),
-    }
+    return {PPO: (policy,), A2C: (policy,), TRPO: (policy,), MaskablePPO: (maskable,)}
+
+
+def memory_variants(spec: AlgorithmSpec, name: str) -> dict[str, AlgorithmSpec]:
+    """
+    Return the variants with memory, ``"name-gru"`` and ``"name-lstm"``.
+
+    :param spec: the algorithm without memory
+    :param name: its name on command lines
+    """
+    kwargs = {kind: {**spec.policy_kwargs, "memory": kind} for kind in MEMORY_NAMES}
+    return {f"{name}-{kind}": replace(spec, policy_kwargs=kwargs[kind]) for kind in MEMORY_NAMES}

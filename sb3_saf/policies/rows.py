@@ -27,6 +27,7 @@ from sb3_saf.teams.rows import (
     OBS_KEY,
     TEAM_KEY,
     TeamSpaces,
+    TerminalRow,
     check_masks,
 )
 
@@ -134,11 +135,11 @@ class TeamRowsPolicy(BasePolicy):
     def predict(
         self,
         observation: Any,
-        state: tuple[np.ndarray, ...] | None = None,
+        state: Any = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
         **kwargs: Any,
-    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+    ) -> tuple[Any, Any]:
         """
         Act as SB3's ``predict``: on rows, or on what the game itself gives.
 
@@ -153,7 +154,8 @@ class TeamRowsPolicy(BasePolicy):
 
             The game's Dicts, Tuples, unequal spaces and channel-last pictures become rows as in ``make_team_env``, and
             actions are those of the game. A model trained on tile codes also takes the pixels of the same game
-        :param state: as in SB3
+        :param state: what agents with memory remember, as in SB3; of observations by agent, the state returned for the
+            step before, ``{agent: state}``. None where episodes begin; agents that it lacks begin
         :param episode_start: as in SB3
         :param deterministic: as in SB3
         :param kwargs: ``action_masks`` of MaskablePPO, for rows or in the form of the observation
@@ -161,10 +163,27 @@ class TeamRowsPolicy(BasePolicy):
         """
         given = self.given_by_game(observation, kwargs.get("action_masks"))
         if given is None:
-            return super().predict(observation, state, episode_start, deterministic, **kwargs)
+            return self._predict_rows(observation, state, episode_start, deterministic, **kwargs)
         masks = {} if given.action_masks is None else {"action_masks": given.action_masks}
-        actions, state = self.predict(given.rows, state, episode_start, deterministic, **masks)
-        return given.actions_of_game(actions), state
+        agents = given.agents
+        if agents is None or not state:
+            actions, after = self._predict_rows(given.rows, state, episode_start, deterministic, **masks)
+        else:
+            blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
+            rows = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
+            starts = np.array([agent not in state for agent in agents])
+            if episode_start is not None:
+                starts |= np.asarray(episode_start).astype(bool)
+            actions, after = self._predict_rows(given.rows, rows, starts, deterministic, **masks)
+        if agents is None or after is None:
+            return given.actions_of_game(actions), after
+        return given.actions_of_game(actions), dict(zip(agents, zip(*after, strict=True), strict=True))
+
+    def _predict_rows(
+        self, rows: Any, state: Any, episode_start: np.ndarray | None, deterministic: bool, **kwargs: Any
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Act on rows, as SB3's ``predict``."""
+        return super().predict(rows, state, episode_start, deterministic, **kwargs)
 
     def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
         """
@@ -293,6 +312,8 @@ class TeamRowsPolicy(BasePolicy):
             arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
         tensors, is_batch = super().obs_to_tensor(arrays)
         assert isinstance(tensors, dict)
+        if isinstance(observation, TerminalRow):
+            tensors = TerminalRow(tensors, observation.row)
         if len({len(tensor) for tensor in tensors.values()}) > 1:
             lengths = ", ".join(f"{key!r} {len(tensor)}" for key, tensor in tensors.items())
             raise ValueError(f"expected as many rows under each key of an observation, got {lengths}")
@@ -368,7 +389,7 @@ class TeamRowsPolicy(BasePolicy):
             teams by construction; otherwise, their joint observations are compared
         """
         if isinstance(obs, TeamMinibatch):
-            observations, rows, active = obs.teams
+            observations, rows, active, _ = obs.teams
             members = self.row_encoder.rows(observations.flatten(0, 1))
             own = members if rows is None else members.at(rows)
             return own, EncodedTeams(members.features, members.arranged(observations.shape[:2]), rows, active)

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple, get_args
 
 import torch as th
-from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from torch import nn
 
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, Selection
-from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic, TeamStates
+from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
 from sb3_saf.networks.layers import NetworkSpec, Rows, gather, mlp, side_by_side
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
@@ -22,9 +21,9 @@ from sb3_saf.policies.parts import (
     Declaration,
     PaperTable,
     TeamParts,
+    memory_variants,
     team_policies,
 )
-from sb3_saf.policies.recurrent import TeamRecurrentPolicy
 from sb3_saf.teams.checks import check_choice, check_count
 
 
@@ -40,18 +39,20 @@ class Communicated(NamedTuple):
     exchanged: Exchanged
 
 
-class SAFStates(TeamStates):
+class SAFCritic(TeamCritic):
     """
-    s_i^SAF of every agent (arXiv 2210.03022, section 5):
+    V_i from s_i^SAF (arXiv 2210.03022, section 5), or from those of the whole team.
 
     m'_i = g_theta(z_i), s_i = g_omega(z_i), slots written from m', m_i read with s_i, s_i^SAF = g_phi([s_i, m_i]).
 
-    :param spec: of the policy
-    :param parts: sizes of the networks
+    :param spec: spec of the policy
+    :param parts: ``critic_input``, ``heads``, ``agent_identity`` and sizes
     """
 
     def __init__(self, spec: NetworkSpec, parts: SAFParts):
-        super().__init__(parts.latent_dim)
+        n_states = spec.n_agents if parts.critic_input == "own" else 1
+        state_dim = parts.latent_dim * spec.n_agents // n_states
+        super().__init__(n_states, spec.critic_memory(state_dim))
 
         def projection(n_inputs: int) -> nn.Sequential:
             return mlp([n_inputs, *parts.projection_arch, parts.latent_dim], spec.activation_fn)
@@ -60,11 +61,22 @@ class SAFStates(TeamStates):
         self.state_net = projection(spec.features_dim)  # g_omega
         self.knowledge_source = KnowledgeSource(spec.n_agents, parts.latent_dim, parts.n_slots)
         self.combine_net = projection(2 * parts.latent_dim)  # g_phi
+        head_dim = state_dim if self.memory is None else spec.memory_size
+        self.value_head: OwnValueHead | JointValueHead
+        if parts.critic_input == "own":
+            self.value_head = OwnValueHead(spec, head_dim, parts.heads)
+        else:
+            self.value_head = JointValueHead(spec, head_dim, parts.heads, parts.agent_identity)
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-        """See :class:`TeamStates`."""
+        """See :class:`TeamCritic`; (G, N, d), or (G, 1, N d) with those of inactive agents read as zeros."""
         communicated = self.communicate(features, teams, active)
-        return self.combine_net(th.cat([communicated.states, communicated.exchanged.read], dim=2))
+        states = self.combine_net(th.cat([communicated.states, communicated.exchanged.read], dim=2))
+        if isinstance(self.value_head, OwnValueHead):
+            return states
+        if active is not None:
+            states = states * active.unsqueeze(2)
+        return states.flatten(1).unsqueeze(1)
 
     def communicate(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> Communicated:
         """
@@ -79,32 +91,10 @@ class SAFStates(TeamStates):
         messages, states = gather(own_messages, teams), gather(own_states, teams)
         return Communicated(states, self.knowledge_source.exchange(messages, states, active))
 
-
-class SAFCritic(SAFStates, TeamCritic):
-    """
-    V_i from s_i^SAF, or from those of the whole team.
-
-    :param spec: spec of the policy
-    :param parts: ``critic_input``, ``heads``, ``agent_identity`` and sizes
-    """
-
-    def __init__(self, spec: NetworkSpec, parts: SAFParts):
-        super().__init__(spec, parts)
-        self.value_head: OwnValueHead | JointValueHead
-        if parts.critic_input == "own":
-            self.value_head = OwnValueHead(spec, parts.latent_dim, parts.heads)
-        else:
-            joint_dim = spec.n_agents * parts.latent_dim
-            self.value_head = JointValueHead(spec, joint_dim, parts.heads, parts.agent_identity)
-
-    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+    def values(self, states: th.Tensor) -> th.Tensor:
         """See :class:`TeamCritic`."""
-        states = self.states(features, teams, active)
-        if isinstance(self.value_head, OwnValueHead):
-            return self.value_head.of_teams(states)
-        if active is not None:
-            states = states * active.unsqueeze(2)
-        return self.value_head(states)
+        head = self.value_head
+        return head.of_teams(states) if isinstance(head, OwnValueHead) else head(states)
 
 
 @dataclass(frozen=True)
@@ -166,22 +156,9 @@ class SAFParts(MAPPOParts):
         """Make the critic: V_i from s_i^SAF."""
         return SAFCritic(spec, self) if self.knowledge_source else super().critic(spec)
 
-    def team_states(self, spec: NetworkSpec) -> TeamStates | None:
-        """Make the states s_i^SAF, or those of all agents."""
-        if not self.knowledge_source:
-            return super().team_states(spec)
-        states = SAFStates(spec, self)
-        return states if self.critic_input == "own" else self._joint(self.latent_dim, spec.n_agents, states)
-
 
 class SAFPolicy(TeamActorCriticPolicy):
     """Policy of SAF, ``PPO("SAFPolicy", env)``; takes the fields of :class:`SAFParts` by keyword."""
-
-    parts_class: ClassVar[type[TeamParts]] = SAFParts
-
-
-class SAFLstmPolicy(TeamRecurrentPolicy):
-    """SAF's parts for RecurrentPPO; takes the fields of :class:`SAFParts` by keyword."""
 
     parts_class: ClassVar[type[TeamParts]] = SAFParts
 
@@ -194,7 +171,7 @@ class SAFMaskablePolicy(TeamMaskablePolicy):
 
 DECLARATION: Final = Declaration(
     "SAF",
-    team_policies(SAFPolicy, SAFLstmPolicy, SAFMaskablePolicy),
+    team_policies(SAFPolicy, SAFMaskablePolicy),
     {
         "saf": AlgorithmSpec(PPO, "SAFPolicy", "saf"),
         # Ablations use SAF's settings and differ in these arguments only.
@@ -202,7 +179,7 @@ DECLARATION: Final = Declaration(
         # The paper's ablation: an actor for each agent, so that sharing is compared with not sharing.
         "saf-no-pool-separate": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"n_policies": 1, "heads": "per_agent"}),
         "saf-no-ks": AlgorithmSpec(PPO, "SAFPolicy", "saf", {"knowledge_source": False}),
-        "saf-lstm": AlgorithmSpec(RecurrentPPO, "SAFLstmPolicy", "saf-lstm"),
+        **memory_variants(AlgorithmSpec(PPO, "SAFPolicy", "saf"), "saf"),
     },
     PaperTable({"heads": "per_agent", "critic_input": "team"}, 2_698_342),
 )

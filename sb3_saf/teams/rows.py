@@ -45,9 +45,11 @@ ACTIVE_KEY: Final = "active"
 ACTION_MASK_KEY: Final = "action_mask"
 #: The state of the row's game, for critics.
 STATE_KEY: Final = "state"
+#: Whether the row's agent took no part in the step before: its episode begins here, and its memory is empty.
+EPISODE_START_KEY: Final = "episode_start"
 #: Keys that only some environments provide.
 OPTIONAL_KEYS: Final[tuple[OptionalKey, ...]] = get_args(OptionalKey)
-ALL_KEYS: Final[frozenset[str]] = frozenset(TEAM_KEYS + OPTIONAL_KEYS)
+ALL_KEYS: Final[frozenset[str]] = frozenset((*TEAM_KEYS, *OPTIONAL_KEYS, EPISODE_START_KEY))
 
 Array = npt.NDArray[Any]
 
@@ -75,6 +77,19 @@ class AgentSpace(spaces.Discrete):
         self.conversions = None if conversions is None else tuple(conversions)
 
 
+class TerminalRow(dict[str, Any]):
+    """
+    Last observation of a row, ``infos[row]["terminal_observation"]``.
+
+    :param entries: the observation
+    :param row: index of the row, whose memory policies use for the value of the observation; (K,) for K observations
+    """
+
+    def __init__(self, entries: Mapping[str, Any], row: int | npt.NDArray[np.int64]) -> None:
+        super().__init__(entries)
+        self.row = row
+
+
 @dataclass(frozen=True)
 class TeamSpaces:
     """
@@ -86,7 +101,8 @@ class TeamSpaces:
     - ``"action_mask"``, MultiBinary(A): 1 for legal actions, see :func:`n_mask_entries`;
     - ``"state"``: the state of the row's game, equal in all its rows.
 
-    ``CentralizedValueWrapper`` adds ``"team"`` and ``"agent"``, and makes ``"active"`` that of the whole team.
+    ``CentralizedValueWrapper`` adds ``"team"``, ``"agent"`` and ``"episode_start"``, and makes ``"active"`` that of the
+    whole team.
 
     :param own: space of one agent's own observation, shape ``(*shape)``
     :param n_agents: N
@@ -96,6 +112,7 @@ class TeamSpaces:
     :param names: the agents' names in index order, if they are known
     :param is_dict: whether rows below ``CentralizedValueWrapper`` are Dicts
     :param conversions: of the agents' observations and actions in the game, in index order; None if rows are the game's
+    :param has_starts: whether rows of ``CentralizedValueWrapper`` have ``"episode_start"``
     """
 
     own: spaces.Space[Any]
@@ -106,6 +123,7 @@ class TeamSpaces:
     names: tuple[Any, ...] | None = None
     is_dict: bool = False
     conversions: tuple[AgentConversion, ...] | None = None
+    has_starts: bool = False
 
     @classmethod
     def of(
@@ -117,6 +135,7 @@ class TeamSpaces:
         state: spaces.Space[Any] | None = None,
         names: Sequence[Any] | None = None,
         conversions: Sequence[AgentConversion] | None = None,
+        has_starts: bool = False,
     ) -> TeamSpaces:
         """
         Return the form of rows of a team whose agents share one observation space, which is checked.
@@ -128,6 +147,7 @@ class TeamSpaces:
         :param state: space of the game's state if rows have it
         :param names: the agents' names in index order, if they are known
         :param conversions: of the agents' observations and actions in the game, in index order
+        :param has_starts: whether rows have ``"episode_start"``
         :raises ValueError: if ``own`` or ``state`` is another kind of space
         """
         bounds_of(own)
@@ -135,7 +155,7 @@ class TeamSpaces:
             _check_state(state)
         is_dict = active or n_masked_actions is not None or state is not None
         known, forms = (None if values is None else tuple(values) for values in (names, conversions))
-        return cls(own, n_agents, active, n_masked_actions, state, known, is_dict, forms)
+        return cls(own, n_agents, active, n_masked_actions, state, known, is_dict, forms, has_starts)
 
     @classmethod
     def of_rows(
@@ -198,9 +218,12 @@ class TeamSpaces:
             isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
         ):
             raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
+        starts = space.spaces.get(EPISODE_START_KEY)
+        if starts is not None and starts != spaces.Discrete(2):
+            raise ValueError(_not_a_team_space(f"its {EPISODE_START_KEY!r} must be Discrete(2), got {starts}"))
         n_masked = None if action_mask is None else action_mask.shape[0]
         names, conversions = (getattr(agent, name, None) for name in ("names", "conversions"))
-        return cls.of(own, n_agents, active is not None, n_masked, state, names, conversions)
+        return cls.of(own, n_agents, active is not None, n_masked, state, names, conversions, starts is not None)
 
     @cached_property
     def team(self) -> spaces.Box:
@@ -231,16 +254,21 @@ class TeamSpaces:
     @property
     def keys(self) -> tuple[str, ...]:
         """Keys of a row's joint observation."""
-        return (*TEAM_KEYS, *self._optional)
+        return tuple(self._joint)
 
     @property
     def _optional(self) -> dict[str, spaces.Space[Any]]:
         parts = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
         return {key: part for key, part in parts.items() if part is not None}
 
+    @property
+    def _joint(self) -> dict[str, spaces.Space[Any]]:
+        starts = {EPISODE_START_KEY: spaces.Discrete(2)} if self.has_starts else {}
+        return {OBS_KEY: self.own, TEAM_KEY: self.team, AGENT_KEY: self.agent, **self._optional, **starts}
+
     def to_dict_space(self) -> spaces.Dict:
         """Return the joint observation space of a row; ``own`` stays the same object."""
-        return spaces.Dict({OBS_KEY: self.own, TEAM_KEY: self.team, AGENT_KEY: self.agent, **self._optional})
+        return spaces.Dict(self._joint)
 
     def to_row_space(self) -> spaces.Space[Any]:
         """Return the observation space of a row below ``CentralizedValueWrapper``."""

@@ -45,7 +45,7 @@ _COLOURS: Final = {
     "random": "#666666",
 }
 #: Line and hatch of variants of a method, which share its colour: with memory, with separate weights per agent.
-_VARIANTS: Final = {"-lstm": ("--", "//"), "-separate": ("-.", "xx")}
+_VARIANTS: Final = {"-gru": ("--", "//"), "-lstm": (":", "\\\\"), "-separate": ("-.", "xx")}
 #: Horizontal lines of reference teams.
 _REFERENCE: Final = "#222222"
 _REFERENCE_LINES: Final = ("-.", ":", (0, (1, 3)), (0, (5, 5)))

@@ -9,6 +9,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_saf.networks.memory import MemoryName
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.vec_env import require_n_agents, shares_reward
 
@@ -20,7 +21,11 @@ _TAKEN_OF_HECOGRID: Final = (*_TAKEN, "gamma")
 
 
 def ppo_settings(
-    env: VecEnv, algo: str = "mappo", algorithm: type[OnPolicyAlgorithm] = PPO, **overrides: Any
+    env: VecEnv,
+    algo: str = "mappo",
+    algorithm: type[OnPolicyAlgorithm] = PPO,
+    memory: MemoryName | None = None,
+    **overrides: Any,
 ) -> dict[str, Any]:
     """
     Return PPO hyperparameters for an environment of teams::
@@ -28,6 +33,7 @@ def ppo_settings(
         model = PPO("MAPPOPolicy", env, **sb3_saf.ppo_settings(env))
         model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf"))
         model = MaskablePPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf", MaskablePPO))
+        model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf", memory="gru"))
 
     They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
     same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
@@ -40,8 +46,9 @@ def ppo_settings(
     :param env: from ``make_team_env``, with any number of games
     :param algo: the method, a name of ``sb3_saf.train --algo`` that PPO trains. The settings of ``"saf"`` include its
         widths, which other policies do not take
-    :param algorithm: the class for which the settings are, those that it takes: PPO, MaskablePPO, RecurrentPPO, TRPO,
-        or A2C, which keeps its own short rollouts
+    :param algorithm: the class for which the settings are, those that it takes: PPO, MaskablePPO, TRPO, or A2C, which
+        keeps its own short rollouts
+    :param memory: ``"gru"`` or ``"lstm"`` for agents that remember their episode
     :param overrides: arguments of the algorithm that take precedence; ``policy_kwargs`` are merged
     :raises ValueError: if ``env`` has no teams, or the algorithm does not train ``algo``
     """
@@ -69,6 +76,8 @@ def ppo_settings(
         teams = int(overrides.get("n_steps", n_steps)) * n_games
         found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
     policy_kwargs = source.get("policy_kwargs", {}) | spec.policy_kwargs
+    if memory is not None:
+        policy_kwargs["memory"] = memory
     if encoder is not None:
         policy_kwargs["features_extractor_class"] = encoder
     if not policy.normalizes_values:

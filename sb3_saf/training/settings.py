@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, get_args
 
-from sb3_contrib import MaskablePPO, RecurrentPPO
+from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -258,11 +258,11 @@ def load_settings(
                 f"method, or leave {key} out"
             )
     if spec.algorithm is not method.algorithm:
-        # It takes the settings that it has; masks and sequences need buffers of their own.
+        # It takes the settings that it has; masks need a buffer of their own.
         arguments = {*_OWN_KEYS, *algorithm_arguments(spec.algorithm)}
         if "batch_size" not in arguments:
             arguments.discard("n_minibatches")
-        if issubclass(spec.algorithm, (MaskablePPO, RecurrentPPO)):
+        if issubclass(spec.algorithm, MaskablePPO):
             arguments -= {"rollout_buffer_class", "rollout_buffer_kwargs"}
         own = {key: value for key, value in own.items() if key in arguments}
     if given.get("batch_size") is not None:
