@@ -18,8 +18,9 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
 from sb3_saf.envs.monitor import TeamMonitor
+from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, STAGGERED, Array
+from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array
 from sb3_saf.teams.vec_env import episode_value, find_n_agents, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
@@ -263,6 +264,7 @@ def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False)
     :param env: the games
     :param deterministic: whether the model takes its most likely actions
     """
+    check_trained_on(model, env)
     policy = getattr(model, "policy", model)
     takes_masks = isinstance(policy, MaskableActorCriticPolicy) or "action_masks" in signature(model.predict).parameters
     asks_for_masks = takes_masks and is_masking_supported(env)
@@ -275,6 +277,37 @@ def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False)
         return actions
 
     return act
+
+
+def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size: bool = False) -> None:
+    """
+    Check that a model was trained on games like these.
+
+    :param model: an algorithm or a policy; anything else passes
+    :param env: the games
+    :param name: of the model, for the message
+    :param same_size: whether the number of agents must be equal, too: critics depend on it, actors do not, unless they
+        read the agent's index
+    :raises ValueError: if observations, actions or, where it matters, the number of agents differ
+    """
+    policy, n_agents = getattr(model, "policy", model), _team_size(env)
+    if not isinstance(policy, TeamRowsPolicy):
+        return
+    trained, space = policy.team_spaces, env.observation_space
+    own = space.spaces.get(OBS_KEY, space) if isinstance(space, spaces.Dict) else space
+    expected, got = (
+        f"observations of shape {shape}, actions {actions} and {n} agents"
+        for shape, actions, n in (
+            (trained.own.shape, policy.action_space, trained.n_agents),
+            (own.shape, env.action_space, n_agents),
+        )
+    )
+    is_other_size = n_agents != trained.n_agents and (same_size or policy.acts_by_index)
+    if own.shape != trained.own.shape or env.action_space != policy.action_space or is_other_size:
+        raise ValueError(
+            f"expected games like those on which {name} was trained, with {expected}, got {got}; make them as for its "
+            "training" + ("" if not is_other_size else f", with {trained.n_agents} agents")
+        )
 
 
 def evaluate_team(
@@ -291,7 +324,9 @@ def evaluate_team(
 
     :param model: any object with SB3's ``predict``, for instance an algorithm, a policy or a ``RandomPolicy``. If the
         games have masks outside their observations (``action_masks()``), they go to ``predict(...,
-        action_masks=...)`` of models that take them, such as those of MaskablePPO
+        action_masks=...)`` of models that take them, such as those of MaskablePPO. Teams of another size than the
+        trained one can be played unless the actor depends on the agent's index (``heads="per_agent"``,
+        ``actor_identity``, QPLEX with memory)
     :param env: vector environment of teams, for instance from ``make_team_env``
     :param n_eval_episodes: team episodes to play
     :param deterministic: whether the model takes its most likely actions
@@ -300,7 +335,7 @@ def evaluate_team(
         ``info`` agent 0's, ``reward`` the team's, ``done`` whether the episode ended
     :param warn: warn if there is no TeamMonitor, so that returns are those of the outermost wrapper
     :return: team returns and lengths in game steps, in the order in which the episodes ended
-    :raises ValueError: if ``env`` has no teams
+    :raises ValueError: if ``env`` has no teams, or the model was trained on another game
     """
     check_count("n_eval_episodes", n_eval_episodes)
     n_agents = _team_size(env)

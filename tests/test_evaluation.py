@@ -20,7 +20,7 @@ from stable_baselines3.common.evaluation import evaluate_policy as evaluate_rows
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_saf import inspect_team, make_team_env, ppo_settings, replay
+from sb3_saf import QPLEX, inspect_team, load_weights, make_team_env, ppo_settings, replay
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
@@ -224,6 +224,58 @@ def test_what_is_of_the_episode_is_found_wherever_the_game_puts_it(told: str, tm
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer) == 16
     assert np.mean(model.ep_success_buffer) == 0.5
     assert sorted(entry["score"] for entry in model.ep_info_buffer) == [3] * 8 + [7] * 8
+
+
+GAME: dict[str, Any] = {"grid_size": 7, "n_treasures": 3, "max_cycles": 6}
+
+
+class TestOtherGames:
+    def make(self, n_agents: int = 3, n_envs: int = 2, **params: Any) -> Any:
+        return make_team_env("TeamSupport", n_envs, seed=0, **{**GAME, "n_agents": n_agents, **params})
+
+    @pytest.mark.parametrize("method", ["saf", "mappo", "ippo", "qplex"])
+    def test_actors_play_in_teams_of_other_sizes(self, method: str) -> None:
+        env = self.make()
+        model: Any = (
+            QPLEX("QPLEXPolicy", env, buffer_size=100, seed=0)
+            if method == "qplex"
+            else PPO(method, env, **ppo_settings(env, method), seed=0)
+        )
+        for n_agents in (2, 5):
+            other = self.make(n_agents)
+            assert len(evaluate_team(model, other, 2).agent_means) == n_agents
+            rows: Any = other.reset()
+            actions, _ = model.predict(rows, deterministic=True)
+            alone = [model.predict(own, deterministic=True)[0] for own in rows["obs"]]
+            assert actions.tolist() == [int(action) for action in alone]
+
+    @pytest.mark.parametrize("kwargs", [{"actor_identity": True}, {"heads": "per_agent"}])
+    def test_actors_that_depend_on_the_index_do_not(self, kwargs: dict[str, Any]) -> None:
+        env = self.make()
+        model = PPO("MAPPO", env, **ppo_settings(env, policy_kwargs=kwargs), seed=0)
+        assert evaluate_team(model, env, 2).lengths == [6, 6]
+        with pytest.raises(ValueError, match=r"and 3 agents, got .* and 5 agents; .* with 3 agents"):
+            evaluate_team(model, self.make(5), 2)
+        with pytest.raises(ValueError, match=r"'agent' must be in 0..2"):
+            model.predict(self.make(5).reset())
+
+    def test_weights_of_ippo_go_to_teams_of_other_sizes(self, tmp_path: Path) -> None:
+        small, large = self.make(), self.make(5)
+        model, other = (PPO("IPPO", env, **ppo_settings(env, "ippo"), seed=i) for i, env in enumerate((small, large)))
+        model.save(tmp_path / "model")
+        load_weights(other, tmp_path / "model")
+        obs: Any = large.reset()
+        assert other.predict(obs, deterministic=True)[0].tolist() == model.predict(obs, deterministic=True)[0].tolist()
+
+    @pytest.mark.parametrize("other", [{"view_size": 5}, {"observation": "rgb"}])
+    def test_models_of_other_games_are_refused(self, other: dict[str, Any], tmp_path: Path) -> None:
+        env = self.make()
+        model = PPO("MAPPO", env, **ppo_settings(env), seed=0)
+        for play in (evaluate_team, inspect_team, replay):
+            with pytest.raises(ValueError, match=r"was trained, with observations of shape \(7, 7\).*, got "):
+                play(model, self.make(**other), *([tmp_path / "page.html"] if play is replay else [2]))
+        with pytest.raises(ValueError, match=r"was trained, .* and 3 agents, got .* and 4 agents"):
+            inspect_team(model, self.make(4), 2)
 
 
 class TestIntervals:

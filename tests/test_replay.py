@@ -125,9 +125,9 @@ def test_long_episodes_are_cut(model: PPO, tmp_path: Path, monkeypatch: pytest.M
 def test_bad_input(model: PPO, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"at least episodes=3 games, got 2; make it with make_team_env"):
         replay(model, make_env(), tmp_path / "page.html", episodes=3)
-    with pytest.raises(ValueError, match=r"team to be trained on observations of shape \(5, 5\).*got shape \(7, 7\)"):
+    with pytest.raises(ValueError, match=r"on which team was trained, .*shape \(7, 7\).*got .*shape \(5, 5\)"):
         replay(model, make_env(view_size=5), tmp_path / "page.html")
-    with pytest.raises(ValueError, match=r"with 2 agents, got .* with 3"):
+    with pytest.raises(ValueError, match=r"and 3 agents, got .* and 2 agents"):
         replay(model, make_env(n_agents=2), tmp_path / "page.html")
     env = sb3_saf.make_team_env(CounterEnv, n_envs=1)
     other = PPO("MAPPOPolicy", env, **sb3_saf.ppo_settings(env))

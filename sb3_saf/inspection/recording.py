@@ -35,7 +35,7 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_saf.evaluation import PlayedStep, play
+from sb3_saf.evaluation import PlayedStep, check_trained_on, play
 from sb3_saf.inspection.reading import (
     OurPolicy,
     PolicyReader,
@@ -216,6 +216,7 @@ def record_episodes(
     :raises ValueError: if the policy is not of this package or ``env`` has no teams
     """
     ours = require_our_policy(policy)
+    check_trained_on(ours, env, same_size=True)
     check_count("n_eval_episodes", n_eval_episodes)
     recorder = _Recorder(env, reader_of(ours, env.num_envs, deterministic), normalizer, observations)
     draws = pictures and env.render_mode == "rgb_array"

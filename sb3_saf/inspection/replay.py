@@ -22,7 +22,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.evaluation import play
+from sb3_saf.evaluation import check_trained_on, play
 from sb3_saf.export.act import Actor
 from sb3_saf.inspection.figures import png
 from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, record_episodes
@@ -109,7 +109,8 @@ def replay(
     grid: Packed | None = None
     atlas = getattr(TeamSpaces.from_observation_space(env.observation_space).own, "atlas", None)
     for name, player in players.items():
-        _check_spaces(name, player, env)
+        if not isinstance(player, Actor):  # which checks every observation
+            check_trained_on(player, env, name, same_size=True)
         for game, episode in enumerate(_play(player, env, episodes, seed, deterministic, gamma)):
             run: Packed = {
                 "name": name if episodes == 1 else f"{name}, game {game + 1}",
@@ -154,20 +155,6 @@ def replay(
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(page, encoding="utf-8")
     return target
-
-
-def _check_spaces(name: str, player: Player, env: VecEnv) -> None:
-    if isinstance(player, Actor):
-        return  # it checks every observation
-    expected, got = (TeamSpaces.from_observation_space(one.observation_space) for one in (env, player))
-    if (got.own.shape, got.n_agents) != (expected.own.shape, expected.n_agents) or (
-        player.action_space != env.action_space
-    ):
-        raise ValueError(
-            f"expected {name} to be trained on observations of shape {expected.own.shape} and {env.action_space} with "
-            f"{expected.n_agents} agents, got shape {got.own.shape} and {player.action_space} with {got.n_agents}; "
-            "replay it on the environment that it was trained on"
-        )
 
 
 def _play(

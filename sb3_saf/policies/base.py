@@ -236,6 +236,11 @@ class TeamPolicy(RememberingPolicy):
 
     # --- what SB3 calls ---------------------------------------------------------------------------------------------
 
+    @property
+    def acts_by_index(self) -> bool:
+        """See the base class."""
+        return self.actor.reads_agent
+
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, action_masks: Masks | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:

@@ -25,6 +25,7 @@ from sb3_saf.teams.rows import (
     AGENT_KEY,
     ALL_KEYS,
     OBS_KEY,
+    STATE_KEY,
     TEAM_KEY,
     TeamSpaces,
     TerminalRow,
@@ -163,6 +164,8 @@ class TeamRowsPolicy(BasePolicy):
         """
         given = self.given_by_game(observation, kwargs.get("action_masks"))
         if given is None:
+            if isinstance(observation, Mapping):  # critics' entries, whose shapes depend on the size of the team
+                observation = {key: value for key, value in observation.items() if key not in self._not_for_acting}
             return self._predict_rows(observation, state, episode_start, deterministic, **kwargs)
         masks = {} if given.action_masks is None else {"action_masks": given.action_masks}
         agents = given.agents
@@ -184,6 +187,16 @@ class TeamRowsPolicy(BasePolicy):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Act on rows, as SB3's ``predict``."""
         return super().predict(rows, state, episode_start, deterministic, **kwargs)
+
+    @property
+    def _not_for_acting(self) -> set[str]:
+        """Entries of rows that the actor does not read."""
+        return {TEAM_KEY, ACTIVE_KEY, STATE_KEY} | (set() if self.acts_by_index else {AGENT_KEY})
+
+    @property
+    def acts_by_index(self) -> bool:
+        """Whether actions depend on the agent's index; otherwise the policy acts in teams of any size."""
+        return True
 
     def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
         """
@@ -323,7 +336,10 @@ class TeamRowsPolicy(BasePolicy):
         n_agents = self.team_spaces.n_agents
         agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
         if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
-            raise ValueError(f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}")
+            raise ValueError(
+                f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}: this policy depends on the index of an "
+                f"agent, and was trained with {n_agents}"
+            )
         return agent
 
     # --- entries of rows --------------------------------------------------------------------------------------------

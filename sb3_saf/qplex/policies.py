@@ -213,6 +213,11 @@ class QPLEXPolicy(TeamRowsPolicy):
         """Return greedy actions, (B,); exploration is done by the algorithm."""
         return self.own_q_values(observation).argmax(dim=1)
 
+    @property
+    def acts_by_index(self) -> bool:
+        """See the base class; memory reads the index, too."""
+        return self.actor.reads_agent or self.memory is not None
+
     def predict(
         self,
         observation: Any,

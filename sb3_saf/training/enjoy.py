@@ -82,15 +82,14 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
         if (trained.algo, trained.env_id) != (options.algo, environment.id):
             raise ValueError(f"{run.folder} is a run of {trained.algo} on {trained.env_id}; give its --algo and --env")
         settings = saved_settings(trained.as_dict(), options.env_kwargs)
-        if settings.n_agents != trained.n_agents:
-            raise ValueError(
-                f"the team was trained with {trained.n_agents} agents, got n_agents={settings.n_agents}; leave "
-                "n_agents out of --env-kwargs"
-            )
         mode = None if options.no_render else "ansi" if options.text else "rgb_array"
         games = settings.make_env(seed, evaluation=True, n_envs=options.episodes, render_mode=mode)
         with closing(games):
-            policy = make_policy(settings, path, games)
+            if settings.n_agents == trained.n_agents:
+                policy = make_policy(settings, path, games)
+            else:  # the actor is that of the trained size
+                with closing(trained.make_env(seed, n_envs=1)) as own_games:
+                    policy = make_policy(trained, path, own_games)
             load_normalization(games, run.folder)
             set_random_seed(seed)
             with open_screen(options, games) as show:
@@ -135,7 +134,7 @@ class Film(TeamVecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         """Wait for the step, and show the first game."""
         results = self.venv.step_wait()
-        self._is_over = self._is_over or bool(results[2][0])
+        self._is_over = self._is_over or bool(np.all(results[2][: self.n_agents]))
         if not self._is_over:
             self._show_first()
         return results
