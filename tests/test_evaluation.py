@@ -535,9 +535,11 @@ class TestTeamEvalCallback:
         monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(OSError, match=r"cannot write .*evaluations\.npz"):
             self.learn(callback, 4, tmp_path)
+        callback.logger.close()
         callback.log_path = None
         with pytest.raises(OSError, match=r"cannot write .*best_model\.zip"):
             self.learn(callback, 4, tmp_path)
+        callback.logger.close()
         assert {name: (tmp_path / name).read_bytes() for name in files} == files
 
     def test_callbacks_can_stop_the_training(self, tmp_path: Path) -> None:

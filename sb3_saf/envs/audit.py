@@ -218,28 +218,25 @@ def layers_of(env: Any) -> list[Any]:
     return layers if any(layer is bare for layer in layers) else [*layers, bare]
 
 
-def settings_of(env: Any, depth: int = 4) -> dict[str, Any]:
+def settings_of(env: Any, depth: int = 3) -> dict[str, Any]:
     """
     Return what a new game keeps of its arguments: the numbers, flags and text among its attributes, by dotted names.
 
     :param env: before its first episode
-    :param depth: how far attributes of attributes are followed
+    :param depth: how far attributes of attributes of the game and of each of its wrappers are followed
     """
     result: dict[str, Any] = {}
-    todo = [("", env, 0)]
-    visited = set()
+    layers = layers_of(env) if hasattr(env, "unwrapped") else [env]
+    todo = [(type(layer).__name__, layer, 0) for layer in reversed(layers) if hasattr(layer, "__dict__")]
+    visited = {id(layer) for _, layer, _ in todo}
     while todo:
         name, value, level = todo.pop()
-        if _is_plain(value):
-            result[name] = value
-        elif id(value) not in visited and level < depth and len(result) < _MOST_SETTINGS:
-            visited.add(id(value))
-            result[f"{name}.class".lstrip(".")] = type(value).__name__
-            todo += [
-                (f"{name}.{key}".lstrip("."), inner, level + 1)
-                for key, inner in sorted(vars(value).items(), reverse=True)
-                if _is_plain(inner) or (hasattr(inner, "__dict__") and _may_hold_settings(inner))
-            ]
+        for key, inner in sorted(vars(value).items()) if len(result) < _MOST_SETTINGS else ():
+            if _is_plain(inner):
+                result[f"{name}.{key}"] = inner
+            elif level < depth - 1 and id(inner) not in visited and _may_hold_settings(inner):
+                visited.add(id(inner))
+                todo.append((f"{name}.{key}", inner, level + 1))
     return result
 
 
@@ -255,7 +252,8 @@ def _is_plain(value: Any) -> bool:
 
 
 def _may_hold_settings(value: Any) -> bool:
-    return not callable(value) and type(value).__module__.partition(".")[0] not in _NO_SETTINGS
+    package = str(getattr(type(value), "__module__", "builtins")).partition(".")[0]  # some compiled types have none
+    return package not in _NO_SETTINGS and hasattr(value, "__dict__") and not callable(value)
 
 
 def has_game_attribute(env: Any, name: str) -> bool:
