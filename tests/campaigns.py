@@ -80,12 +80,6 @@ CAMPAIGNS: Final = (
     _kills("SAF, a game that makes its generator late", "--game lazy"),
     _kills("SAF, JaxMARL's MPE in a batch", "--game jax", 4, needs=("jaxmarl",)),
     Campaign(
-        "crafted checkpoints, checksums right, contents wrong",
-        f"{PYTEST} tests/test_crafted_checkpoints.py",
-        1_000,
-        "CRAFTED={n}",
-    ),
-    Campaign(
         "each of bit flips, truncations, bytes too many in checkpoints",
         f"{PYTEST} tests/test_checkpoints_files.py",
         1_000,

@@ -432,6 +432,26 @@ def test_a_folder_without_checkpoints_cannot_be_resumed(tmp_path: Path) -> None:
         resumable_learn(make(), ROLLOUT, tmp_path / "file")
 
 
+def test_a_folder_that_is_removed_while_a_run_writes_is_made_again(tmp_path: Path) -> None:
+    class Remover(BaseCallback):
+        def _on_rollout_end(self) -> None:
+            shutil.rmtree(tmp_path / "ck", ignore_errors=True)
+
+        def _on_step(self) -> bool:
+            return True
+
+    struck(tmp_path / "ck", make, 20, [Remover()])
+    assert weights(go_on(tmp_path / "ck", make(), [Remover()])) == undisturbed()
+
+
+def test_other_conditions_are_told_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    resumable_learn(make(), ROLLOUT, tmp_path)
+    monkeypatch.setattr("sb3_saf.checkpoints.runs.package_version", lambda: "9.9")
+    with pytest.warns(UserWarning, match=r"sb3_saf was .*, now '9\.9'"):
+        model = resumable_learn(make(), WHOLE, tmp_path)
+    assert weights(model) == undisturbed()
+
+
 def test_another_run_does_not_go_into_the_folder(tmp_path: Path) -> None:
     go_on(tmp_path, make(), rollouts=1)
     with pytest.raises(CheckpointError, match="has checkpoints of another run"):
