@@ -262,9 +262,9 @@ class Leaving(Game):
         out[0] = {a: self.see(a) for a in self.agents}
 
 
-def returns_of_a(game: Game, **kwargs: Any) -> list[float]:
+def returns_of_a(game: Game, gae_lambda: float = 1.0) -> list[float]:
     """Return the returns of agent ``a`` in one episode with gamma 0.5, for a critic that says 0."""
-    model = ppo(make_team_env(game, **kwargs))
+    model = ppo(make_team_env(game), gae_lambda=gae_lambda)
     with th.no_grad():
         for parameter in model.policy.value_net.parameters():
             parameter.zero_()
@@ -292,6 +292,17 @@ def test_an_agent_learns_from_all_that_the_game_pays_it(
     assert returns_of_a(game) == expected
     env = make_team_env(game)
     assert evaluate_team(RandomPolicy(env, seed=0), env, 2).returns == [sum(paid)] * 2
+
+
+@pytest.mark.parametrize(
+    ("out", "paid", "expected"),
+    [((1, 2, 3), (0, 0, 0, 8), [1.0]), ((1,), (0, 2, 0, 8), [1.0, 0.0, 8.0])],
+)
+def test_what_is_paid_while_an_agent_is_away_needs_no_trace(
+    out: tuple[int, ...], paid: tuple[float, ...], expected: list[float]
+) -> None:
+    """With lambda 0, a return is the reward and the value that follows, which for the critic here is 0."""
+    assert returns_of_a(Leaving(out, paid, dies=False), gae_lambda=0.0) == expected
 
 
 class Alone(Game):
