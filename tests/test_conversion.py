@@ -15,6 +15,7 @@ from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, make_team_env, ppo_settings
 from sb3_saf.teams.rows import n_mask_entries
+from tests.contrib_teams import random_masks
 
 VECTOR: Final = spaces.Box(-1, 1, (5,), np.float64)
 SHORT: Final = spaces.Box(-1, 1, (3,), np.float32)
@@ -22,6 +23,7 @@ PICTURE: Final = spaces.Box(0, 255, (12, 12, 3), np.uint8)
 NESTED: Final = spaces.Dict(
     z=spaces.Discrete(3, start=4), a=spaces.Tuple([SHORT, spaces.MultiDiscrete([2, 3], start=[1, 0])])
 )
+MULTI: Final = spaces.MultiDiscrete([4, 3], start=[0, 2])
 FOUR, THREE = spaces.Discrete(4, start=2), spaces.Discrete(3)
 LONG, WIDE = spaces.Box(-2, 2, (3,), np.float32), spaces.Box(0, 1, (1,), np.float32)
 
@@ -39,6 +41,8 @@ KINDS: Final[dict[str, list[tuple[spaces.Space[Any], spaces.Space[Any]]]]] = {
         (SHORT, FOUR),
     ],
     "ambiguous": [(SHORT, THREE), (SHORT, FOUR), (VECTOR, THREE)],
+    "multi": [(VECTOR, MULTI), (SHORT, spaces.MultiDiscrete([2, 5])), (VECTOR, MULTI)],
+    "mixed": [(VECTOR, MULTI), (SHORT, FOUR), (VECTOR, MULTI)],
     "boxes": [(VECTOR, LONG), (SHORT, WIDE), (VECTOR, LONG)],
 }
 
@@ -78,7 +82,7 @@ class Kinds(ParallelEnv[str, Any, Any]):
             space.seed(int(self.rng.integers(1 << 30)))
             observations[agent] = space.sample()
             if self.masks is not None:
-                mask = (np.arange(n_mask_entries(acted) or 0) == self.rng.integers(3)).astype(np.int8)
+                mask = random_masks(acted, 1, self.rng)[0].astype(np.int8)
                 if self.masks == "info":
                     infos[agent] = {"action_mask": mask}
                 else:
