@@ -1,19 +1,33 @@
-"""Initial arrays of a batch: the data its games share, and games that have not begun."""
+"""
+Arrays of a batch: the data its games share, games that have not begun, and snapshots.
+
+A snapshot holds terrain, agents, their order of arrival, counters and random generators; derived data (agents by cell,
+tile codes) are computed on loading. Letters: E games, N agents, W columns and rows.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain
-from hecogrid_envs.core.occupancy import plane_offset
+from hecogrid_envs.constants import AGENT_PALETTE, BLUE_INDEX, KEY_CARRIER_INDEX, ZONE_COLOURS, Terrain
+from hecogrid_envs.core.occupancy import arrive, plane_offset
 from hecogrid_envs.core.types import Games, World
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams
+from hecogrid_envs.state import check_state, state_of
 from hecogrid_envs.task import DECLARED, TaskName
 from hecogrid_envs.tiles import FIRST_TERRAIN, turned_atlases
+
+Snapshot = Mapping[str, npt.NDArray[Any]]
+
+#: Arrays of games that a snapshot stores as they are.
+_STORED: Final = (
+    *("rng", "terrain", "x", "y", "direction", "has_key", "colour", "order", "steps", "collected", "collected_now"),
+)
 
 #: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
 SLACK: Final = 64
@@ -146,3 +160,57 @@ def empty_games(world: World, n_games: int) -> Games:
     games.order[...] = np.arange(world.n_agents)
     games.planes.reshape(n_games, -1)[...] = world.blank_planes  # the outer wall and what lies beyond it stay
     return games
+
+
+def take_snapshot(games: Games, seeded: npt.NDArray[np.bool_]) -> dict[str, npt.NDArray[Any]]:
+    """Copy E games: arrays by name; ``rank`` (E, N) counts the agents that arrived earlier in the same cell."""
+    ranks = np.zeros(games.before.shape, dtype=np.int32)
+    previous = games.before.astype(np.int64)
+    while (there := previous >= 0).any():
+        ranks += there
+        earlier = np.take_along_axis(games.before, np.maximum(previous, 0), axis=1)
+        previous = np.where(there, earlier, -1)
+    stored = {name: getattr(games, name).copy() for name in _STORED}
+    return {"seeded": seeded.copy(), **stored, "rank": ranks}
+
+
+def check_snapshot(snapshot: Snapshot, example: Snapshot, params: HECOGridParams) -> None:
+    """
+    Check that the kernels can index with a snapshot, whose values they do not check.
+
+    :param snapshot: to be restored
+    :param example: snapshot of the games that it is for
+    :param params: of these games
+    :raises ValueError: naming the first array that differs in shape or dtype, or a value out of range
+    """
+    for name, array in example.items():
+        given = np.asarray(snapshot.get(name))
+        if (given.shape, given.dtype) != (array.shape, array.dtype):
+            raise ValueError(
+                f"invalid snapshot: expected `{name}` as {array.dtype} {array.shape}, got {given.dtype} {given.shape}; "
+                "take the task, the parameters and the number of games that it was made with"
+            )
+    for name, high in {"terrain": max(Terrain), "has_key": 1, "colour": len(AGENT_PALETTE) - 1}.items():
+        if (highest := int(snapshot[name].max())) > high:
+            raise ValueError(f"invalid snapshot: `{name}` must be at most {high}, got {highest}")
+    if (np.sort(snapshot["order"], axis=1) != np.arange(params.n_agents)).any():
+        raise ValueError("invalid snapshot: `order` is not a permutation of the agents")
+    for game in np.flatnonzero(snapshot["seeded"]).tolist():
+        names = ("terrain", "x", "y", "direction", "has_key")
+        try:
+            check_state(state_of(*(snapshot[name][game] for name in names)), params)
+        except ValueError as error:
+            raise ValueError(f"invalid snapshot: game {game}: {error}") from error
+
+
+def load_snapshot(games: Games, world: World, snapshot: Snapshot) -> None:
+    """Restore games from a checked snapshot; their cells must be redrawn afterwards."""
+    for name, empty in empty_games(world, len(games.rng))._asdict().items():
+        getattr(games, name)[...] = empty
+    begun = snapshot["seeded"]
+    for name in _STORED:
+        getattr(games, name)[begun] = snapshot[name][begun]
+    cells = games.y * world.width + games.x
+    for game in np.flatnonzero(begun).tolist():
+        for agent in np.argsort(snapshot["rank"][game], kind="stable").tolist():
+            arrive(games, game, agent, int(cells[game, agent]))

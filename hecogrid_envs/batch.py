@@ -16,13 +16,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import typeof
 
-from hecogrid_envs.arrays import aligned, empty_games, world_of
+from hecogrid_envs.arrays import aligned, check_snapshot, empty_games, load_snapshot, take_snapshot, world_of
 from hecogrid_envs.constants import N_ACTIONS, Terrain, TreasureState
 from hecogrid_envs.constants import STEP as STEP_AHEAD
 from hecogrid_envs.core.rng import fresh_seed, generator_word
 from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.snapshots import check_snapshot, load_snapshot, take_snapshot
 from hecogrid_envs.state import StateMapping, check_state, state_of
 from hecogrid_envs.task import TaskName, check_task
 from hecogrid_envs.tiles import INVISIBLE
@@ -189,7 +188,13 @@ class GameBatch:
         shape = (self.n_games, self.params.n_agents)
         if actions.shape != shape:
             raise ValueError(f"actions must have shape {shape}, (games, agents), got {actions.shape}")
-        check_actions(actions)
+        if actions.dtype.kind not in "iu":
+            raise ValueError(f"actions must be integers, got {actions.dtype}")
+        # Negative numbers are large when read as unsigned.
+        if actions.view(f"u{actions.itemsize}").max() >= N_ACTIONS:
+            game, agent = np.argwhere((actions < 0) | (actions >= N_ACTIONS))[0].tolist()
+            got = f"{actions[game, agent]} for agent {agent} of game {game}"
+            raise ValueError(f"actions must be from 0 to {N_ACTIONS - 1}, got {got}")
         self._take(actions)
 
     def _take(self, actions: npt.NDArray[np.integer[Any]]) -> None:
@@ -207,14 +212,12 @@ class GameBatch:
         shape = (self.n_games, *self._view_shape)
         if given is None:
             return np.empty(shape, dtype=np.uint8)
+        expected = f"{name} must be a contiguous and writeable uint8 array of shape {shape}"
         if not isinstance(given, np.ndarray):
-            raise ValueError(f"{name} must be a contiguous uint8 array of shape {shape}, got {type(given).__name__}")
-        if given.shape != shape or given.dtype != np.uint8 or not given.flags.c_contiguous:
-            raise ValueError(
-                f"{name} must be a contiguous uint8 array of shape {shape}, got {given.dtype} {given.shape}"
-            )
-        if not given.flags.writeable:
-            raise ValueError(f"{name} must be an array that can be written to, got a read-only one")
+            raise ValueError(f"{expected}, got {type(given).__name__}")
+        contiguous, writeable = given.flags.c_contiguous, given.flags.writeable
+        if given.shape != shape or given.dtype != np.uint8 or not contiguous or not writeable:
+            raise ValueError(f"{expected}, got {given.dtype} {given.shape}, {contiguous=}, {writeable=}")
         return given
 
     def observe_game(self, game: int) -> U8:
@@ -305,23 +308,15 @@ class GameBatch:
         """
         return take_snapshot(self._games, self._seeded)
 
-    def check_snapshot(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
-        """
-        Check that a snapshot is a valid state of these games.
-
-        :param snapshot: result of :meth:`snapshot`
-        :raises ValueError: naming the first array with a wrong shape or type, or the first value that no game reaches
-        """
-        check_snapshot(snapshot, self._games, self._seeded, self.params)
-
     def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
         """
         Restore a snapshot of a batch with the same task, parameters and number of games.
 
         :param snapshot: result of :meth:`snapshot`; copied
-        :raises ValueError: see :meth:`check_snapshot`; the games are then unchanged
+        :raises ValueError: naming the first array with a wrong shape or dtype, or with values that are no indices of
+            cells, directions, colours or agents; the games are then unchanged
         """
-        self.check_snapshot(snapshot)
+        check_snapshot(snapshot, self.snapshot(), self.params)
         load_snapshot(self._games, self._world, snapshot)
         self._play_all(REDRAW)
         self._seeded[...] = snapshot["seeded"]
@@ -333,31 +328,17 @@ class GameBatch:
 
         :return: (N, W, H)
         """
-        view = (self.params.n_agents, self.params.view_size, self.params.view_size)
-        state, codes = self.get_state(game), self._views_of_game(self._checked(game), TILES, view)
-        return seen_cells(
-            codes != INVISIBLE,
-            state["agent_pos"],
-            state["agent_dir"],
-            self.params.view_offset,
-            self.params.grid_size,
-        )
-
-
-def check_actions(actions: npt.NDArray[Any]) -> None:
-    """
-    Check the actions of a step.
-
-    :param actions: integers from 0 to 6, game-major, then agent
-    :raises ValueError: if they are not integers, or naming the first row with a value out of range
-    """
-    if actions.dtype.kind not in "iu":
-        raise ValueError(f"actions must be integers, got {actions.dtype}")
-    # Negative numbers are large when read as unsigned.
-    if actions.view(f"u{actions.itemsize}").max() >= N_ACTIONS:
-        rows = actions.reshape(-1)
-        row = int(np.flatnonzero((rows < 0) | (rows >= N_ACTIONS))[0])
-        raise ValueError(f"actions must be from 0 to {N_ACTIONS - 1}, got {rows[row]} in row {row}")
+        state, side, width = self.get_state(game), self.params.view_size, self.params.grid_size
+        n_agents, offset = self.params.n_agents, self.params.view_offset
+        codes = self._views_of_game(self._checked(game), TILES, (n_agents, side, side))
+        agent, row, column = np.nonzero(codes != INVISIBLE)
+        ahead, aside = (side - 1 - offset - row)[:, np.newaxis], (column - side // 2)[:, np.newaxis]
+        facing = state["agent_dir"][agent]
+        cells = state["agent_pos"][agent] + ahead * STEP_AHEAD[facing] + aside * STEP_AHEAD[(facing + 1) % 4]
+        on_map = ((cells >= 0) & (cells < width)).all(axis=1)
+        seen = np.zeros((n_agents, width, width), dtype=np.bool_)
+        seen[agent[on_map], cells[on_map, 0], cells[on_map, 1]] = True
+        return seen
 
 
 def _positive(name: str, value: int) -> int:
@@ -376,31 +357,3 @@ def _announced_compilation() -> Iterator[None]:
         yield
     finally:
         timer.cancel()
-
-
-def seen_cells(
-    views: npt.NDArray[np.bool_], agent_pos: npt.NDArray[Any], agent_dir: npt.NDArray[Any], offset: int, width: int
-) -> npt.NDArray[np.bool_]:
-    """
-    Return which cells of the map the agents see, given their own views.
-
-    :param views: (N, V, V) bool, the cells each agent sees in its view, row by row, the agent facing up
-    :param agent_pos: (N, 2) x, y
-    :param agent_dir: (N,)
-    :param offset: rows visible behind the agent
-    :param width: W, side of the map
-    :return: (N, W, W) bool, indexed ``[agent, x, y]``; seen cells beyond the map are left out
-    """
-    side = views.shape[1]
-    agent, row, column = np.nonzero(views)
-    ahead, aside = side - 1 - offset - row, column - side // 2
-    direction = np.asarray(agent_dir)[agent]
-    cell = (
-        np.asarray(agent_pos)[agent]
-        + ahead[:, None] * STEP_AHEAD[direction]
-        + aside[:, None] * STEP_AHEAD[(direction + 1) % 4]
-    )
-    on_map = ((cell >= 0) & (cell < width)).all(axis=1)
-    seen = np.zeros((len(views), width, width), dtype=np.bool_)
-    seen[agent[on_map], cell[on_map, 0], cell[on_map, 1]] = True
-    return seen

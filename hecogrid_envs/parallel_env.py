@@ -15,10 +15,9 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from hecogrid_envs.batch import GameBatch
 from hecogrid_envs.constants import N_ACTIONS, Colour, Command, RenderMode, TreasureState, zone_colour
-from hecogrid_envs.page import COMMON_PAGE
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import STATE_PLANES, StateMapping, central_view, state_option
-from hecogrid_envs.task import DECLARED, Task, TaskName
+from hecogrid_envs.task import COMMON_PAGE, DECLARED, Task, TaskName
 from hecogrid_envs.tiles import observation_space
 
 Observations = dict[str, npt.NDArray[np.uint8]]
@@ -270,14 +269,25 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
 
             zones = self.params.zone_of_column() if self.params.heterogeneity > 1 else None
             return render_text(self.get_state(), zones=zones, step=self.n_steps, collected=self.collected)
-        frame = self._frame()
         if self.render_mode == "rgb_array":
-            return frame
-        self._show(frame)
+            return self.picture()
+        from hecogrid_envs.play import HumanWindow
+        from hecogrid_envs.rendering import fit_tile_size
+
+        if self._window is None:
+            self._window = HumanWindow(f"HECOGrid: {self.task}", fps=self.metadata["render_fps"])
+        self._window.show(self.picture(fit_tile_size(self.params.grid_size)))
         return None
 
-    def _frame(self) -> npt.NDArray[np.uint8]:
-        from hecogrid_envs.rendering import Scene, fit_tile_size, render_scene
+    def picture(self, tile_size: int | None = None, selected: int | None = None) -> npt.NDArray[np.uint8]:
+        """
+        Draw the game.
+
+        :param tile_size: pixels per cell, see :func:`hecogrid_envs.rendering.render_scene`
+        :param selected: index of an agent to mark
+        :return: (height, width, 3)
+        """
+        from hecogrid_envs.rendering import Scene, render_scene
 
         scene = Scene(
             task=self.task,
@@ -286,15 +296,9 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
             step=self.n_steps,
             collected=self.collected,
             visible=self._batch.fields_of_view(self._game),
+            selected=selected,
         )
-        return render_scene(scene, fit_tile_size(self.params.grid_size) if self.render_mode == "human" else None)
-
-    def _show(self, frame: npt.NDArray[np.uint8]) -> None:
-        from hecogrid_envs.window import HumanWindow
-
-        if self._window is None:
-            self._window = HumanWindow(f"HECOGrid: {self.task}", fps=self.metadata["render_fps"])
-        self._window.show(frame)
+        return render_scene(scene, tile_size)
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -1,5 +1,5 @@
 """
-Play a game with the keyboard: ``python -m hecogrid_envs.play TeamSupport``.
+A window for pictures, and playing in it with the keyboard: ``python -m hecogrid_envs.play TeamSupport``.
 
 You walk one agent at a time; the others wait, or wander with ``--others random``.
 """
@@ -9,26 +9,21 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import select
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+import warnings
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import fields
-from importlib.util import find_spec
-from typing import Any, Final, Literal, TextIO, get_args, get_type_hints
+from types import ModuleType
+from typing import Any, Final, Literal, get_args, get_type_hints
 
 import numpy as np
-import numpy.typing as npt
 
-from hecogrid_envs.batch import seen_cells
 from hecogrid_envs.constants import N_ACTIONS, Command, Direction
 from hecogrid_envs.parallel_env import HECOGridEnv
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.rendering import Picture, Scene, fit_tile_size, render_scene
+from hecogrid_envs.rendering import Picture, fit_tile_size
 from hecogrid_envs.tasks import parallel_env
-from hecogrid_envs.text import render_text
-from hecogrid_envs.tiles import INVISIBLE
-from hecogrid_envs.window import HumanWindow
 
 Others = Literal["wait", "random"]
 
@@ -60,13 +55,16 @@ what an agent has to learn. The number keys are never translated.
 #: Parameters that affect observations only, not the displayed game.
 _NOT_FOR_PEOPLE: Final = ("observation", "view_tile_size")
 _WINDOW_FPS: Final = 30
+_OTHER_WAYS: Final = (
+    'draw pictures with render_mode="rgb_array", text with "ansi", or set SDL_VIDEODRIVER=dummy to test'
+)
 
 
 class Session:
     """
     One person's game: turns keys into joint actions and says what happened.
 
-    :param env: the game, with tile codes as observations
+    :param env: the game
     :param seed: seed of the first game; later games continue its randomness
     :param raw: send each key's zone 0 integer instead of translating it for the agent's zone
     :param others: behaviour of the agents that are not selected
@@ -82,13 +80,11 @@ class Session:
         self._rng = np.random.default_rng(seed)
         self._zones = env.params.zone_of_column()
         self._command_of = env.params.command_of()
-        self._views: npt.NDArray[np.bool_]
         self.new_game(seed)
 
     def new_game(self, seed: int | None = None) -> None:
         """Start over on a new level."""
-        observations, _ = self.env.reset(seed=seed)
-        self._look(observations)
+        self.env.reset(seed=seed)
         self.over = False
         self.message = "new game; h lists the keys"
 
@@ -122,11 +118,8 @@ class Session:
         action = self.action_for(key)
         actions[self.selected] = action
         command = Command(int(self._command_of[self._zone(self.selected), action]))
-        observations, rewards, terminations, truncations, _ = self.env.step(
-            dict(zip(self.env.possible_agents, actions, strict=True))
-        )
-        self._look(observations)
-        self.over = any(terminations.values()) or any(truncations.values())
+        _, rewards, _, truncations, _ = self.env.step(dict(zip(self.env.possible_agents, actions, strict=True)))
+        self.over = any(truncations.values())
         gain = round(sum(rewards.values()))
         self.message = f"{key}: action {action} = {command.name.lower()}"
         self.message += f"; {gain} collected!" if gain else ""
@@ -150,10 +143,6 @@ class Session:
     def _zone(self, agent: int) -> int:
         return int(self._zones[self.env.get_state()["agent_pos"][agent][0]])
 
-    def _look(self, observations: Mapping[str, Any]) -> None:
-        views = [np.asarray(observations[agent]) for agent in self.env.possible_agents]
-        self._views = np.stack(views) != INVISIBLE
-
     @property
     def status(self) -> str:
         """Selected agent and outcome of the last action."""
@@ -162,148 +151,136 @@ class Session:
         key = ", has a key" if state["agent_has_key"][agent] else ""
         return f"agent {agent} (zone {self._zone(agent)}, facing {facing}{key}): {self.message}"
 
-    def text(self, colour: bool) -> str:
-        """Write the game as text, then the status."""
-        env = self.env
-        several = int(self._zones[-1]) > 0
-        page = render_text(
-            env.get_state(),
-            zones=self._zones if several else None,
-            step=env.n_steps,
-            collected=env.collected,
-            colour=colour,
-        )
-        return f"{page}\n{self.status}"
 
-    def picture(self, tile_size: int) -> Picture:
-        """Draw the game as a picture, the selected agent marked."""
-        env, state = self.env, self.env.get_state()
-        visible = seen_cells(
-            self._views, state["agent_pos"], state["agent_dir"], env.params.view_offset, env.params.grid_size
-        )
-        scene = Scene(env.task, env.params, state, env.n_steps, env.collected, visible, self.selected)
-        return render_scene(scene, tile_size)
-
-
-# --- in a window
-
-
-def play_window(session: Session, tile_size: int | None = None, echo: Callable[[str], object] = print) -> None:
+class HumanWindow:
     """
-    Play in a window until the person leaves.
+    Window that shows pictures and collects keys; it opens with the first picture.
+
+    After the person has closed it, pictures are dropped silently, so that the program continues.
+
+    :param title: text of the title bar
+    :param fps: maximum pictures per second, :meth:`show` waits if necessary; None never waits
+    """
+
+    def __init__(self, title: str = "HECOGrid", fps: float | None = None) -> None:
+        self.title = title
+        self.fps = fps
+        self.closed_by_user = False
+        self._pygame: ModuleType | None = None
+        self._screen: Any = None
+        self._clock: Any = None
+        self._keys: list[str] = []
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a window now."""
+        return self._screen is not None
+
+    def show(self, picture: Picture) -> None:
+        """
+        Show a picture; the window takes its size.
+
+        :param picture: (height, width, 3)
+        :raises ImportError: if pygame is missing
+        :raises RuntimeError: if there is no display
+        """
+        if self.closed_by_user:
+            return
+        pygame = self._open(picture.shape[1], picture.shape[0])
+        pygame.surfarray.blit_array(self._screen, picture.transpose(1, 0, 2))
+        pygame.display.flip()
+        self._collect_events()
+        if self.fps is not None:
+            self._clock.tick(self.fps)
+
+    def poll(self) -> list[str]:
+        """
+        Return the keys pressed since the last call.
+
+        :return: names such as ``"left"``, ``"space"``, ``"p"``, ``"3"``; ``"quit"`` if the window was closed
+        """
+        self._collect_events()
+        keys, self._keys = self._keys, []
+        return keys
+
+    def close(self) -> None:
+        """Close the window; a later picture opens a new one unless the person closed this one."""
+        if self._pygame is not None and self.is_open:
+            self._pygame.display.quit()
+        self._screen = None
+
+    def _open(self, width: int, height: int) -> ModuleType:
+        if self._pygame is None:
+            os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+            try:
+                with warnings.catch_warnings():  # some versions warn about setuptools, on which users cannot act
+                    warnings.simplefilter("ignore")
+                    import pygame as imported
+            except ImportError as error:
+                raise ImportError("a window needs pygame: pip install -e '.[render]'") from error
+            self._pygame = imported
+        pygame = self._pygame
+        if self._screen is None:
+            _start_display(pygame)
+            pygame.display.set_caption(self.title)
+            self._clock = pygame.time.Clock()
+        if self._screen is None or self._screen.get_size() != (width, height):
+            self._screen = pygame.display.set_mode((width, height))
+            pygame.key.set_repeat(300, 90)
+        return pygame
+
+    def _collect_events(self) -> None:
+        pygame = self._pygame
+        if pygame is None or not self.is_open:
+            return
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT:
+                self._keys.append("quit")
+                self.closed_by_user = True
+                self.close()
+                return
+            if event.type == pygame.KEYDOWN:
+                # Keys of the number pad have names such as "[4]".
+                self._keys.append(pygame.key.name(event.key).strip("[]"))
+
+
+def _start_display(pygame: ModuleType) -> None:
+    """
+    Start the display, or raise RuntimeError without one.
+
+    Without a screen, SDL silently selects a driver that shows nothing; it is accepted only if requested explicitly.
+    """
+    try:
+        pygame.display.init()
+    except pygame.error as error:
+        raise RuntimeError(f"no window can be opened ({error}); {_OTHER_WAYS}") from error
+    driver = pygame.display.get_driver()
+    if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
+        pygame.display.quit()
+        raise RuntimeError(f"no window can be opened (there is no display); {_OTHER_WAYS}")
+
+
+def play_window(session: Session, tile_size: int | None = None) -> None:
+    """
+    Play in a window until the person leaves; the status is printed after every key.
 
     :param session: the game
     :param tile_size: pixels per cell; by default as many as fit the screen of a laptop
-    :param echo: called with the status after every key
     """
-    tile = tile_size or fit_tile_size(session.env.params.grid_size, 840)
-    echo(KEYS_HELP)
-    with closing(HumanWindow(f"HECOGrid: {session.env.task}", fps=_WINDOW_FPS)) as window:
-        picture = session.picture(tile)
+    env, tile = session.env, tile_size or fit_tile_size(session.env.params.grid_size, 840)
+    print(KEYS_HELP)
+    with closing(HumanWindow(f"HECOGrid: {env.task}", fps=_WINDOW_FPS)) as window:
+        picture = env.picture(tile, session.selected)
         while True:
             window.show(picture)
             for key in window.poll():
                 if not session.press(key):
                     return
-                echo(session.status)
-                picture = session.picture(tile)
-
-
-# --- in a terminal
-
-
-def play_text(session: Session, stdin: TextIO, stdout: TextIO) -> None:
-    """
-    Play in a terminal, key by key, or from lines of key names if the input is no terminal.
-
-    :param session: the game
-    :param stdin: keys
-    :param stdout: where the game is written
-    """
-    terminal = stdin.isatty() and find_spec("termios") is not None  # not on Windows
-    colour = stdout.isatty() and "NO_COLOR" not in os.environ
-    clear = "\x1b[2J\x1b[H" if terminal and stdout.isatty() else ""
-    mode: AbstractContextManager[object] = _single_keys(stdin) if terminal else nullcontext()
-    with mode:
-        print(clear + session.text(colour), file=stdout, flush=True)
-        for key in terminal_keys(stdin.fileno()) if terminal else line_keys(stdin):
-            if not session.press(key):
-                return
-            print(clear + session.text(colour), file=stdout, flush=True)
-
-
-def line_keys(stdin: TextIO) -> Iterator[str]:
-    """Read keys from lines such as ``up up left p``: their words, in lower case."""
-    for line in stdin:
-        yield from line.lower().split()
-
-
-_ESCAPES: Final = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OC": "right", "OD": "left"}
-
-
-def terminal_keys(descriptor: int) -> Iterator[str]:
-    """
-    Read keys from a terminal in single key mode; arrow keys arrive as escape sequences, Esc as a lone escape.
-
-    :param descriptor: file descriptor to read bytes from
-    :return: names as :class:`~hecogrid_envs.window.HumanWindow` gives them, until the input ends
-    """
-    names = {"\t": "tab", " ": "space", "\x04": "quit"}
-    while True:
-        key = os.read(descriptor, 1).decode(errors="replace")
-        if not key:
-            return
-        if key == "\x1b":
-            # The rest of an escape sequence follows immediately.
-            sequence = ""
-            while len(sequence) < 2 and select.select([descriptor], [], [], 0.05)[0]:
-                sequence += os.read(descriptor, 1).decode(errors="replace")
-            yield _ESCAPES.get(sequence, "escape" if not sequence else f"escape {sequence}")
-        else:
-            yield names.get(key, key.lower())
-
-
-@contextmanager
-def _single_keys(stdin: TextIO) -> Iterator[None]:
-    """Put a terminal into single key mode without echo, and restore it at the end."""
-    import termios
-    import tty
-
-    before = termios.tcgetattr(stdin.fileno())
-    tty.setcbreak(stdin.fileno())
-    try:
-        yield
-    finally:
-        termios.tcsetattr(stdin.fileno(), termios.TCSADRAIN, before)
+                print(session.status)
+                picture = env.picture(tile, session.selected)
 
 
 # --- the command line
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Build the command line parser: one option per parameter of the world, and the player's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hecogrid_envs.play",
-        description="Play a HECOGrid game with the keyboard.",
-        epilog=KEYS_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "task", nargs="?", default="TeamSupport", help="TeamTogether, TeamSupport (default) or KeyForTreasure"
-    )
-    parser.add_argument("--seed", type=int, help="seed of the first game (default: a new one every time)")
-    parser.add_argument(
-        "--raw", action="store_true", help="do not translate keys into the dynamics of the agent's zone"
-    )
-    parser.add_argument(
-        "--others", choices=get_args(Others), default="wait", help="what the other agents do (default: wait)"
-    )
-    parser.add_argument(
-        "--text", action="store_true", help="play in the terminal; reads lines of key names from a pipe"
-    )
-    parser.add_argument("--tile-size", type=int, help="pixels per cell in the window (default: fit the screen)")
-    _add_world_options(parser.add_argument_group("world", "parameters of the game"))
-    return parser
 
 
 def _add_world_options(group: argparse._ArgumentGroup) -> None:
@@ -331,7 +308,18 @@ def make_session(arguments: Sequence[str] | None = None) -> tuple[Session, argpa
 
     :param arguments: command line arguments, ``sys.argv[1:]`` by default
     """
-    parser = build_parser()
+    parser = argparse.ArgumentParser(
+        prog="python -m hecogrid_envs.play",
+        description="Play a HECOGrid game with the keyboard.",
+        epilog=KEYS_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("task", nargs="?", default="TeamSupport", help="its name (default: TeamSupport)")
+    parser.add_argument("--seed", type=int, help="seed of the first game (default: a new one every time)")
+    parser.add_argument("--raw", action="store_true", help="do not translate keys into the dynamics of the zone")
+    parser.add_argument("--others", choices=get_args(Others), default="wait", help="other agents (default: wait)")
+    parser.add_argument("--tile-size", type=int, help="pixels per cell (default: fit the screen)")
+    _add_world_options(parser.add_argument_group("world", "parameters of the game"))
     options = parser.parse_args(arguments)
     names = {field.name for field in fields(HECOGridParams)}
     world = {name: value for name, value in vars(options).items() if name in names}
@@ -346,14 +334,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     session, options = make_session(arguments)
     try:
-        if options.text:
-            play_text(session, sys.stdin, sys.stdout)
-        else:
-            play_window(session, options.tile_size)
+        play_window(session, options.tile_size)
     except KeyboardInterrupt:
         pass
     except (ImportError, RuntimeError) as error:
-        sys.exit(f"{error}\n(or play in the terminal: add --text)")
+        sys.exit(str(error))
     finally:
         session.env.close()
 

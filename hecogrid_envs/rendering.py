@@ -76,25 +76,31 @@ class Scene(NamedTuple):
     selected: int | None = None
 
 
-def render_scene(scene: Scene, tile_size: int | None = None, show_views: bool = True) -> Picture:
+def render_scene(scene: Scene, tile_size: int | None = None) -> Picture:
     """
     Draw a scene.
 
     :param scene: what to draw
     :param tile_size: pixels per cell, from 4 to 128; by default 24, and less for maps of more than 60 cells
-    :param show_views: outline what each agent sees (needs ``scene.visible``)
     :return: (height, width, 3); the size depends on the task, the parameters and ``tile_size`` only
     :raises ValueError: if the tile size is out of range or the picture exceeds :data:`MAX_PIXELS`
     :raises ImportError: if Pillow is missing
     """
     if tile_size is None:
         tile_size = min(_USUAL_TILE, fit_tile_size(scene.params.grid_size, _LARGEST_SIDE))
-    _check_size(scene.params, tile_size)
+    side = scene.params.grid_size
+    if not isinstance(tile_size, (int, np.integer)) or not MIN_TILE <= tile_size <= MAX_TILE:
+        raise ValueError(f"tile_size must be an integer from {MIN_TILE} to {MAX_TILE}, got {tile_size!r}")
+    if (side * tile_size) ** 2 > MAX_PIXELS:
+        raise ValueError(
+            f"a map of {side} x {side} cells at tile_size={tile_size} is more than {MAX_PIXELS} pixels; use "
+            f"tile_size={fit_tile_size(side)}"
+        )
     walls = np.ascontiguousarray(scene.state["walls"], dtype=np.bool_)
     image = _background(scene.task, scene.params, tile_size, walls.tobytes()).copy()
     _draw_header(image, scene, tile_size)
     top = header_height(scene.task, scene.params, tile_size)
-    if show_views and scene.visible is not None:
+    if scene.visible is not None:
         _draw_views(image, scene, tile_size, top)
     _draw_objects(image, scene, tile_size, top)
     _draw_agents(image, scene, tile_size, top)
@@ -115,16 +121,6 @@ def fit_tile_size(grid_size: int, max_pixels: int = 960) -> int:
     :return: pixels per cell, at least 4
     """
     return int(np.clip(max_pixels // grid_size, MIN_TILE, 32))
-
-
-def _check_size(params: HECOGridParams, tile_size: int) -> None:
-    if not isinstance(tile_size, (int, np.integer)) or not MIN_TILE <= tile_size <= MAX_TILE:
-        raise ValueError(f"tile_size must be an integer from {MIN_TILE} to {MAX_TILE}, got {tile_size!r}")
-    if (params.grid_size * tile_size) ** 2 > MAX_PIXELS:
-        raise ValueError(
-            f"a map of {params.grid_size} x {params.grid_size} cells at tile_size={tile_size} is more than "
-            f"{MAX_PIXELS} pixels; use tile_size={fit_tile_size(params.grid_size)}"
-        )
 
 
 def _pillow() -> tuple[ModuleType, ModuleType, ModuleType]:

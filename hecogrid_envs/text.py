@@ -1,5 +1,5 @@
 """
-Games as text, for terminals and tests, and levels from text.
+Games as text, and levels from text.
 
 One character per cell, then a list of the agents with their index and ground, for which a cell has no room. The text
 holds the complete state mapping, so that a printed game can be read back::
@@ -18,14 +18,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from hecogrid_envs.constants import KEY_CARRIER_COLOUR, Colour, TreasureState, zone_colour
+from hecogrid_envs.constants import TreasureState
 from hecogrid_envs.state import StateMapping
 
 WALL: Final = "#"
@@ -45,23 +44,9 @@ LEGEND: Final = (
 
 _ZONE_DIGITS: Final = "0123456789abcdefghijklmnopqrstuvwxyz"
 _AGENT_WORD: Final = re.compile(rf"(\d+)([{re.escape(AGENT + CARRIER)}])(\d+),(\d+)([$_]?)")
-_ESCAPE: Final = re.compile(r"\x1b\[[0-9;]*m")
 _PAGE_WIDTH: Final = 100
 
-_INKS: Final[dict[str, Colour]] = {
-    WALL: (150, 155, 170),
-    FLOOR: (90, 95, 110),
-    TREASURE: (38, 222, 129),
-    COLLECTED: (120, 125, 140),
-    KEY: (255, 214, 64),
-}
-
 _Planes = tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8], npt.NDArray[np.bool_]]
-
-
-class _Ink(NamedTuple):
-    front: Colour
-    back: Colour
 
 
 class _Agent(NamedTuple):
@@ -77,7 +62,6 @@ def render_text(
     zones: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
     step: int | None = None,
     collected: int | None = None,
-    colour: bool = False,
     legend: bool = True,
 ) -> str:
     """
@@ -87,7 +71,6 @@ def render_text(
     :param zones: (W,) zone of each column, written above the map as digits and letters
     :param step: game steps so far
     :param collected: treasures collected so far
-    :param colour: colour it for a terminal (ANSI, 24 bits)
     :param legend: end with a line that explains the characters
     :return: lines, without a final newline; :func:`parse_level` reads them back
     """
@@ -95,12 +78,9 @@ def render_text(
     known = [f"{name} {value}" for name, value in (("step", step), ("collected", collected)) if value is not None]
     if known:
         lines.append("  ".join(known))
-    columns = None if zones is None else [int(zone) for zone in zones]
-    if columns is not None:
-        heading = "".join(_ZONE_DIGITS[zone % len(_ZONE_DIGITS)] for zone in columns)
-        lines.append(_painted(heading, columns, _zone_ink) if colour else heading)
-    rows = ["".join(row) for row in _characters(state).T]
-    lines += [_painted(row, columns or [0] * len(row), _cell_ink) for row in rows] if colour else rows
+    if zones is not None:
+        lines.append("".join(_ZONE_DIGITS[int(zone) % len(_ZONE_DIGITS)] for zone in zones))
+    lines += ["".join(row) for row in _characters(state).T]
     lines += _agent_lines(state)
     if legend:
         lines.append(LEGEND)
@@ -143,36 +123,6 @@ def _agent_lines(state: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-# --- colours of a terminal
-
-
-def _painted(row: str, zones: list[int], ink: Callable[[str, int], _Ink]) -> str:
-    """Colour a line, with one escape sequence per run of equal colours."""
-    parts = []
-    inks = (ink(character, zone) for character, zone in zip(row, zones, strict=True))
-    for look, run in groupby(zip(inks, row, strict=True), key=lambda pair: pair[0]):
-        front, back = (";".join(map(str, part)) for part in look)
-        parts.append(f"\x1b[38;2;{front};48;2;{back}m{''.join(character for _, character in run)}\x1b[0m")
-    return "".join(parts)
-
-
-def _zone_ink(character: str, zone: int) -> _Ink:
-    red, green, blue = zone_colour(zone)
-    return _Ink((0, 0, 0) if red + 2 * green > 250 else (255, 255, 255), (red, green, blue))
-
-
-def _cell_ink(character: str, zone: int) -> _Ink:
-    """Choose colours: the ground is the zone's colour, darkened; agents are the zone's colour, lightened."""
-    red, green, blue = zone_colour(zone)
-    if character in AGENT:
-        front: Colour = (64 + 3 * red // 4, 64 + 3 * green // 4, 64 + 3 * blue // 4)
-    elif character in CARRIER:
-        front = KEY_CARRIER_COLOUR
-    else:
-        front = _INKS.get(character, (255, 255, 255))
-    return _Ink(front, (28 + red // 9, 28 + green // 9, 28 + blue // 9))
-
-
 # --- reading
 
 
@@ -184,7 +134,7 @@ def parse_level(text: str) -> StateMapping:
     order and stand on plain floor; with one, its numbers, grounds and directions apply, and agents may be left out
     of the map (``#.$.#`` with ``agents 0>2,1`` puts agent 0 on the treasure). Spaces are floor, too.
 
-    :param text: the level; colours, indentation, empty lines, step, zones and legend are ignored
+    :param text: the level; indentation, empty lines, step, zones and legend are ignored
     :return: state mapping; whether it fits an environment is checked by the environment
     :raises ValueError: naming the first line or cell that cannot be read
     """
@@ -213,7 +163,7 @@ def _sort_lines(text: str) -> tuple[list[str], list[str]]:
     rows: list[str] = []
     words: list[str] = []
     ended = False
-    for line in (raw.strip() for raw in _ESCAPE.sub("", text).splitlines()):
+    for line in map(str.strip, text.splitlines()):
         if line.startswith("agents"):
             words += line.split()[1:]
         elif line.startswith(WALL) and not ended:

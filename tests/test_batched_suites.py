@@ -278,7 +278,8 @@ def test_games_of_vmas_begin_again_one_by_one() -> None:
             assert (rows["obs"][3 * game] != infos[3 * game]["terminal_observation"]["obs"]).any()
         going = ~dones
         if dones.any() and going.any():
-            assert np.abs(rows["obs"][going] - last["obs"][going]).max() < 0.5, "others go on"
+            change = np.abs(rows["obs"][going] - last["obs"][going])[:, :-1]  # the last is an angle, which may wrap
+            assert change.max() < 0.5, "others go on"
     assert any(t < 99 and not truncated for t, truncated in ends)
 
 

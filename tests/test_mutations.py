@@ -188,7 +188,7 @@ def test_mutated_states_are_refused_in_our_own_words_or_can_be_played() -> None:
 def test_mutated_levels_are_refused_in_our_own_words_or_can_be_played() -> None:
     rng = random.Random(0)
     env, count = a_game(), 0
-    text = render_text(env.get_state(), colour=False)
+    text = render_text(env.get_state())
     for _ in range(COUNT):
         level = scrambled(text, rng)
 

@@ -1,14 +1,9 @@
-"""Playing: keys become the right action integers; the program runs in a terminal, from a pipe and in a window."""
+"""Playing: keys become the right action integers; the program runs in a window."""
 
 from __future__ import annotations
 
-import io
-import os
-import subprocess
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import permutations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +12,8 @@ import pytest
 from hecogrid_envs import TeamSupportEnv, play
 from hecogrid_envs.parallel_env import StepResult
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.play import Others, Session, line_keys, make_session, play_text, play_window, terminal_keys
+from hecogrid_envs.play import HumanWindow, Others, Session, make_session, play_window
 from hecogrid_envs.text import parse_level
-from hecogrid_envs.window import HumanWindow, _import_pygame
 
 #: Zone 0 is columns 0 to 4, zone 1 columns 5 to 9.
 LEVEL = """
@@ -182,105 +176,25 @@ def test_forward_walks_in_every_zone_unless_raw() -> None:
     assert session.env.get_state()["agent_pos"][1].tolist() == [5, 2]
 
 
-def test_text_shows_the_game() -> None:
-    session = real_session(heterogeneity=2)
-    lines = session.text(colour=False).splitlines()
-    assert lines[:4] == ["step 0  collected 0", "0000011111", "##########", "#>.$.v...#"]
-    assert lines[-1] == "agent 0 (zone 0, facing east): new game; h lists the keys"
-    assert real_session().text(colour=False).splitlines()[1] == "##########"
-
-
-def test_picture_marks_the_selected_agent_and_its_view() -> None:
+def test_picture_marks_the_selected_agent_and_the_views() -> None:
     pytest.importorskip("PIL")
-    session = real_session()
-    session.press("space")
-    first = session.picture(12)
-    session.press("tab")
+    session, game = noted_session()
+    first = game.picture(12, selected=0)
     assert first.shape[1] == 120
-    assert not np.array_equal(first, session.picture(12))
-    session._views[:] = False
-    session.selected = 0
-    assert not np.array_equal(first, session.picture(12))
-
-
-# --- in a terminal
-
-
-def test_lines_of_keys() -> None:
-    assert list(line_keys(io.StringIO("up UP left\n\n  p\nq"))) == ["up", "up", "left", "p", "q"]
-
-
-def test_playing_from_a_pipe() -> None:
-    out = io.StringIO()
-    play_text(real_session(), io.StringIO("up up\nq up\n"), out)
-    pages = [line for line in out.getvalue().splitlines() if line.startswith("step")]
-    assert pages == ["step 0  collected 0", "step 1  collected 0", "step 2  collected 1"]
-    assert "\x1b" not in out.getvalue()
-
-
-def test_single_keys() -> None:
-    reader, writer = os.pipe()
-    os.write(writer, b"\x1b[A\x1b[D\x1bOCpD \t3\x04")
-    os.close(writer)
-    try:
-        keys = ["up", "left", "right", "p", "d", "space", "tab", "3", "quit"]
-        assert list(terminal_keys(reader)) == keys
-    finally:
-        os.close(reader)
-
-
-def test_escape_alone_is_a_key() -> None:
-    reader, writer = os.pipe()
-    try:
-        os.write(writer, b"\x1b")
-        assert next(terminal_keys(reader)) == "escape"
-    finally:
-        os.close(reader)
-        os.close(writer)
-
-
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, int]]:
-    """Return the two ends of a terminal: the player's and the program's."""
-    pty = pytest.importorskip("pty", reason="no terminals of this kind on Windows")
-    player, program = pty.openpty()
-    yield player, program
-    os.close(player)
-    os.close(program)
-
-
-def test_playing_key_by_key_in_a_terminal(terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    import termios
-
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    player, program = terminal
-    before = termios.tcgetattr(program)
-    # No newlines: keys take effect when pressed.
-    keys = iter([b"\x1b[A", b"\x1b[A", b"q"])
-
-    class Screen(io.StringIO):
-        """Presses a key whenever there is a new page."""
-
-        def flush(self) -> None:
-            os.write(player, next(keys))
-
-    session = real_session()
-    with open(program, closefd=False) as stdin:
-        play_text(session, stdin, Screen())
-    assert session.env.collected == 1
-    assert termios.tcgetattr(program) == before
+    assert not np.array_equal(first, game.picture(12, selected=1))
+    session.press("right")
+    session.press("left")
+    back = game.picture(12, selected=0)
+    assert np.array_equal(first[-120:], back[-120:]), "all but the steps above the map"
 
 
 # --- in a window
 
 
-def test_playing_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_playing_in_a_window(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("PIL")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    try:
-        pygame = _import_pygame()
-    except ImportError:
-        pytest.skip("pygame is not installed")
+    pygame = pytest.importorskip("pygame")
     session = real_session()
     shown = []
     keys = iter([pygame.K_UP, pygame.K_UP, pygame.K_q])
@@ -291,13 +205,12 @@ def test_playing_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
         pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=next(keys)))
 
     monkeypatch.setattr(HumanWindow, "show", press_next)
-    said: list[str] = []
-    play_window(session, tile_size=12, echo=said.append)
+    play_window(session, tile_size=12)
     assert session.env.collected == 1
     assert len(shown) == 3
     assert not np.array_equal(shown[0], shown[2])
-    assert said[0] == play.KEYS_HELP
-    assert said[-1].endswith("1 collected!")
+    printed = capsys.readouterr().out
+    assert printed.startswith(play.KEYS_HELP) and printed.endswith("1 collected!\n")
     assert not pygame.display.get_init()
 
 
@@ -308,7 +221,7 @@ def test_every_parameter_is_an_option() -> None:
     words = (
         "TeamTogether --n-agents 4 --grid-size 12 --coordination 2 --heterogeneity 3 --n-treasures 9 --n-keys 1 "
         "--clutter-density 0.2 --view-size 5 --view-offset 2 --support-radius 3 --max-cycles 20 --rules released "
-        "--agent-order index --seed 3 --raw --others random --text"
+        "--agent-order index --seed 3 --raw --others random --tile-size 9"
     )
     session, options = make_session(words.split())
     assert session.env.task == "TeamTogether"
@@ -328,22 +241,22 @@ def test_every_parameter_is_an_option() -> None:
         agent_order="index",
         observation="tiles",
     )
-    assert (session.raw, session.others, options.text) == (True, "random", True)
+    assert (session.raw, session.others, options.tile_size) == (True, "random", 9)
 
 
 def test_defaults_are_those_of_the_world() -> None:
-    session, options = make_session([])
+    session, _ = make_session([])
     assert session.env.params == HECOGridParams(observation="tiles")
-    assert (session.env.task, session.raw, session.others, options.text) == ("TeamSupport", False, "wait", False)
+    assert (session.env.task, session.raw, session.others) == ("TeamSupport", False, "wait")
 
 
 WRONG = [
-    (["TeamSuport"], "unknown task 'TeamSuport' (did you mean 'TeamSupport'?)"),
-    (["--coordination", "11"], "coordination must be an integer from 1 to 10"),
-    (["--grid-size", "big"], "argument --grid-size: invalid int value: 'big'"),
-    (["--rules", "mine"], "argument --rules: invalid choice: 'mine'"),
-    (["--grid-size", "8"], "n_treasures must be an integer from 0 to 36"),
-    (["--seed", "-1"], "non-negative"),
+    (["TeamSuport"], "did you mean 'TeamSupport'"),
+    (["--coordination", "11"], "coordination"),
+    (["--grid-size", "big"], "--grid-size"),
+    (["--rules", "mine"], "--rules"),
+    (["--grid-size", "8"], "n_treasures"),
+    (["--seed", "-1"], "seed"),
 ]
 
 
@@ -364,26 +277,10 @@ def test_help_lists_keys_and_parameters(capsys: pytest.CaptureFixture[str]) -> N
     assert "number of zones" in page
 
 
-def test_the_program_as_typed() -> None:
-    small = ["--n-agents", "2", "--grid-size", "8", "--n-treasures", "3", "--n-keys", "0"]
-    done = subprocess.run(
-        [sys.executable, "-m", "hecogrid_envs.play", "TeamSupport", "--text", "--seed", "1", *small],
-        input="up space\nr\nq\n",
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(__file__).parent.parent,
-    )
-    steps = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("step")]
-    assert steps == ["0", "1", "2", "0"]
-    assert done.stderr == ""
-
-
-def test_no_window_points_to_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_window_the_program_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise RuntimeError("no display")
 
     monkeypatch.setattr(play, "play_window", refuse)
-    with pytest.raises(SystemExit) as stop:
+    with pytest.raises(SystemExit, match="no display"):
         play.main(["--n-agents", "2"])
-    assert stop.value.code == "no display\n(or play in the terminal: add --text)"

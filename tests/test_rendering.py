@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import os
-import socket
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from hecogrid_envs import rendering, window
-from hecogrid_envs.batch import seen_cells
+from hecogrid_envs import rendering
 from hecogrid_envs.constants import zone_colour
 from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.play import HumanWindow
 from hecogrid_envs.rendering import Scene, fit_tile_size, header_height, render_scene
 from hecogrid_envs.task import TaskName
-from hecogrid_envs.window import HumanWindow
 
 pytest.importorskip("PIL")
 
@@ -68,8 +65,12 @@ def cell_of(scene: Scene, x: int, y: int, tile: int = TILE) -> npt.NDArray[np.ui
     return draw(scene, tile)[1][x, y]
 
 
-def count(cell: npt.NDArray[np.uint8], colour: tuple[int, int, int]) -> int:
+def count(cell: npt.NDArray[np.uint8], colour: tuple[int, ...]) -> int:
     return int((cell == colour).all(axis=-1).sum())
+
+
+def golden(cell: npt.NDArray[np.uint8]) -> int:
+    return count(cell, (255, 214, 64))
 
 
 # --- size
@@ -99,13 +100,12 @@ def test_fit_tile_size(grid_size: int, max_pixels: int, tile: int) -> None:
 
 @pytest.mark.parametrize("tile", [3, 129, 12.0])
 def test_wrong_tile_size(tile: Any) -> None:
-    with pytest.raises(ValueError, match=f"^tile_size must be an integer from 4 to 128, got {tile}$"):
+    with pytest.raises(ValueError, match=f"tile_size .*got {tile}"):
         render_scene(make_scene(), tile)
 
 
 def test_enormous_picture_is_refused_with_advice() -> None:
-    message = r"^a map of 100 x 100 cells at tile_size=128 is more than 67108864 pixels; use tile_size=9$"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"100 x 100 .*tile_size=128 .*tile_size=9"):
         render_scene(make_scene(grid_size=100), 128)
 
 
@@ -115,14 +115,14 @@ def test_enormous_picture_is_refused_with_advice() -> None:
 def test_floor_shows_the_zone_and_walls_do_not() -> None:
     scene = make_scene(heterogeneity=3)
     scene.state["walls"][4, 6] = True
-    zones, cells = scene.params.zone_of_column(), draw(scene)[1]
+    zones, cells = scene.params.zone_of_column(), draw(scene)[1].astype(int)
+    one_zone = make_scene(heterogeneity=1)
+    neutral = cell_of(one_zone, 2, 2)[10, 10].astype(int)
     for x in range(1, SIDE - 1):
-        expected = 0.75 * np.array(rendering._FLOOR) + 0.25 * np.array(zone_colour(int(zones[x])))
+        expected = 0.75 * neutral + 0.25 * np.array(zone_colour(int(zones[x])))
         assert np.abs(cells[x, 4, 10, 10] - expected).max() <= 1
-    assert (cells[4, 6] == rendering._WALL).all()
-    neutral = make_scene(heterogeneity=1)
-    assert (cell_of(neutral, 2, 2)[1:-1, 1:-1] == rendering._FLOOR).all()
-    assert len(draw(neutral)[0]) < len(draw(scene)[0])
+    assert (cells[4, 6] == cells[0, 0]).all() and (cells[4, 6] != cells[4, 5]).any()
+    assert len(draw(one_zone)[0]) < len(draw(scene)[0])
 
 
 @pytest.mark.parametrize(("rules", "n_zones"), [("paper", 3), ("released", 4)])
@@ -162,8 +162,8 @@ def test_gems_have_the_colour_of_the_task(task: TaskName, brightest: int) -> Non
 def test_keys_are_golden() -> None:
     scene = make_scene()
     scene.state["keys"][2, 2] = True
-    assert count(cell_of(scene, 2, 2), rendering._KEY) > 20
-    assert count(cell_of(scene, 3, 2), rendering._KEY) == 0
+    assert golden(cell_of(scene, 2, 2)) > 20
+    assert golden(cell_of(scene, 3, 2)) == 0
 
 
 # --- agents
@@ -175,13 +175,8 @@ def test_agents_have_colours_of_their_own_and_numbers() -> None:
     cells = draw(scene)[1]
     for agent, colour in enumerate((*rendering.AGENT_COLOURS, rendering.AGENT_COLOURS[0])):
         assert count(cells[1 + agent, 5], colour) > 40
-    floor = make_scene([(1, 5, 0, False)] * 8)
-    assert not np.array_equal(cell_of(make_scene([(1, 5, 0, False)]), 1, 5), cell_of(floor, 1, 5))
-    assert not np.array_equal(rendering._agent_sprite(look(0)), rendering._agent_sprite(look(7)))
-
-
-def look(agent: int = 0, direction: int = 0, has_key: bool = False, size: int = TILE) -> rendering._Look:
-    return rendering._Look(size, agent, direction, has_key, False)
+    one_zone = draw(make_scene([(1 + agent, 5, 0, False) for agent in range(8)]))[1]
+    assert not np.array_equal(one_zone[1, 5], one_zone[8, 5])
 
 
 @pytest.mark.parametrize("tile", [12, 24])
@@ -195,8 +190,8 @@ def test_agent_points_where_it_faces(direction: int, tile: int) -> None:
 
 def test_key_carriers_show_their_key() -> None:
     cells = draw(make_scene([(2, 2, 0, True), (4, 2, 0, False)]))[1]
-    assert count(cells[2, 2][: TILE // 2, TILE // 2 :], rendering._KEY) > 10
-    assert count(cells[4, 2], rendering._KEY) == 0
+    assert golden(cells[2, 2][: TILE // 2, TILE // 2 :]) > 10
+    assert golden(cells[4, 2]) == 0
 
 
 def test_treasure_shows_behind_an_agent() -> None:
@@ -246,25 +241,6 @@ def test_views_are_outlined_and_change_nothing_else() -> None:
     assert 0 < (drawn - plain)[4, 5, 10, 10].max() < 16
     assert (drawn - plain)[3, 5, 10, 0, 0] > 60
     assert (drawn - plain)[4, 5, 10, 0, 0] < 16
-    np.testing.assert_array_equal(render_scene(seen, TILE, show_views=False), render_scene(scene, TILE))
-
-
-@pytest.mark.parametrize(
-    ("direction", "ahead", "right"),
-    [(0, (6, 5), (5, 6)), (1, (5, 6), (4, 5)), (2, (4, 5), (5, 4)), (3, (5, 4), (6, 5))],
-)
-def test_seen_cells_turn_with_the_agent(direction: int, ahead: tuple[int, int], right: tuple[int, int]) -> None:
-    views = np.zeros((3, 7, 7), dtype=bool)
-    views[0, 5, 3] = True  # the agent's own cell, with one row behind it
-    views[1, 4, 3] = True  # one ahead
-    views[2, 5, 4] = True  # one to the right
-    seen = seen_cells(views, np.array([(5, 5)] * 3), np.full(3, direction), 1, SIDE)
-    assert [np.argwhere(plane).tolist() for plane in seen] == [[[5, 5]], [list(ahead)], [list(right)]]
-
-
-def test_seen_cells_beyond_the_map_are_left_out() -> None:
-    seen = seen_cells(np.ones((1, 3, 3), dtype=bool), np.array([(0, 0)]), np.array([3]), 1, 4)
-    assert np.argwhere(seen[0]).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
 
 
 # --- the bar above the map
@@ -281,27 +257,23 @@ def test_step_score_and_treasures_are_in_the_header() -> None:
     assert draw(scene._replace(step=3, collected=1))[0].tobytes() not in pages
 
 
-@pytest.mark.parametrize(("grid_size", "tile"), [(6, 8), (6, 24), (8, 12), (30, 24)])
+@pytest.mark.parametrize(("grid_size", "tile"), [(6, 24), (8, 12), (30, 24)])
 def test_words_stay_inside_the_header(grid_size: int, tile: int) -> None:
-    """Nothing is cut off on the right, lines do not overlap, and all numbers of a game have enough space."""
-    params = HECOGridParams(
-        n_agents=2, grid_size=grid_size, n_treasures=min(100, (grid_size - 2) ** 2), n_keys=0, max_cycles=500
-    )
-    layout = rendering._header_layout("KeyForTreasure", params, tile)
-    state = {"treasures": np.full(params.n_treasures, 2)}
-    words = rendering._words(Scene("KeyForTreasure", params, state, 500, params.n_treasures))
-    widths = [rendering._word_width(word, layout.font) for word in words]
-    boxes = [(y, x, x + width) for (x, y), width in zip(layout.places, widths, strict=True)]
-    assert max(end for _, _, end in boxes) <= grid_size * tile or layout.font == 6
-    for (row, _, end), (next_row, start, _) in pairwise(boxes):
-        assert next_row >= row + layout.font or start > end
-    assert boxes[-1][0] + layout.font < layout.height
+    """Nothing is cut off on the right, also with the largest numbers of a game."""
+    n_treasures = min(100, (grid_size - 2) ** 2)
+    params = HECOGridParams(n_agents=2, grid_size=grid_size, n_treasures=n_treasures, n_keys=0, max_cycles=500)
+    state = make_state([(1, 1, 0, False)] * 2, grid_size)
+    state["treasures"].reshape(-1)[:n_treasures] = 2
+    head = draw(Scene("KeyForTreasure", params, state, 0, n_treasures), tile)[0]
+    background = head[0, 0]
+    assert (head[:-4] != background).any(), "words"
+    assert (head[:-4, -2:] == background).all()
 
 
 @pytest.mark.parametrize(("step", "share"), [(0, 0.0), (25, 0.5), (50, 1.0)])
 def test_time_bar_grows_with_the_steps(step: int, share: float) -> None:
-    bar = draw(make_scene()._replace(step=step))[0][-1]
-    assert count(bar, rendering._DIM) == share * SIDE * TILE
+    bars = [draw(make_scene()._replace(step=at))[0][-1] for at in (step, 50)]
+    assert count(bars[0], tuple(bars[1][0].tolist())) == share * SIDE * TILE
 
 
 # --- missing packages
@@ -309,10 +281,10 @@ def test_time_bar_grows_with_the_steps(step: int, share: float) -> None:
 
 def test_missing_libraries_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(ImportError, match=r"^drawing games needs Pillow: pip install -e '.\[render\]'$"):
-        rendering._pillow()
+    with pytest.raises(ImportError, match=r"Pillow: .*\[render\]"):
+        render_scene(make_scene([(1, 1, 0, True)], grid_size=7), 31)
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ImportError, match=r"^a window needs pygame: pip install -e '.\[render\]'$"):
+    with pytest.raises(ImportError, match=r"pygame: .*\[render\]"):
         HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))
 
 
@@ -322,10 +294,7 @@ def test_missing_libraries_say_what_to_install(monkeypatch: pytest.MonkeyPatch) 
 @pytest.fixture
 def pygame(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    try:
-        module = window._import_pygame()
-    except ImportError:
-        pytest.skip("pygame is not installed")
+    module = pytest.importorskip("pygame")
     yield module
     module.display.quit()
 
@@ -380,17 +349,3 @@ def test_no_display_for_real(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.delenv("SDL_VIDEODRIVER")
     with pytest.raises(RuntimeError, match="no window can be opened"):
         HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="displays of other systems are not servers")
-def test_a_display_that_hangs(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An X server that accepts connections and never answers."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        name = f"127.0.0.1:{server.getsockname()[1] - 6000}"
-        monkeypatch.delenv("SDL_VIDEODRIVER")
-        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-        monkeypatch.setenv("DISPLAY", name)
-        monkeypatch.setattr("hecogrid_envs.window._DISPLAY_SECONDS", 2.0)
-        message = rf"the display '{name}' has not answered for 2 s; is the connection to it broken\?\); draw pictures"
-        with pytest.raises(RuntimeError, match=message):
-            HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))

@@ -58,37 +58,27 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], object]:
     return change
 
 
-def _same_cell(snapshot: dict[str, Any]) -> None:
-    """Put two agents into one cell, both as first arrival."""
-    for name in ("x", "y"):
-        snapshot[name][0, :] = snapshot[name][0, 0]
-    snapshot["rank"][0] = 0
-
-
 @pytest.mark.parametrize(
-    ("change", "fault"),
+    ("change", "named"),
     [
-        (_set("x", 10_000_000), "'agent_pos' must hold values from 0 to 8, got 10000000"),
-        (_set("x", 0), "agent 0 stands in a wall"),
-        (_set("rank", 32_000), "'rank'"),
-        (_same_cell, r"'rank' \[0, 0, 0"),
-        (_set("terrain", 9), "9 in 'terrain'"),
-        (_set("terrain", 0), "the outer ring must be wall"),
-        (_set("direction", 4), "'agent_dir' must hold values from 0 to 3"),
-        (_set("colour", 200), "200 in 'colour'"),
-        (_set("order", 77), "no order of the agents"),
-        (_set("steps", -1), "-1 in 'steps'"),
-        (_set("collected", 99), "99 in 'collected'"),
-        (lambda snapshot: snapshot.pop("rng"), "differ in 'rng'"),
-        (lambda snapshot: snapshot.update(x=snapshot["x"][:, :5]), r"expected 'x' of shape \(4, 6\)"),
-        (lambda snapshot: snapshot.update(x=snapshot["x"].astype(float)), "expected 'x' of shape"),
-        (lambda snapshot: snapshot.update(x=None), r"got \(\) and NoneType"),
+        (_set("x", 10_000_000), "'agent_pos' .*got 10000000"),
+        (_set("x", 0), "agent 0 .*wall"),
+        (_set("terrain", 9), "`terrain` .*got 9"),
+        (_set("terrain", 0), "outer ring"),
+        (_set("direction", 4), "'agent_dir'"),
+        (_set("has_key", 2), "`has_key`"),
+        (_set("colour", 200), "`colour` .*got 200"),
+        (_set("order", 77), "`order` is not a permutation"),
+        (lambda snapshot: snapshot.pop("rng"), "`rng`"),
+        (lambda snapshot: snapshot.update(x=snapshot["x"][:, :5]), r"`x` as int32 \(4, 6\)"),
+        (lambda snapshot: snapshot.update(x=snapshot["x"].astype(float)), "`x` .*got float64"),
+        (lambda snapshot: snapshot.update(x=None), "`x` .*got object"),
     ],
 )
-def test_what_no_game_reaches_is_refused_and_changes_nothing(change: Callable[..., object], fault: str) -> None:
+def test_what_kernels_cannot_index_is_refused_and_changes_nothing(change: Callable[..., object], named: str) -> None:
     batch = played(n_steps=5)
     before, snapshot = batch.snapshot(), batch.snapshot()
     change(snapshot)
-    with pytest.raises(ValueError, match=fault):
+    with pytest.raises(ValueError, match=named):
         batch.restore(snapshot)
     np.testing.assert_equal(batch.snapshot(), before)

@@ -89,17 +89,6 @@ def test_zones_beyond_nine_are_letters() -> None:
     assert render_text(make_state(), zones=[9, 10, 35, 36, 0, 0, 0]).splitlines()[0] == "9az0000"
 
 
-def test_zones_and_things_have_colours_of_their_own() -> None:
-    plain = render_text(make_state(), zones=[0] * 7, colour=True).splitlines()
-    split = render_text(make_state(), zones=[0, 0, 0, 0, 1, 1, 1], colour=True).splitlines()
-    # The bottom wall is one run of one colour with one zone, two with two.
-    assert plain[4].count("\x1b[38") == 1
-    assert split[4].count("\x1b[38") == 2
-    # Wall, treasure, collected, key, floor, carrier, wall: all differ from their neighbours.
-    assert plain[2].count("\x1b[38") == 7
-    assert "38;2;255;0;189" in plain[2]
-
-
 # --- reading
 
 
@@ -123,10 +112,10 @@ def states(draw: st.DrawFn) -> State:
     }
 
 
-@given(states(), st.booleans(), st.booleans())
-def test_every_state_is_read_back(state: State, colour: bool, heading: bool) -> None:
+@given(states(), st.booleans())
+def test_every_state_is_read_back(state: State, heading: bool) -> None:
     zones = np.arange(len(state["walls"])) if heading else None
-    page = render_text(state, zones=zones, step=7 if heading else None, collected=2 if heading else None, colour=colour)
+    page = render_text(state, zones=zones, step=7 if heading else None, collected=2 if heading else None)
     assert_equal_states(parse_level(page), state)
 
 
@@ -161,33 +150,27 @@ def test_agents_line_may_stand_alone() -> None:
 
 
 ROOM = "####\n#>.#\n#..#\n####\n"
+#: Levels, and what the message names.
 WRONG = [
-    ("", "the text holds no map: its rows begin with '#'"),
-    ("step 3\nagents 0>1,1", "the text holds no map: its rows begin with '#'"),
-    ("####\n#.#\n####", "all rows of the map must be 4 long as the first is, row 1 is 3"),
-    ("####\n#?.#\n####", f"cell (1, 1) holds '?', which means nothing ({LEGEND})"),
-    (
-        "####\n#.2#\n####",
-        "several agents share cell (2, 1); add a line that lists all, such as 'agents 0>2,1'",
-    ),
-    (ROOM + "hello", "line 'hello' is no row of the map (they begin with '#'), and no 'agents' line either"),
-    (ROOM + "\n####", "line '####' is no row of the map (they begin with '#'), and no 'agents' line either"),
-    (
-        ROOM + "agents 0x1,1",
-        "agent '0x1,1' cannot be read; write index, direction, x,y, ground, such as 0>2,1 or 3N4,5$",
-    ),
-    (ROOM + "agents 0>1,1 0>1,1", "agent 0 is listed twice"),
-    (ROOM + "agents 0>1,1 2>1,1", "agents must be numbered from 0 to 1, got [0, 2]"),
-    (ROOM + "agents 0>1,4", "agent 0 stands at (1, 4), beyond the map of 4 x 4"),
-    (ROOM + "agents 0>2,2", "the map shows an agent at (1, 1), the 'agents' line does not"),
+    ("", "no map"),
+    ("step 3\nagents 0>1,1", "no map"),
+    ("####\n#.#\n####", "4 long .*row 1 is 3"),
+    ("####\n#?.#\n####", r"cell \(1, 1\) .*'\?'"),
+    ("####\n#.2#\n####", r"cell \(2, 1\); .*'agents 0>2,1'"),
+    (ROOM + "hello", "'hello'"),
+    (ROOM + "\n####", "'####'"),
+    (ROOM + "agents 0x1,1", "'0x1,1' .*3N4,5"),
+    (ROOM + "agents 0>1,1 0>1,1", "agent 0 .*twice"),
+    (ROOM + "agents 0>1,1 2>1,1", r"0 to 1, got \[0, 2\]"),
+    (ROOM + "agents 0>1,4", r"agent 0 .*\(1, 4\), .*4 x 4"),
+    (ROOM + "agents 0>2,2", r"agent at \(1, 1\)"),
 ]
 
 
-@pytest.mark.parametrize(("level", "message"), WRONG)
-def test_wrong_levels(level: str, message: str) -> None:
-    with pytest.raises(ValueError) as error:  # noqa: PT011 (the whole message is compared)
+@pytest.mark.parametrize(("level", "named"), WRONG)
+def test_wrong_levels(level: str, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
         parse_level(level)
-    assert str(error.value) == message
 
 
 def test_the_page_in_the_documentation_is_real() -> None:

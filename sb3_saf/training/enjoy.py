@@ -162,7 +162,7 @@ def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | N
         write_video(path, frames, fps)
         print(path)
     else:
-        from hecogrid_envs.window import HumanWindow
+        from hecogrid_envs.play import HumanWindow
 
         window = HumanWindow(options.env, fps)
         try:
