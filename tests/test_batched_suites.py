@@ -304,3 +304,32 @@ def test_a_team_of_robots_is_trained_and_evaluated(continuous: bool) -> None:
     model = PPO("SAFPolicy", env, n_steps=8, batch_size=48, rollout_buffer_class=TeamRolloutBuffer, seed=0)
     model.learn(192)
     assert max(evaluate_team(model, env, 4).lengths) <= 8
+
+
+STAGGERED = [
+    pytest.param("jaxmarl/MPE_simple_spread_v3", 10, marks=needs_jaxmarl),
+    pytest.param("vmas/balance", 8, marks=needs_vmas),
+    ("hecogrid/TeamSupport-v0", 8),
+]
+
+
+@pytest.mark.parametrize(("env_id", "n_steps"), STAGGERED)
+def test_first_episodes_of_staggered_games_end_one_after_the_other(env_id: str, n_steps: int) -> None:
+    limit: dict[str, Any] = {"max_cycles": n_steps} if env_id.startswith("hecogrid") else {"max_steps": n_steps}
+    venv: Any = make_team_env(env_id, 4, seed=0, stagger=True, **limit).unwrapped
+    venv.reset()
+    idle = np.zeros((venv.num_envs, *(venv.action_space.shape or ())), dtype=venv.action_space.dtype)
+    ends: dict[int, list[tuple[int, bool]]] = {game: [] for game in range(4)}
+    for step in range(n_steps):
+        _, _, dones, infos = venv.step(idle)
+        for row in np.flatnonzero(dones[:: len(dones) // 4]):
+            ends[int(row)].append((step, "staggered" in infos[row * (len(dones) // 4)]))
+    lengths = [ends[game][0][0] for game in (3, 2, 1)]
+    assert lengths == sorted(set(lengths)) and all(ends[game][0][1] for game in (1, 2, 3))
+    assert not any(short for _, short in ends[0])
+
+
+@needs_jaxmarl
+def test_games_without_a_limit_to_move_are_not_staggered() -> None:
+    with pytest.raises(ValueError, match="stagger=True"):
+        make_team_env("smax/3m", 2, stagger=True).reset()

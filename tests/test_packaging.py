@@ -36,7 +36,8 @@ def _setup_cfg() -> configparser.ConfigParser:
 def _declared() -> list[tuple[str, Requirement]]:
     config = _setup_cfg()
     groups = {"install_requires": config["options"]["install_requires"], **config["options.extras_require"]}
-    return [(group, requirement) for group, lines in groups.items() for requirement in _requirements(lines)]
+    declared = [(group, requirement) for group, lines in groups.items() for requirement in _requirements(lines)]
+    return [(group, requirement) for group, requirement in declared if requirement.name != config["metadata"]["name"]]
 
 
 def _pins() -> list[Requirement]:

@@ -11,6 +11,9 @@ from typing import Any, Final
 
 from sb3_saf.suites.suite import Suite
 
+#: Requirements of all suites of JaxMARL.
+JAXMARL: Final = ('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"')
+
 
 def _tasks() -> list[str]:
     from sb3_saf.suites.engines.jaxmarl_envs import registered
@@ -27,7 +30,7 @@ def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
 SUITE: Final = Suite(
     name="jaxmarl",
     title="environments by the names that JaxMARL registers",
-    requires=('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"'),
+    requires=JAXMARL,
     extra="jaxmarl",
     page="https://jaxmarl.foersterlab.com",
     list_tasks=_tasks,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from sb3_saf.suites.jaxmarl import JAXMARL
 from sb3_saf.suites.suite import Suite
 
 
@@ -29,8 +30,8 @@ def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
 SUITE: Final = Suite(
     name="overcooked",
     title="two cooks in one kitchen, on JAX",
-    requires=('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"'),
-    extra="overcooked",
+    requires=JAXMARL,
+    extra="jaxmarl",
     page="https://jaxmarl.foersterlab.com/environments/overcooked/",
     list_tasks=_tasks,
     examples=("cramped_room",),

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from sb3_saf.suites.jaxmarl import JAXMARL
 from sb3_saf.suites.suite import Suite
 
 
@@ -30,8 +31,8 @@ def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
 SUITE: Final = Suite(
     name="smax",
     title="StarCraft's micromanagement, on JAX",
-    requires=('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"'),
-    extra="smax",
+    requires=JAXMARL,
+    extra="jaxmarl",
     page="https://jaxmarl.foersterlab.com/environments/smax/",
     list_tasks=_tasks,
     examples=("3m",),

@@ -336,6 +336,16 @@ class JaxGames(ResumableBatch):
         self._buffers, rows = self._programs.begin(keys)
         return self._on_host(rows)
 
+    def shorten(self) -> npt.NDArray[np.bool_]:
+        """Cut the episodes that have just begun (see the base class)."""
+        games, limit = self.games, getattr(self.env, "max_steps", None)
+        if limit is None or not hasattr(games.state, "step"):
+            return super().shorten()
+        steps = np.arange(self.n_games) * limit // self.n_games
+        state = games.state.replace(step=steps.astype(games.state.step.dtype))
+        self._buffers = jax.vmap(self._programs.packing.pack)(games._replace(state=state))
+        return steps > 0
+
     def step(self, actions: Array) -> BatchStep:
         """Step every game (see the base class)."""
         narrow = actions.astype(np.int32) if actions.dtype.kind == "i" else actions

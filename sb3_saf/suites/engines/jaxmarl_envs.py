@@ -63,6 +63,7 @@ def vec_env(
     *,
     state: bool = False,
     render_mode: str | None = None,
+    stagger: bool = False,
     reward_shaping: float = 0.0,
     reward_shaping_steps: int | None = None,
     fixed: Mapping[str, Any] | None = None,
@@ -76,6 +77,7 @@ def vec_env(
     :param seed: seed of the run
     :param state: whether rows have the state of the game
     :param render_mode: None or ``"rgb_array"``
+    :param stagger: see :class:`ResumableBatchVecEnv`
     :param reward_shaping: weight of the shaped rewards, if the environment has any
     :param reward_shaping_steps: game steps, summed over games, over which that weight decreases to 0; None for never
     :param fixed: arguments of the environment that the task sets
@@ -88,4 +90,4 @@ def vec_env(
     if render_mode is not None and programs.rules.draw is None:
         raise ValueError(f"JaxMARL draws no pictures of {name}; leave render_mode={render_mode!r} out")
     games = JaxGames(programs, n_envs, reward_shaping, reward_shaping_steps)
-    return ResumableBatchVecEnv(games, seed, render_mode)
+    return ResumableBatchVecEnv(games, seed, render_mode, stagger)

@@ -70,6 +70,13 @@ class VmasGames(Batch):
             observations = self.env.reset(seed=None if seeds is None else seeds[0] % 2**32)
         return self._rows(observations, np.ones(self.n_games, dtype=bool))
 
+    def shorten(self) -> npt.NDArray[np.bool_]:
+        """Cut the episodes that have just begun (see the base class)."""
+        if self.env.max_steps is None:
+            return super().shorten()
+        self.env.steps[:] = th.arange(self.n_games) * self.env.max_steps // self.n_games
+        return (self.env.steps > 0).numpy(force=True)
+
     def step(self, actions: Array) -> BatchStep:
         """Step every game (see the base class)."""
         with self._own_randomness():
@@ -153,6 +160,7 @@ def vec_env(
     *,
     state: bool = False,
     render_mode: str | None = None,
+    stagger: bool = False,
     max_steps: int | None = _MAX_STEPS,
     continuous_actions: bool = True,
     device: str = "cpu",
@@ -166,6 +174,7 @@ def vec_env(
     :param seed: seed of the run
     :param state: must be False: VMAS has no state of the game
     :param render_mode: None or ``"rgb_array"``
+    :param stagger: see :class:`BatchVecEnv`
     :param max_steps: time limit in game steps; None for none
     :param continuous_actions: whether actions are forces, or indices of directions
     :param device: torch device of the games
@@ -190,4 +199,4 @@ def vec_env(
     for warning in said:
         if _UNUSED in str(warning.message):
             raise ValueError(f"vmas/{scenario} cannot be made with {params}: {warning.message}")
-    return BatchVecEnv(VmasGames(env), seed, render_mode)
+    return BatchVecEnv(VmasGames(env), seed, render_mode, stagger)
