@@ -53,7 +53,7 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.policies.ippo import IPPOMaskablePolicy, IPPOPolicy
     from sb3_saf.policies.mappo import MAPPOMaskablePolicy, MAPPOPolicy
     from sb3_saf.policies.saf import SAFMaskablePolicy, SAFPolicy
-    from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy
+    from sb3_saf.qplex.policies import QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
     from sb3_saf.teams.errors import CheckpointError, NonFiniteError
@@ -97,7 +97,6 @@ __all__ = [
     "ObservationEncoder",
     "PaperCNN",
     "PartsEncoder",
-    "QPLEXLstmPolicy",
     "QPLEXPolicy",
     "QPLEXPoolPolicy",
     "RandomPolicy",

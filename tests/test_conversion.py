@@ -108,7 +108,7 @@ class Kinds(ParallelEnv[str, Any, Any]):
 
 def make(algorithm: Any, policy: str, env: Any, **kwargs: Any) -> Any:
     if algorithm is QPLEX:
-        return QPLEX(policy, env, buffer_size=100, seed=0)
+        return QPLEX(policy, env, buffer_size=100, seed=0, **kwargs)
     settings = ppo_settings(env, n_steps=8, **kwargs) if algorithm is PPO else {"n_steps": 8, "batch_size": 24}
     return algorithm(policy, env, **settings, seed=0)
 
@@ -151,7 +151,7 @@ def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: P
     ("algorithm", "policy", "kwargs"),
     [
         (QPLEX, "QPLEXPolicy", {}),
-        (QPLEX, "QPLEXLstmPolicy", {}),
+        (QPLEX, "QPLEXPolicy", {"memory": "gru"}),
         (PPO, "IPPOPolicy", {"memory": "lstm"}),
         (PPO, "MAPPOPolicy", {}),
     ],
@@ -165,7 +165,7 @@ def test_every_algorithm_acts_on_the_games_observations(algorithm: Any, policy: 
         actions, state = model.predict(given, state, np.full(3, step == 0))
         observations, _, _, _, infos = game.step(actions)
         given = observations, infos
-        assert (state is None) == ("Lstm" not in policy and not kwargs)
+        assert (state is None) == (not kwargs)
 
 
 def test_masks_are_passed_by_agent() -> None:

@@ -32,13 +32,14 @@ def telling(**kwargs: Any) -> VecEnv:
 
 def model_on(env: VecEnv, policy: str = "QPLEXPolicy", folder: Path | None = None, **parts: Any) -> QPLEX:
     nets = NETS | parts
-    if policy == "QPLEXLstmPolicy":
-        nets |= {"lstm_hidden_size": 8, "sequence_length": 4, "burn_in": 2}
+    policy, _, memory = policy.partition("-")
+    if memory:
+        nets |= {"memory": memory, "memory_size": 8, "sequence_length": 4, "burn_in": 2}
     logs = None if folder is None else str(folder)
     return QPLEX(policy, env, seed=1, device="cpu", policy_kwargs=nets, tensorboard_log=logs, **QUICK)
 
 
-@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXLstmPolicy"])
+@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
 def test_the_page(policy: str, tmp_path: Path) -> None:
     callback = InspectionCallback(telling(), every_game_steps=20, n_eval_episodes=4)
     model_on(telling(), policy, tmp_path).learn(40 * 3, log_interval=4, callback=callback)
@@ -88,7 +89,7 @@ def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
     assert view.actions.tolist() == policy.predict({key: value.numpy() for key, value in obs.items()})[0].tolist()
 
 
-@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXLstmPolicy"])
+@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
 def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
     env = telling()
     team = policy_on(env, policy)

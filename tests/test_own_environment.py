@@ -236,10 +236,11 @@ def test_agents_are_found_by_their_names(is_saved: bool, tmp_path: Path) -> None
     assert actions == {"agent_1": by_index[1], "agent_0": by_index[0]}
 
 
-@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXLstmPolicy"])
+@pytest.mark.parametrize("memory", [None, "gru"])
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_qplex_acts_by_agent(policy: str, deterministic: bool) -> None:
-    model: Any = QPLEX(policy, make_team_env(CounterEnv, n_envs=2, seed=0), buffer_size=100, device="cpu", seed=0)
+def test_qplex_acts_by_agent(memory: str | None, deterministic: bool) -> None:
+    env = make_team_env(CounterEnv, n_envs=2, seed=0)
+    model: Any = QPLEX("QPLEXPolicy", env, buffer_size=100, device="cpu", seed=0, policy_kwargs={"memory": memory})
     observations, _ = CounterEnv().reset(seed=0)
     model.set_random_seed(1)
     actions, _ = model.predict(observations, deterministic=deterministic)

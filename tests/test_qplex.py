@@ -34,7 +34,8 @@ from tests.matrix_games import ONE_STEP, MatrixGame, TwoStates
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams
 
-POLICIES = ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXLstmPolicy"]
+#: Policies, with the kind of their memory.
+POLICIES = ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru", "QPLEXPolicy-lstm"]
 #: Small and quick.
 QUICK: dict[str, Any] = {
     "buffer_size": 200,
@@ -63,8 +64,9 @@ def telling_env(n_games: int = 4, time_limit: TimeLimit = "terminal", **kwargs: 
 
 def make_model(env: Any = None, policy: str = "QPLEXPolicy", **kwargs: Any) -> QPLEX:
     nets = SMALL_NETS | kwargs.pop("policy_kwargs", {})
-    if policy == "QPLEXLstmPolicy":
-        nets = {"lstm_hidden_size": 8, "sequence_length": 4, "burn_in": 2} | nets
+    policy, _, memory = policy.partition("-")
+    if memory:
+        nets = {"memory": memory, "memory_size": 8, "sequence_length": 4, "burn_in": 2} | nets
     return QPLEX(policy, toy_env() if env is None else env, **(QUICK | {"seed": 0, "policy_kwargs": nets} | kwargs))
 
 
@@ -138,7 +140,7 @@ def test_two_states_vdn_diverges_and_qplex_finds_the_value() -> None:
 
 
 @pytest.mark.parametrize(
-    ("policy", "kind"), [("QPLEXPolicy", "all"), ("QPLEXPoolPolicy", "features"), ("QPLEXLstmPolicy", "all")]
+    ("policy", "kind"), [("QPLEXPolicy", "all"), ("QPLEXPoolPolicy", "features"), ("QPLEXPolicy-lstm", "all")]
 )
 def test_unique_rows_give_the_numbers_of_every_row(policy: str, kind: str) -> None:
     errors = []
@@ -206,26 +208,28 @@ def test_the_gradient_goes_into_the_online_networks_alone() -> None:
     assert not th.equal(attached[True], attached[False])
 
 
-def test_memory_in_training_is_memory_in_play() -> None:
+@pytest.mark.parametrize("kind", ["gru", "lstm"])
+def test_memory_in_training_is_memory_in_play(kind: str) -> None:
     """Q values of sequences from the start of episodes equal those of predict, step by step."""
-    model = make_model(ToyTeams(length=4, n_games=1), "QPLEXLstmPolicy", buffer_size=12, batch_size=8)
+    model = make_model(ToyTeams(length=4, n_games=1), f"QPLEXPolicy-{kind}", buffer_size=12, batch_size=8)
     model.learn(12 * 3)
     policy, buffer = model.policy, model._buffer()
-    assert policy.memory is not None
+    net = policy.actor_memory
+    assert net is not None
     samples = buffer.sample_sequences(1, 12, 0)
     info = samples.sequences
     assert info is not None
     features = policy.encode_with(policy.features_extractor, samples.now.own.flatten(0, 1))
     agents = th.arange(3).repeat(12)
-    inputs = policy.memory.inputs(features, info.last_actions.flatten(), agents).view(1, 12, 3, -1)
-    hidden, _ = policy.memory.unroll(inputs, info.resets.view(1, 12))
-    trained = q_values(policy.actor, hidden, agents).view(12, 3, -1).argmax(dim=2)
+    inputs = net.inputs(features, info.last_actions.flatten(), agents).view(12, 3, -1)
+    latents, _ = net(inputs, th.zeros(3, net.state_dim), info.resets.unsqueeze(1).expand(12, 3))
+    trained = q_values(policy.actor, latents.flatten(0, 1), agents).view(12, 3, -1).argmax(dim=2)
     state: Any = None
     for t in range(12):
         obs = {"obs": samples.now.own[t].numpy(), "agent": np.arange(3)}
         actions, state = policy.predict(obs, state, np.full(3, t % 4 == 0))
         assert np.array_equal(actions, trained[t])
-        state = (*state[:2], samples.actions[t].numpy())  # the actions that were taken
+        state = (state[0], samples.actions[t].numpy())  # the actions that were taken
 
 
 # --- playing ----------------------------------------------------------------------------------------------------------
@@ -358,7 +362,7 @@ def test_evaluation_callback(tmp_path: Path) -> None:
     games = toy_env(2)
     games.seed(10_000)
     callback = TeamEvalCallback(games, n_eval_episodes=2, eval_freq=20, log_path=str(tmp_path), verbose=0)
-    make_model(policy="QPLEXLstmPolicy").learn(60 * 3, callback=callback)
+    make_model(policy="QPLEXPolicy-lstm").learn(60 * 3, callback=callback)
     assert np.load(tmp_path / "evaluations.npz")["game_steps"].tolist() == [20, 40, 60]
 
 
@@ -392,7 +396,7 @@ def test_a_policy_of_ppo_is_refused_with_those_that_fit() -> None:
 
 def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"its memory reads the agent's last action, too; act with model\.predict"):
-        export_actors(make_model(policy="QPLEXLstmPolicy"), tmp_path / "actor")
+        export_actors(make_model(policy="QPLEXPolicy-lstm"), tmp_path / "actor")
 
 
 def test_exported_actors_keep_to_masks(tmp_path: Path) -> None:
@@ -420,7 +424,7 @@ def test_acting_reads_nothing_but_own_observations() -> None:
     alone = [model.predict(own, deterministic=True)[0] for own in obs["obs"]]
     assert np.array_equal(alone, model.predict(obs, deterministic=True)[0])
     with pytest.raises(ValueError, match="'agent'"):
-        make_model(env, "QPLEXLstmPolicy").predict(obs["obs"], deterministic=True)
+        make_model(env, "QPLEXPolicy-lstm").predict(obs["obs"], deterministic=True)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------

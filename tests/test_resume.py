@@ -191,7 +191,7 @@ MODELS: dict[str, Callable[[], Any]] = {
         algorithm=MaskablePPO, policy="SAFMaskablePolicy", env=masked_games(), batch_size=ROLLOUT, n_epochs=1
     ),
     "QPLEX": lambda: qplex("QPLEXPolicy"),
-    "QPLEX with memory": lambda: qplex("QPLEXLstmPolicy", sequence_length=4, burn_in=2),
+    "QPLEX with memory": lambda: qplex("QPLEXPolicy", memory="lstm", sequence_length=4, burn_in=2),
     "PPO with memory": lambda: make(
         rollout_buffer_class=sb3_saf.TeamRolloutBuffer, policy_kwargs=LIGHT | {"memory": "lstm", "memory_size": 8}
     ),

@@ -109,7 +109,7 @@ def _checked_policy(model: object) -> ExportablePolicy:
             f"expected model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got {type(policy).__name__}; "
             "policies of Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
-    if isinstance(policy, QPLEXPolicy) and policy.memory is not None:
+    if isinstance(policy, QPLEXPolicy) and policy.actor_memory is not None:
         raise ExportError(
             f"{type(policy).__name__} cannot be exported: its memory reads the agent's last action, too; act with "
             "model.predict, which carries the state, or train PPO with memory, which can be exported"

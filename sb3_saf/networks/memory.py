@@ -91,6 +91,20 @@ class Memory(nn.Module):
         outputs, memory = self(inputs.unsqueeze(0), memory, None if starts is None else starts.unsqueeze(0))
         return outputs.squeeze(0), memory
 
+    def every(self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor) -> th.Tensor:
+        """
+        Run over successive steps; arguments as in :meth:`forward`.
+
+        :return: memory (T, R, M) after every step, which begins with the outputs (T, R, H)
+        """
+        if isinstance(self.rnn, nn.GRU):
+            return self(inputs, memory, starts)[0]
+        memories = []
+        for step, begins in zip(inputs, starts, strict=True):
+            _, memory = self.step(step, memory, begins)
+            memories.append(memory)
+        return th.stack(memories)
+
     def _run(self, inputs: th.Tensor, memory: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         if isinstance(self.rnn, nn.GRU):
             outputs, hidden = self.rnn(inputs, memory.unsqueeze(0))

@@ -26,7 +26,7 @@ from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import gather
 from sb3_saf.networks.memory import MEMORY_NAMES, Memory, MemoryName
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, joined_teams
-from sb3_saf.policies.rows import TeamRowsPolicy, entry_of
+from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_choice, check_count, check_flag
 from sb3_saf.teams.rows import ACTIVE_KEY, AGENT_KEY, EPISODE_START_KEY, TerminalRow
 
@@ -166,12 +166,7 @@ class RememberingPolicy(TeamRowsPolicy):
         with th.no_grad():
             own = self.encode_own(obs)
             memory = None if state is None else th.as_tensor(state[0], device=self.device)
-            assert isinstance(obs, dict)
-            starts = obs[EPISODE_START_KEY].reshape(-1) != 0 if EPISODE_START_KEY in obs else None
-            if episode_start is not None:
-                begins = th.as_tensor(np.reshape(episode_start, -1).astype(bool), device=self.device)
-                starts = begins if starts is None else starts | begins
-            latents, memory = self.remember(own.of_rows(), memory, starts)
+            latents, memory = self.remember(own.of_rows(), memory, self._starts(obs, episode_start))
             actions = self._distribution(obs, own, latents=latents).get_actions(deterministic=deterministic)
         array = actions.cpu().numpy().reshape((-1, *(self.action_space.shape or ())))
         if isinstance(self.action_space, spaces.Box):
@@ -216,10 +211,6 @@ class RememberingPolicy(TeamRowsPolicy):
         """Continue from a state (see :meth:`checkpoint_state`)."""
         actor, critic = (part if part is None else part.to(self.device) for part in (state["actor"], state["critic"]))
         self.running = RunningMemory(actor, critic)
-
-    def _starts(self, obs: PyTorchObs) -> th.Tensor:
-        """Return the rows whose episode begins, (B,) bool."""
-        return entry_of(obs, EPISODE_START_KEY, "a policy with memory").reshape(-1) != 0
 
     def _advance(self, obs: PyTorchObs, encoded: Encoded) -> tuple[Step, th.Tensor]:
         """

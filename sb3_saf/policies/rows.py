@@ -24,6 +24,7 @@ from sb3_saf.teams.rows import (
     ACTIVE_KEY,
     AGENT_KEY,
     ALL_KEYS,
+    EPISODE_START_KEY,
     OBS_KEY,
     STATE_KEY,
     TEAM_KEY,
@@ -168,19 +169,31 @@ class TeamRowsPolicy(BasePolicy):
                 observation = {key: value for key, value in observation.items() if key not in self._not_for_acting}
             return self._predict_rows(observation, state, episode_start, deterministic, **kwargs)
         masks = {} if given.action_masks is None else {"action_masks": given.action_masks}
-        agents = given.agents
-        if agents is None or not state:
-            actions, after = self._predict_rows(given.rows, state, episode_start, deterministic, **masks)
-        else:
+        return self.act_in_game(given, self._predict_rows, state, episode_start, deterministic, **masks)
+
+    @staticmethod
+    def act_in_game(
+        given: Given, predict: Callable[..., tuple[Any, Any]], state: Any, episode_start: Any, *args: Any, **kwargs: Any
+    ) -> tuple[Any, Any]:
+        """
+        Act on what a game gives; of observations by agent, the state is by agent, too.
+
+        :param given: rows and agents
+        :param predict: acts on rows, as SB3's ``predict``
+        :param state: see :meth:`predict`
+        :param episode_start: see :meth:`predict`
+        """
+        agents, memory, starts = given.agents, state, episode_start
+        if agents is not None and state:
             blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
-            rows = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
+            memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
             starts = np.array([agent not in state for agent in agents])
             if episode_start is not None:
                 starts |= np.asarray(episode_start).astype(bool)
-            actions, after = self._predict_rows(given.rows, rows, starts, deterministic, **masks)
-        if agents is None or after is None:
-            return given.actions_of_game(actions), after
-        return given.actions_of_game(actions), dict(zip(agents, zip(*after, strict=True), strict=True))
+        actions, after = predict(given.rows, memory, starts, *args, **kwargs)
+        if agents is not None and after is not None:
+            after = dict(zip(agents, zip(*after, strict=True), strict=True))
+        return given.actions_of_game(actions), after
 
     def _predict_rows(
         self, rows: Any, state: Any, episode_start: np.ndarray | None, deterministic: bool, **kwargs: Any
@@ -367,6 +380,16 @@ class TeamRowsPolicy(BasePolicy):
         """Return whether the rows' own agents are active, (B, 1) bool; None if all always are."""
         active = self._active(obs)
         return None if active is None else active.gather(1, self._agent(obs).unsqueeze(1))
+
+    def _starts(self, obs: PyTorchObs, episode_start: Any = None) -> th.Tensor:
+        """Return the rows whose episode begins, (B,) bool: by ``episode_start`` (B,) or their own entry."""
+        n_rows = len(self._own(obs))
+        starts = th.zeros(n_rows, dtype=th.bool, device=self.device)
+        if not isinstance(obs, th.Tensor) and EPISODE_START_KEY in obs:
+            starts = obs[EPISODE_START_KEY].reshape(-1) != 0
+        if episode_start is not None:
+            starts = starts | th.as_tensor(np.reshape(episode_start, -1).astype(bool), device=self.device)
+        return starts
 
     def _action_mask(self, obs: PyTorchObs, padded: bool = False) -> th.Tensor | None:
         """Return the rows' legal actions, (B, A) bool; None if all always are. Only padding rows may have none."""

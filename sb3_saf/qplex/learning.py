@@ -134,16 +134,29 @@ def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples)
     if memory is None:
         return features
     assert sequences is not None, "agents with memory learn from sequences"
-    shape = samples.actions.shape
-    agent = _agents(samples.actions)
-    inputs = memory.inputs(features.now.flatten(0, 1), sequences.last_actions.flatten(), agent)
-    in_time = inputs.view(sequences.n, sequences.length, shape[1], -1)
-    hidden, cell = memory.unroll(in_time, sequences.resets.view(sequences.n, sequences.length))
+    shape, (n, length) = samples.actions.shape, (sequences.n, sequences.length)
+    agent, starts, joins = _agents(samples.actions), sequences.resets.unsqueeze(1).expand(shape), None
+    if samples.now.active is not None and samples.after.active is not None:  # agents that join begin
+        before = samples.now.active.roll(1, dims=0)
+        before[::length] = True
+        starts = starts | ~before
+        joins = (samples.after.active & ~samples.now.active).flatten()
+    last = sequences.last_actions.masked_fill(starts, -1).flatten()
+    inputs = memory.inputs(features.now.flatten(0, 1), last, agent)
+
+    def by_step(x: th.Tensor) -> th.Tensor:
+        """Arrange agents of team steps (n T N, ...) by step: (T, n N, ...)."""
+        return x.view(n, length, shape[1], -1).transpose(0, 1).reshape(length, n * shape[1], -1)
+
+    remembered = memory.every(
+        by_step(inputs), inputs.new_zeros(n * shape[1], memory.state_dim), by_step(starts.flatten()).squeeze(2)
+    )
+    remembered = remembered.view(length, n, shape[1], -1).transpose(0, 1).reshape(len(inputs), -1)
     # One step from each step: also exact if the next step of the sequence belongs to another episode.
     with th.no_grad():
-        further = memory.inputs(features.after.flatten(0, 1), samples.actions.flatten(), agent)
-        after, _ = memory(further, (hidden, cell))
-    return Features(hidden.view(*shape, -1), after.view(*shape, -1))
+        last = samples.actions.flatten() if joins is None else samples.actions.flatten().masked_fill(joins, -1)
+        after, _ = memory.step(memory.inputs(features.after.flatten(0, 1), last, agent), remembered, joins)
+    return Features(remembered[:, : memory.size].view(*shape, -1), after.view(*shape, -1))
 
 
 # --- values -----------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from torch import nn
 
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
+from sb3_saf.networks.memory import MEMORY_NAMES, MemoryName
 from sb3_saf.qplex.heads import AgentMemory
 from sb3_saf.qplex.mixers import MIXER_NAMES, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
 from sb3_saf.teams.checks import check_choice, check_count
@@ -30,7 +31,8 @@ class QPLEXParts:
     :param n_kernels: attention kernels of QPLEX's lambda
     :param kernel_arch: hidden sizes of each kernel's networks
     :param detach_state: whether the mixer's gradient stops before the agents' encoder
-    :param lstm_hidden_size: size of each agent's memory; 0 for none
+    :param memory: ``"gru"`` or ``"lstm"`` over features, last action and the agent's index; None for none
+    :param memory_size: H, size of each agent's memory
     :param sequence_length: with memory, game steps of a training sequence that enter the loss
     :param burn_in: with memory, game steps before them that only warm up the memory; the length of an episode to always
         start at its beginning
@@ -45,19 +47,19 @@ class QPLEXParts:
     n_kernels: int = 4
     kernel_arch: tuple[int, ...] = (64,)
     detach_state: bool = False
-    lstm_hidden_size: int = 0
+    memory: MemoryName | None = None
+    memory_size: int = 64
     sequence_length: int = 16
     burn_in: int = 8
 
     def __post_init__(self) -> None:
         check_choice("mixer", self.mixer, MIXER_NAMES)
         check_choice("heads", self.heads, get_args(Heads))
-        for name in ("n_policies", "latent_dim", "mixer_hidden", "n_kernels", "sequence_length"):
+        check_choice("memory", self.memory, (*MEMORY_NAMES, None))
+        for name in ("n_policies", "latent_dim", "mixer_hidden", "n_kernels", "memory_size", "sequence_length"):
             check_count(name, getattr(self, name))
-        for name in ("lstm_hidden_size", "burn_in"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
+        if isinstance(self.burn_in, bool) or not isinstance(self.burn_in, int) or self.burn_in < 0:
+            raise ValueError(f"burn_in must be a whole number of at least 0, got {self.burn_in!r}")
         # Saved models may have lists.
         for name in ("projection_arch", "kernel_arch"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
@@ -87,9 +89,9 @@ class QPLEXParts:
 
     def agent_memory(self, features_dim: int, action_space: spaces.Discrete, n_agents: int) -> AgentMemory | None:
         """Make each agent's memory, if any."""
-        if not self.lstm_hidden_size:
+        if self.memory is None:
             return None
-        return AgentMemory(features_dim, action_space, n_agents, self.lstm_hidden_size)
+        return AgentMemory(self.memory, features_dim, int(action_space.n), n_agents, self.memory_size)
 
     def make_mixer(self, state_dim: int, n_agents: int, n_actions: int) -> Mixer:
         """Make the mixer of N agents with as many actions each, for states of size S."""
@@ -105,10 +107,3 @@ class QPLEXPoolParts(QPLEXParts):
     """QPLEX with as many heads in its pool as SAF has policies."""
 
     n_policies: int = 4
-
-
-@dataclass(frozen=True)
-class QPLEXLstmParts(QPLEXParts):
-    """QPLEX with memory."""
-
-    lstm_hidden_size: int = 64

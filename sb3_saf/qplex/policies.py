@@ -22,10 +22,10 @@ from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, pop_named
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
-from sb3_saf.qplex.parts import QPLEXLstmParts, QPLEXParts, QPLEXPoolParts
+from sb3_saf.qplex.parts import QPLEXParts, QPLEXPoolParts
 from sb3_saf.teams.rows import STATE_KEY, Array
 
-#: A recurrent policy's state: hidden (B, H), cell (B, H), last action (B,).
+#: What agents with memory remember: memory (B, M), last action (B,).
 State = tuple[Array, ...]
 
 
@@ -34,7 +34,7 @@ class QNetworks(NamedTuple):
     All networks of Q_tot.
 
     :param encoder: encoder of own observations
-    :param memory: LSTM of each agent, or None
+    :param memory: memory of each agent, or None
     :param actor: Q heads
     :param mixer: mixer from Q_i of all agents to Q_tot
     :param state_encoder: encoder of the games' states for the mixer; None if it reads the agents' features
@@ -93,7 +93,7 @@ class QPLEXPolicy(TeamRowsPolicy):
     action_space: spaces.Discrete
     features_extractor: BaseFeaturesExtractor
     actor: ActorNetwork
-    memory: AgentMemory | None
+    actor_memory: AgentMemory | None
     state_encoder: nn.Module | None
 
     def __init__(
@@ -135,12 +135,14 @@ class QPLEXPolicy(TeamRowsPolicy):
         self.features_extractor = self.make_features_extractor()
         self.features_dim = self.features_extractor.features_dim
         parts, n_agents = self.parts, self.team_spaces.n_agents
-        self.memory = parts.agent_memory(self.features_dim, self.action_space, n_agents)
-        latent_dim = self.features_dim if self.memory is None else self.memory.hidden_size
+        self.actor_memory = parts.agent_memory(self.features_dim, self.action_space, n_agents)
+        latent_dim = self.features_dim if self.actor_memory is None else self.actor_memory.size
         self.actor = parts.actor(latent_dim, n_agents, self.action_space, self.net_arch, self.activation_fn)
         if self.ortho_init:
             self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
             orthogonal_init(self.actor)
+            if self.actor_memory is not None:
+                orthogonal_init(self.actor_memory)
         # The mixer is made last: with one seed, policies with different mixers have the same initial agents.
         state = self.team_spaces.state
         self.state_encoder = None if state is None else ObservationEncoder(state, self.features_dim)
@@ -157,7 +159,7 @@ class QPLEXPolicy(TeamRowsPolicy):
     @property
     def online(self) -> QNetworks:
         """The networks that are trained and act."""
-        return QNetworks(self.features_extractor, self.memory, self.actor, self.mixer, self.state_encoder)
+        return QNetworks(self.features_extractor, self.actor_memory, self.actor, self.mixer, self.state_encoder)
 
     @property
     def target(self) -> QNetworks:
@@ -216,31 +218,16 @@ class QPLEXPolicy(TeamRowsPolicy):
     @property
     def acts_by_index(self) -> bool:
         """See the base class; memory reads the index, too."""
-        return self.actor.reads_agent or self.memory is not None
+        return self.actor.reads_agent or self.actor_memory is not None
 
-    def predict(
-        self,
-        observation: Any,
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
-        **kwargs: Any,
-    ) -> tuple[Any, State | None]:
-        """
-        Act greedily; see the base class.
-
-        :param observation: rows, only own observations (and ``"agent"`` for memory or one head per agent), one or a
-            batch; or what the game gives
-        :param state: recurrent state after the last step: hidden state, cell state, last action. None at the start
-        :param episode_start: (B,) where an episode starts, which resets the state
-        :param deterministic: unused
-        :param kwargs: unused
-        :return: actions (B,) and the next state
-        """
-        if self.memory is None or self.given_by_game(observation) is not None:
-            return super().predict(observation, state, episode_start, deterministic)
+    def _predict_rows(
+        self, rows: Any, state: Any, episode_start: np.ndarray | None, deterministic: bool, **kwargs: Any
+    ) -> tuple[np.ndarray, State | None]:
+        """Act greedily; with memory, rows need ``"agent"``, and ``state`` is memory and last action."""
+        if self.actor_memory is None:
+            return super()._predict_rows(rows, state, episode_start, deterministic)
         self.set_training_mode(False)
-        obs, is_batch = self.obs_to_tensor(observation)
+        obs, is_batch = self.obs_to_tensor(rows)
         with th.no_grad():
             values, _, state = self.evaluate(obs, state, episode_start)
         actions = values.argmax(dim=1).cpu().numpy()
@@ -250,29 +237,25 @@ class QPLEXPolicy(TeamRowsPolicy):
         self, obs: PyTorchObs, state: State | None = None, episode_start: np.ndarray | None = None
     ) -> Evaluated:
         """
-        Evaluate the agents' networks for one step; arguments as in :meth:`predict`, but tensors.
+        Evaluate the agents' networks for one step; ``episode_start`` as in ``predict``.
 
         :param obs: rows, or only own observations
         """
-        memory, own = self.memory, self.encode_own(obs)
-        features = own.of_rows()
-        if memory is None:
+        net, features = self.actor_memory, self.encode_own(obs).of_rows()
+        if net is None:
             return Evaluated(self.own_q_values(obs), features, None)
-        last = th.full((len(features),), -1, dtype=th.long, device=features.device)
-        remembered = memory.empty(len(features), features)
-        if state is not None:
-            fresh = th.zeros_like(last, dtype=th.bool)
-            if episode_start is not None:
-                fresh = th.as_tensor(np.asarray(episode_start).astype(bool), device=features.device).reshape(-1)
-            hidden, cell, last_action = (th.as_tensor(part, device=features.device) for part in state)
-            keep = (~fresh).to(features.dtype).unsqueeze(1)
-            remembered = hidden * keep, cell * keep
-            last = last_action.long().masked_fill(fresh, -1)
+        if state is None:
+            starts = th.ones(len(features), dtype=th.bool, device=features.device)
+            memory = features.new_zeros(len(features), net.state_dim)
+            last = th.full((len(features),), -1, device=features.device)
+        else:
+            starts = self._starts(obs, episode_start)
+            memory, last = (th.as_tensor(part, device=features.device) for part in state)
         agent = self._agent(obs)
-        hidden, cell = memory(memory.inputs(features, last, agent), remembered)
-        values = q_values(self.actor, hidden, agent, self._action_mask(obs))
-        following = (part.cpu().numpy() for part in (hidden, cell, values.argmax(dim=1)))
-        return Evaluated(values, hidden, tuple(following))
+        inputs = net.inputs(features, last.long().masked_fill(starts, -1), agent)
+        latents, memory = net.step(inputs, memory, starts)
+        values = q_values(self.actor, latents, agent, self._action_mask(obs))
+        return Evaluated(values, latents, (memory.cpu().numpy(), values.argmax(dim=1).cpu().numpy()))
 
     def team_steps(self, obs: dict[str, th.Tensor]) -> TeamSteps:
         """Return the mixer's inputs from rows of whole teams, game-major."""
@@ -300,13 +283,3 @@ class QPLEXPoolPolicy(QPLEXPolicy):
     """
 
     parts_class: ClassVar[type[QPLEXParts]] = QPLEXPoolParts
-
-
-class QPLEXLstmPolicy(QPLEXPolicy):
-    """
-    QPLEX with memory: an LSTM over features, last action and the agent's index.
-
-    ``predict`` takes and returns the state, as in SB3's recurrent policies; it needs ``"agent"`` besides ``"obs"``.
-    """
-
-    parts_class: ClassVar[type[QPLEXParts]] = QPLEXLstmParts

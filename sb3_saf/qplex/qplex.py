@@ -30,7 +30,7 @@ from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
 from sb3_saf.qplex.learning import TeamError, team_errors
 from sb3_saf.qplex.mixers import MixerName
-from sb3_saf.qplex.policies import QPLEXLstmPolicy, QPLEXPolicy, QPLEXPoolPolicy, State
+from sb3_saf.qplex.policies import QPLEXPolicy, QPLEXPoolPolicy, State
 from sb3_saf.teams.checks import check_count, check_whole_teams
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
@@ -61,7 +61,7 @@ class QPLEX(OffPolicyAlgorithm):
     **Exploration**: epsilon-greedy over legal actions, independently per agent, also in
     ``predict(deterministic=False)``.
 
-    :param policy: ``"QPLEXPolicy"``, ``"QPLEXPoolPolicy"`` (Q heads from a pool) or ``"QPLEXLstmPolicy"`` (memory)
+    :param policy: ``"QPLEXPolicy"`` or ``"QPLEXPoolPolicy"`` (Q heads from a pool)
     :param env: vector environment of teams
     :param mixer: ``"qplex"``, ``"qmix"`` or ``"vdn"``; None uses ``policy_kwargs`` (QPLEX by default)
     :param learning_rate: learning rate, or a schedule of it
@@ -90,7 +90,7 @@ class QPLEX(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        policy.__name__: policy for policy in (QPLEXPolicy, QPLEXPoolPolicy, QPLEXLstmPolicy)
+        policy.__name__: policy for policy in (QPLEXPolicy, QPLEXPoolPolicy)
     }
     policy: QPLEXPolicy
     replay_buffer: TeamReplayBuffer | None
@@ -272,8 +272,7 @@ class QPLEX(OffPolicyAlgorithm):
         """
         given = self.policy.given_by_game(observation)
         if given is not None:
-            actions, state = self.predict(given.rows, state, episode_start, deterministic)
-            return given.actions_of_game(actions), state
+            return self.policy.act_in_game(given, self.predict, state, episode_start, deterministic)
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
         if deterministic or not self.exploration_rate:
             return actions, state
@@ -412,7 +411,7 @@ class QPLEX(OffPolicyAlgorithm):
     def _sample(self, batch_size: int) -> TeamReplaySamples:
         """Sample a batch; sequences for agents with memory."""
         parts = self.policy.parts
-        if self.policy.memory is None:
+        if self.policy.actor_memory is None:
             return self._buffer().sample(batch_size)
         n_sequences = max(1, batch_size // parts.sequence_length)
         return self._buffer().sample_sequences(n_sequences, parts.sequence_length, parts.burn_in)
