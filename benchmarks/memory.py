@@ -43,12 +43,15 @@ class CueGame(ParallelEnv[str, Any, Any]):
         self.length, self.cue = length, cue
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """See PettingZoo."""
         return spaces.Box(0, 1, (5,), np.float32)
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
+        """See PettingZoo."""
         return spaces.Discrete(3)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Show new cues."""
         if seed is not None or not hasattr(self, "rng"):
             self.rng = np.random.default_rng(seed)
         self.agents, self.time, self.first = list(self.possible_agents), 0, 2
@@ -74,6 +77,7 @@ class CueGame(ParallelEnv[str, Any, Any]):
         return observations, infos
 
     def step(self, actions: dict[str, Any]) -> Any:
+        """Wait, or answer in the last step."""
         if self.time == 0:
             self.first = int(actions["a"])
         self.time += 1
@@ -106,7 +110,7 @@ def trained(
             kwargs |= {"n_policies": 2, "latent_dim": 16, "projection_arch": (32,)}
         model = PPO(
             f"{method.upper()}Policy", env, policy_kwargs=kwargs, n_steps=4 * length, batch_size=64 * length,
-            n_epochs=4, learning_rate=5e-3, ent_coef=0.01, gae_lambda=1.0,
+            n_epochs=4, learning_rate=2e-3, ent_coef=0.01, gae_lambda=1.0,
             rollout_buffer_class=sb3_saf.TeamRolloutBuffer, **common,
         )  # fmt: skip
     return model.learn(n_episodes * length * 2)

@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
+from benchmarks.memory import share_right, trained
 from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env
 from tests.team_venv import TeamVenv
 from tests.weights import DyingGame
@@ -283,6 +284,25 @@ def test_saves_loads_and_continues(tmp_path: Any) -> None:
     assert (loaded.policy.memory, loaded.policy.memory_size, loaded.policy.critic_memory) == ("lstm", 8, False)
     assert equal(weights(model), weights(loaded))
     loaded.learn(16 * 9)
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("method", "memory", "n_episodes", "right"),
+    [
+        ("ippo", "lstm", 3_000, True),
+        ("qplex", "gru", 3_000, True),
+        ("mappo", None, 800, False),
+    ],
+)
+def test_a_cue_in_the_first_step_is_answered_in_the_last(
+    method: str, memory: str | None, n_episodes: int, right: bool
+) -> None:
+    """With masks, and an agent that may have left before; ``python -m benchmarks.memory`` is the whole ladder."""
+    answered = share_right(trained(method, memory, 3, n_episodes=n_episodes), 3)
+    assert answered > 0.95 if right else 0.35 < answered < 0.65
 
 
 # --- acting -----------------------------------------------------------------------------------------------------------
