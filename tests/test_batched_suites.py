@@ -329,6 +329,18 @@ def test_first_episodes_of_staggered_games_end_one_after_the_other(env_id: str, 
     assert not any(short for _, short in ends[0])
 
 
+def test_a_restored_state_knows_which_episodes_are_short() -> None:
+    one, other = (make_team_env("TeamSupport", 3, seed=0, stagger=True, max_cycles=6).unwrapped for _ in range(2))
+    states: Any = (one, other)
+    one.reset()
+    idle = np.zeros(one.num_envs, dtype=int)
+    one.step(idle)
+    states[1].load_checkpoint_state(states[0].checkpoint_state())
+    for _ in range(5):
+        infos = [venv.step(idle)[3] for venv in (one, other)]
+        np.testing.assert_equal(infos[0], infos[1])
+
+
 @needs_jaxmarl
 def test_games_without_a_limit_to_move_are_not_staggered() -> None:
     with pytest.raises(ValueError, match="stagger=True"):

@@ -188,9 +188,7 @@ def test_seeds_decide_what_happens(env_id: str) -> None:
 class Strike(BaseCallback):
     """Ends the training in the middle of a rollout, as a crash would."""
 
-    def __init__(self, at: int) -> None:
-        super().__init__()
-        self.at = at
+    at = -1
 
     def _on_step(self) -> bool:
         if self.n_calls == self.at:
@@ -210,8 +208,10 @@ def test_a_struck_run_goes_on_bit_for_bit_and_its_team_is_exported_and_inspected
         env = make_team_env(env_id, n_envs=2, seed=5, monitor_dir=str(tmp_path / folder))
         kwargs: dict[str, Any] = {"n_steps": 8, "n_epochs": 2, "rollout_buffer_class": TeamRolloutBuffer}
         model = PPO("SAFPolicy", env, batch_size=8 * env.n_agents, seed=5, **kwargs)
+        strike = Strike()
+        strike.at = at  # no argument of its constructor, which would make it another run
         return resumable_learn(
-            model, 80 * env.n_agents, tmp_path / folder, [Strike(at)], every_game_steps=1, trust_games=True
+            model, 80 * env.n_agents, tmp_path / folder, [strike], every_game_steps=1, trust_games=True
         )
 
     whole = learn("a")

@@ -1,11 +1,11 @@
 """
-Cooperative benchmark suites by name: ``make_team_env("lbf/Foraging-8x8-2p-3f-v3", n_envs=8)``.
+Suites of cooperative games by name: ``make_team_env("lbf/Foraging-8x8-2p-3f-v3", n_envs=8)``.
 
 A suite is one file of this folder with a constant ``SUITE``, an object of :class:`sb3_saf.suites.suite.Suite`, which
 adapts an installed package. ``make_team_env``, the commands and the experiments find it by the part of an id before the
 slash; ``python -m sb3_saf.suites`` lists all. Packages are imported only when a game is made or listed.
 
-A suite provides its games in one of two forms. Letters: E games, N agents, B = E * N rows.
+A suite provides its games in one of two forms, or in both as HECOGrid does. Letters: E games, N agents, B = E * N rows.
 
 ``game(task, *, render_mode=None, **params)`` returns **one game**, a PettingZoo ParallelEnv, which SuperSuit converts
 to rows, in one or several processes (:class:`sb3_saf.envs.supersuit_vec_env.SuperSuitVecEnv`). Agents may have
