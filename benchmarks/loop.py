@@ -5,7 +5,8 @@ Measure the training loop with few games and small networks: SB3's own PPO compa
 ``free``: games that take no time (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of 2 x
 64 without an encoder, for all, and SAF's pool, slots and widths of the zoo's size ``small``; 4 epochs, 4 minibatches.
 SB3 plays the same rows with its ``MlpPolicy``. ``small``: HECOGrid in the zoo's size ``small``, with the zoo's
-settings. ``growth``: cost by the number of agents, ``small`` with N agents and the same number of rows.
+settings. ``memory``: the same for MAPPO and SAF, without and with memory. ``growth``: cost by the number of agents,
+``small`` with N agents and the same number of rows.
 
 Processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of the rollout in
 milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole loop, and the
@@ -252,11 +253,11 @@ def print_growth(rounds: int) -> None:
 def main() -> None:
     """Print the selected tables, by default all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=("free", "small", "growth"))
+    parser.add_argument("--only", nargs="+", choices=("free", "small", "memory", "growth"))
     parser.add_argument("--games", nargs="+", type=int, default=list(N_STEPS), choices=list(N_STEPS), help="of free")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
-    tables = options.only or ("free", "small", "growth")
+    tables = options.only or ("free", "small", "memory", "growth")
     th.set_num_threads(1)
     if "free" in tables:
         for n_games in options.games:
@@ -264,6 +265,10 @@ def main() -> None:
     if "small" in tables:
         models = {algo.upper(): small_model(algo) for algo in ("ippo", "mappo", "saf")}
         print_table("HECOGrid TeamSupport, size small", costs(models, options.rounds))
+    if "memory" in tables:
+        for algo in ("mappo", "saf"):
+            models = {name: small_model(name) for name in (algo, f"{algo}-gru", f"{algo}-lstm")}
+            print_table(f"HECOGrid TeamSupport, size small, {algo} with memory", costs(models, options.rounds))
     if "growth" in tables:
         print_growth(options.rounds)
 
