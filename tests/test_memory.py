@@ -17,7 +17,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from benchmarks.memory import share_right, trained
-from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf.inspection.recording import record_episodes
 from tests.team_venv import TeamVenv
 from tests.weights import DyingGame
 
@@ -266,6 +267,15 @@ def test_two_runs_of_one_seed_end_alike_and_evaluation_between_changes_nothing()
     found = [make_model().learn(40 * 9, callback=callback) for callback in (None, None, Evaluate())]
     assert equal(weights(found[0]), weights(found[1]))
     assert equal(weights(found[0]), weights(found[2]))
+
+
+def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tmp_path: Any) -> None:
+    callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=1, pictures=False)
+    plain = make_model(env=make_env((5, 5, 5))).learn(48 * 9)
+    watched = make_model(env=make_env((5, 5, 5)), tensorboard_log=str(tmp_path)).learn(48 * 9, callback=callback)
+    assert equal(weights(plain), weights(watched))
+    recorded = record_episodes(watched.policy, make_env(), 6, gamma=0.9)
+    assert np.isfinite(recorded.values).all()
 
 
 def test_games_in_other_processes_are_trained_alike() -> None:
