@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from benchmarks.memory import share_right, trained
 from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.inspection.recording import record_episodes
+from sb3_saf.networks.memory import Memory
 from tests.team_venv import TeamVenv
 from tests.weights import DyingGame
 
@@ -105,6 +106,39 @@ def test_memory_is_that_of_the_agents_own_episode(kind: str) -> None:
                 outputs, _ = policy.actor_memory.rnn(th.stack(seen[row][::-1]).unsqueeze(1))
                 th.testing.assert_close(policy.running.actor[row, :8], outputs[-1, 0], rtol=0, atol=1e-6)
         obs = env.step(np.zeros(9, dtype=int))[0]
+
+
+def test_the_compiled_gru_is_pytorchs() -> None:
+    """Outputs and gradients, with episodes that begin in between; PyTorch's is used where TRPO differentiates twice."""
+    th.manual_seed(0)
+    net, inputs, memory = Memory("gru", 5, 7), th.randn(9, 6, 5), th.randn(6, 7)
+    starts, weight = th.rand(9, 6) < 0.3, th.randn(9, 6, 7)
+    assert starts[1:].any(dim=1).sum() > 3
+    results = []
+    for twice in (False, True):
+        leaves = [part.clone().requires_grad_() for part in (inputs, memory)]
+        outputs, after = net(*leaves, starts, twice)
+        loss = (outputs * weight).sum() + after.square().sum()
+        results.append([outputs, after, *th.autograd.grad(loss, [*leaves, *net.parameters()])])
+    for one, other in zip(*results, strict=True):
+        th.testing.assert_close(one, other, rtol=1e-5, atol=2e-6)
+
+
+def test_a_teams_memory_goes_on_when_an_agent_joins() -> None:
+    env = make_team_env(DyingGame, 1, seed=0)
+    policy = make_model("MAPPOPolicy", env=env).policy
+    policy.set_training_mode(False)
+    obs: Any = env.reset()
+    for step in range(9):  # c joins in step 2, the next episode begins with step 7
+        tensors, memory = obs_as_tensor(obs, policy.device), copy.deepcopy(policy.running)
+        with th.no_grad():
+            values = policy(tensors)[1] + 0
+            if step:
+                memory.critic.zero_()
+                with policy.remembering(memory):
+                    forgetful = policy(tensors)[1] + 0
+                assert th.equal(values, forgetful) == (step == 7)
+        obs = env.step(obs["action_mask"].argmax(axis=1))[0]
 
 
 @pytest.mark.parametrize("policy", POLICIES)
