@@ -190,6 +190,7 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any,
             if is_cell(process):
                 process.kill()
         assert "died" in str(first.exception(timeout=200))
+        time.sleep(1)  # the times are in whole seconds
         second = time.strftime("%Y-%m-%dT%H:%M:%S%z")
         engine.submit(killed).result(timeout=200)
     assert read_json(killed / "result" / "finished.json")["started"] < second

@@ -20,7 +20,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_saf import IPPOPolicy, LightEncoder, MAPPOPolicy, PaperCNN, SAFPolicy
-from sb3_saf.networks.layers import Linear, Rows
+from sb3_saf.networks.layers import Linear
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import DECLARATIONS, register
@@ -599,12 +599,13 @@ def test_predict_needs_the_agent_with_heads_per_agent() -> None:
 
 def test_malformed_observations_are_refused() -> None:
     policy, obs = make_policy(MAPPOPolicy), to_numpy(team_rows(VECTOR))
+    by_agent = make_policy(MAPPOPolicy, heads="per_agent")
     with pytest.raises(ValueError, match=r"expected observations with the keys 'obs', 'team', 'agent', got 'other'"):
         policy.predict(obs | {"other": obs["obs"]})
     with pytest.raises(ValueError, match=r"'agent' must be in 0..2, got"):
-        policy.predict(obs | {"agent": obs["agent"] + 1})
+        by_agent.predict(obs | {"agent": obs["agent"] + 1})
     with pytest.raises(ValueError, match=r"as many rows under each key of an observation, got 'obs' 12, 'agent' 1"):
-        policy.predict({"obs": obs["obs"], "agent": np.array(1)})
+        by_agent.predict({"obs": obs["obs"], "agent": np.array(1)})
     with pytest.raises(ValueError, match=r"'obs' must be finite, got nan"):
         policy.predict(obs["obs"] * np.float32(np.nan))
     with pytest.raises(ValueError, match=r"'obs' must be tile codes in 0..19, got 255"):
@@ -736,8 +737,8 @@ def test_actor_and_encoder_run_without_the_critic() -> None:
 
 def test_parts_can_be_replaced() -> None:
     class DoubledCritic(JointCritic):
-        def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-            return 2.0 * super().forward(features, teams, active)
+        def values(self, states: th.Tensor) -> th.Tensor:
+            return 2.0 * super().values(states)
 
     class DoubledParts(MAPPOParts):
         def critic(self, spec: Any) -> DoubledCritic:

@@ -78,11 +78,11 @@ class Interrupt(BaseCallback):
 
     def __init__(self, after: int, error: type[BaseException]) -> None:
         super().__init__()
-        self.after, self.error = after, error
+        self._limit, self._error = after, error  # settings, under their own names, would make it another run
 
     def _on_step(self) -> bool:
-        if self.num_timesteps >= self.after:
-            raise self.error
+        if self.num_timesteps >= self._limit:
+            raise self._error
         return True
 
 

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import (
@@ -102,7 +101,6 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._raw = raw
         self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
         self._normalization = unwrap_vec_normalize(venv)
-        self._is_monitored = is_vecenv_wrapped(venv, TeamMonitor)
         #: (E, N), the agents that took part in the last step of episodes that go on.
         self._playing = np.zeros((self.n_games, team.n_agents), dtype=np.int8)
         self._n_steps = 0
@@ -162,8 +160,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             self._warn_of_unused_masks()
         obs, rewards, dones, infos = self.venv.step_wait()
         self._n_steps += 1
-        if not self._is_monitored:
-            check_finite("rewards", rewards, self.n_agents, self._n_steps)
+        check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
         infos = self._complete_infos(infos, ended)
         self._playing = self._playing * ~ended[:, np.newaxis]
