@@ -510,8 +510,8 @@ def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
         index = f", {{{OBS_KEY!r}: ..., {AGENT_KEY!r}: its index}}, or the observations of all agents by name"
         raise ValueError(
             f"expected the observation to have {key!r}, which {reader} reads, got "
-            f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs)) or 'nothing that it reads'}; pass whole rows of "
-            f"sb3_saf.CentralizedValueWrapper{index if key == AGENT_KEY else ''}"
+            f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs)) or 'nothing that it reads'}; pass "
+            f"whole rows of sb3_saf.CentralizedValueWrapper{index if key == AGENT_KEY else ''}"
         )
     return obs[key]
 
