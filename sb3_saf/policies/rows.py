@@ -508,10 +508,10 @@ def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
     """Return an entry of rows, or raise an error that ``reader`` needs it."""
     if isinstance(obs, th.Tensor) or (key not in obs and not isinstance(obs, TeamMinibatch)):
         index = f", {{{OBS_KEY!r}: ..., {AGENT_KEY!r}: its index}}, or the observations of all agents by name"
+        keys = "an array" if isinstance(obs, th.Tensor) else ", ".join(map(repr, obs)) or "nothing that it reads"
         raise ValueError(
-            f"expected the observation to have {key!r}, which {reader} reads, got "
-            f"{'an array' if isinstance(obs, th.Tensor) else ', '.join(map(repr, obs)) or 'nothing that it reads'}; pass "
-            f"whole rows of sb3_saf.CentralizedValueWrapper{index if key == AGENT_KEY else ''}"
+            f"expected the observation to have {key!r}, which {reader} reads, got {keys}; pass whole rows of "
+            f"sb3_saf.CentralizedValueWrapper{index if key == AGENT_KEY else ''}"
         )
     return obs[key]
 
