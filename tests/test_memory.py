@@ -108,10 +108,12 @@ def test_memory_is_that_of_the_agents_own_episode(kind: str) -> None:
         obs = env.step(np.zeros(9, dtype=int))[0]
 
 
-def test_the_compiled_gru_is_pytorchs() -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_compiled_loops_are_pytorchs(kind: Any) -> None:
     """Outputs and gradients, with episodes that begin in between; PyTorch's is used where TRPO differentiates twice."""
     th.manual_seed(0)
-    net, inputs, memory = Memory("gru", 5, 7), th.randn(9, 6, 5), th.randn(6, 7)
+    net, inputs = Memory(kind, 5, 7), th.randn(9, 6, 5)
+    memory = th.randn(6, net.state_dim)
     starts, weight = th.rand(9, 6) < 0.3, th.randn(9, 6, 7)
     assert starts[1:].any(dim=1).sum() > 3
     results = []
@@ -119,6 +121,8 @@ def test_the_compiled_gru_is_pytorchs() -> None:
         leaves = [part.clone().requires_grad_() for part in (inputs, memory)]
         outputs, after = net(*leaves, starts, twice)
         loss = (outputs * weight).sum() + after.square().sum()
+        every = net.every(leaves[0], leaves[1], starts)
+        assert th.equal(every[:, :, :7], outputs) or twice
         results.append([outputs, after, *th.autograd.grad(loss, [*leaves, *net.parameters()])])
     for one, other in zip(*results, strict=True):
         th.testing.assert_close(one, other, rtol=1e-5, atol=2e-6)

@@ -1,8 +1,8 @@
 """
 Memory over the steps of an episode: a GRU or an LSTM.
 
-On the CPU, a GRU's gates are computed by compiled loops, which also empty the memory where episodes begin. PyTorch's
-GRU, which runs from one beginning to the next, takes twice as long.
+On the CPU, gates are computed by compiled loops, which also empty the memory where episodes begin. PyTorch's own, which
+run from one beginning to the next, take twice as long.
 
 Letters: T steps, R rows (agents or teams), d inputs, H outputs, M size of a row's memory.
 """
@@ -53,16 +53,19 @@ class Memory(nn.Module):
         :param twice: whether the result must be differentiable twice, as TRPO needs
         :return: outputs (T, R, H), and the memory (R, M) after the last step
         """
-        on_cpu = inputs.device.type == "cpu" and inputs.dtype == th.float32 and not th.compiler.is_compiling()
-        if isinstance(self.rnn, nn.GRU) and on_cpu and not twice:
-            of_input, of_memory, input_bias, memory_bias = self.rnn.parameters()
-            of_inputs = nn.functional.linear(inputs, of_input, input_bias)
-            outputs: th.Tensor = _GRU.apply(of_inputs, memory, starts, of_memory, memory_bias)
-            return outputs, outputs[-1]
+        if not twice and _can_be_compiled(inputs):
+            memories = self._compiled(inputs, memory, starts)
+            return memories[:, :, : self.rnn.hidden_size], memories[-1]
         if not twice:
             return self._from_start_to_start(inputs, memory, starts)
         with th.backends.cudnn.flags(enabled=False):  # it has no second derivatives
             return self._from_start_to_start(inputs, memory, starts)
+
+    def _compiled(self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor | None) -> th.Tensor:
+        of_input, of_memory, input_bias, memory_bias = self.rnn.parameters()
+        of_inputs = nn.functional.linear(inputs, of_input, input_bias)
+        memories: th.Tensor = _Recurrence.apply(of_inputs, memory, starts, of_memory, memory_bias)
+        return memories
 
     def _from_start_to_start(
         self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor | None
@@ -97,8 +100,8 @@ class Memory(nn.Module):
 
         :return: memory (T, R, M) after every step, which begins with the outputs (T, R, H)
         """
-        if isinstance(self.rnn, nn.GRU):
-            return self(inputs, memory, starts)[0]
+        if _can_be_compiled(inputs):
+            return self._compiled(inputs, memory, starts)
         memories = []
         for step, begins in zip(inputs, starts, strict=True):
             _, memory = self.step(step, memory, begins)
@@ -123,12 +126,18 @@ class Memory(nn.Module):
                 nn.init.zeros_(parameter)
 
 
-class _GRU(th.autograd.Function):
-    """
-    The recurrence of a GRU, from its inputs' part of the gates (T, R, 3 H): reset r, update z, candidate n.
+def _can_be_compiled(inputs: th.Tensor) -> bool:
+    return inputs.device.type == "cpu" and inputs.dtype == th.float32 and not th.compiler.is_compiling()
 
-    r = sigmoid(x_r + h_r), z = sigmoid(x_z + h_z), n = tanh(x_n + r h_n), h' = (1 - z) n + z h, with
-    [h_r, h_z, h_n] = W h + b, and h = 0 where an episode begins.
+
+class _Recurrence(th.autograd.Function):
+    """
+    Memory (T, R, M) after every step, from the inputs' part of the gates, (T, R, 3 H) or, of an LSTM, (T, R, 4 H).
+
+    With x of the inputs and h of the memory, W h + b, and an empty memory where an episode begins:
+
+    - GRU: r = sigmoid(x_r + h_r), z = sigmoid(x_z + h_z), n = tanh(x_n + r h_n), h' = (1 - z) n + z h
+    - LSTM: i, f, o = sigmoid(x + h), g = tanh(x_g + h_g), c' = f c + i g, h' = o tanh(c')
     """
 
     @staticmethod
@@ -140,51 +149,59 @@ class _GRU(th.autograd.Function):
         weight: th.Tensor,
         bias: th.Tensor,
     ) -> th.Tensor:
-        of_inputs, (length, n_rows, _), size = of_inputs.contiguous(), of_inputs.shape, memory.shape[1]
+        of_inputs, (length, n_rows, n_gates), size = of_inputs.contiguous(), of_inputs.shape, weight.shape[1]
         starts = of_inputs.new_zeros(length, n_rows, dtype=th.bool) if starts is None else starts.contiguous()
-        before, after = of_inputs.new_empty(2, length, n_rows, size)
-        of_memory, gates = of_inputs.new_empty(2, length, n_rows, 3 * size)
-        transposed, arrays = (
-            weight.t(),
-            [part.detach().numpy() for part in (of_inputs, of_memory, before, gates, after)],
-        )
+        before, after = of_inputs.new_empty(2, length, *memory.shape)
+        gates, of_memory = of_inputs.new_empty(length, n_rows, 4 * size), of_inputs.new_empty(n_rows, n_gates)
+        arrays = [part.detach().numpy() for part in (of_inputs, before, gates, after)]
+        kernel, transposed = _gru if n_gates == 3 * size else _lstm, weight.t()
         for step in range(length):
             before[step] = memory.masked_fill(starts[step].unsqueeze(1), 0.0)
-            th.addmm(bias, before[step], transposed, out=of_memory[step])
-            _step(*(array[step] for array in arrays))
+            th.addmm(bias, before[step, :, :size], transposed, out=of_memory)
+            kernel(of_memory.numpy(), *[array[step] for array in arrays])
             memory = after[step]
-        ctx.save_for_backward(before, of_memory, gates, starts, weight)
+        ctx.save_for_backward(before, gates, after, starts, weight)
         return after
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[Any, ...]:
-        before, of_memory, gates, starts, weight = ctx.saved_tensors
-        gradient, (length, n_rows, size) = gradients[0].clone(memory_format=th.contiguous_format), before.shape
-        of_inputs, of_gates = before.new_empty(2, length, n_rows, 3 * size)
-        later, following = before.new_zeros(n_rows, size), before.new_zeros(n_rows, size)
-        over_time = [part.numpy() for part in (gradient, before, of_memory, gates, of_inputs, of_gates)]
-        of_step = [later.numpy(), following.numpy()]
-        for step in reversed(range(length)):
-            _back(*[array[step] for array in over_time], *of_step)
-            th.addmm(following, of_gates[step], weight, out=later)
-            later.masked_fill_(starts[step].unsqueeze(1), 0.0)
-        flat = of_gates.flatten(0, 1)
-        return of_inputs, later, None, flat.t() @ before.flatten(0, 1), flat.sum(dim=0)
+        before, gates, after, starts, weight = ctx.saved_tensors
+        gradient, (n_gates, size) = gradients[0].clone(memory_format=th.contiguous_format), weight.shape
+        of_inputs, earlier = before.new_empty(*before.shape[:2], n_gates), th.zeros_like(before[0])
+        # Gradients of the memory's parts of the gates: in a GRU, the candidate's is multiplied by the reset gate.
+        parts, saved, kernel = [of_inputs], [gradient, before, gates, after, of_inputs], _lstm_back
+        if n_gates == 3 * size:
+            parts = [of_inputs[:, :, : 2 * size], th.empty_like(before)]
+            saved, kernel = [gradient, before, gates, of_inputs, parts[1]], _gru_back
+        weights = weight.split([part.shape[2] for part in parts])
+        arrays = [part.numpy() for part in saved]
+        for step in reversed(range(len(before))):
+            gradient[step] += earlier
+            kernel(*[array[step] for array in arrays], earlier.numpy())
+            for part, weight_of_part in zip(parts, weights, strict=True):
+                earlier[:, :size].addmm_(part[step], weight_of_part)
+            earlier.masked_fill_(starts[step].unsqueeze(1), 0.0)
+        flat, hidden = [part.flatten(0, 1) for part in parts], before[:, :, :size].flatten(0, 1)
+        of_weight = th.cat([part.t() @ hidden for part in flat])
+        return of_inputs, earlier, None, of_weight, th.cat([part.sum(dim=0) for part in flat])
 
 
 Floats = npt.NDArray[np.float32]
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 
+# The kernels' loops are short and over few arrays, so that they are vectorised.
+
 
 @cached(error_model="numpy", fastmath={"contract"})
-def _step(of_inputs: Floats, of_memory: Floats, before: Floats, gates: Floats, after: Floats) -> None:
-    """Compute the gates [r, z, n] (R, 3 H) and h' (R, H)."""
+def _gru(of_memory: Floats, of_inputs: Floats, before: Floats, gates: Floats, after: Floats) -> None:
+    """Compute [r, z, n, h_n] (R, 4 H) and h' (R, H)."""
     n_rows, size = before.shape
     for row in range(n_rows):
-        # Short loops over few arrays are vectorised.
         for i in range(2 * size):
             gates[row, i] = _HALF + _HALF * tanh_of(_HALF * (of_inputs[row, i] + of_memory[row, i]))
+        for i in range(2 * size, 3 * size):
+            gates[row, size + i] = of_memory[row, i]
         for i in range(size):
             j = 2 * size + i
             gates[row, j] = tanh_of(of_inputs[row, j] + gates[row, i] * of_memory[row, j])
@@ -194,27 +211,14 @@ def _step(of_inputs: Floats, of_memory: Floats, before: Floats, gates: Floats, a
 
 
 @cached(error_model="numpy", fastmath={"contract"})
-def _back(
-    gradient: Floats,
-    before: Floats,
-    of_memory: Floats,
-    gates: Floats,
-    of_inputs: Floats,
-    of_gates: Floats,
-    later: Floats,
-    direct: Floats,
+def _gru_back(
+    gradient: Floats, before: Floats, gates: Floats, of_inputs: Floats, of_candidate: Floats, earlier: Floats
 ) -> None:
-    """
-    Compute the gradients of the parts of the gates (R, 3 H), and the direct one of h (R, H), from those of h'.
-
-    :param later: (R, H) gradient of h' by later steps; ``gradient`` is that by the output, and becomes the sum
-    """
+    """Compute the gradients of x (R, 3 H) and h_n (R, H), and the direct one of h (R, H), from that of h'."""
     n_rows, size = before.shape
     for row in range(n_rows):
         for i in range(size):
-            gradient[row, i] += later[row, i]
-        for i in range(size):
-            direct[row, i] = gradient[row, i] * gates[row, size + i]
+            earlier[row, i] = gradient[row, i] * gates[row, size + i]
         for i in range(size):
             z, n = gates[row, size + i], gates[row, 2 * size + i]
             of_inputs[row, 2 * size + i] = gradient[row, i] * (_ONE - z) * (_ONE - n * n)
@@ -222,9 +226,55 @@ def _back(
             z, n = gates[row, size + i], gates[row, 2 * size + i]
             of_inputs[row, size + i] = gradient[row, i] * (before[row, i] - n) * z * (_ONE - z)
         for i in range(size):
-            r, j = gates[row, i], 2 * size + i
-            of_inputs[row, i] = of_inputs[row, j] * of_memory[row, j] * r * (_ONE - r)
-        for i in range(2 * size):
-            of_gates[row, i] = of_inputs[row, i]
+            r = gates[row, i]
+            of_inputs[row, i] = of_inputs[row, 2 * size + i] * gates[row, 3 * size + i] * r * (_ONE - r)
         for i in range(size):
-            of_gates[row, 2 * size + i] = of_inputs[row, 2 * size + i] * gates[row, i]
+            of_candidate[row, i] = of_inputs[row, 2 * size + i] * gates[row, i]
+
+
+@cached(error_model="numpy", fastmath={"contract"})
+def _lstm(of_memory: Floats, of_inputs: Floats, before: Floats, gates: Floats, after: Floats) -> None:
+    """Compute the gates [i, f, g, o] (R, 4 H) and [h', c'] (R, 2 H)."""
+    n_rows, size = len(before), before.shape[1] // 2
+    for row in range(n_rows):
+        for i in range(4 * size):
+            gates[row, i] = of_inputs[row, i] + of_memory[row, i]
+        for i in range(2 * size):
+            gates[row, i] = _HALF + _HALF * tanh_of(_HALF * gates[row, i])
+        for i in range(2 * size, 3 * size):
+            gates[row, i] = tanh_of(gates[row, i])
+        for i in range(3 * size, 4 * size):
+            gates[row, i] = _HALF + _HALF * tanh_of(_HALF * gates[row, i])
+        for i in range(size):
+            new = gates[row, i] * gates[row, 2 * size + i]
+            after[row, size + i] = gates[row, size + i] * before[row, size + i] + new
+        for i in range(size):
+            after[row, i] = gates[row, 3 * size + i] * tanh_of(after[row, size + i])
+
+
+@cached(error_model="numpy", fastmath={"contract"})
+def _lstm_back(
+    gradient: Floats, before: Floats, gates: Floats, after: Floats, of_inputs: Floats, earlier: Floats
+) -> None:
+    """Compute the gradients of the parts of the gates (R, 4 H), and the direct one of [h, c], from that of [h', c']."""
+    n_rows, size = len(before), before.shape[1] // 2
+    for row in range(n_rows):
+        for i in range(size):
+            t, o = tanh_of(after[row, size + i]), gates[row, 3 * size + i]
+            of_inputs[row, 3 * size + i] = gradient[row, i] * t * o * (_ONE - o)
+        for i in range(size):
+            t = tanh_of(after[row, size + i])
+            gradient[row, size + i] += gradient[row, i] * gates[row, 3 * size + i] * (_ONE - t * t)
+        for i in range(size):
+            gate, g = gates[row, i], gates[row, 2 * size + i]
+            of_inputs[row, i] = gradient[row, size + i] * g * gate * (_ONE - gate)
+        for i in range(size):
+            f = gates[row, size + i]
+            of_inputs[row, size + i] = gradient[row, size + i] * before[row, size + i] * f * (_ONE - f)
+        for i in range(size):
+            g = gates[row, 2 * size + i]
+            of_inputs[row, 2 * size + i] = gradient[row, size + i] * gates[row, i] * (_ONE - g * g)
+        for i in range(size):
+            earlier[row, i] = np.float32(0.0)
+        for i in range(size):
+            earlier[row, size + i] = gradient[row, size + i] * gates[row, size + i]
