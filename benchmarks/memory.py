@@ -110,7 +110,7 @@ def trained(
             kwargs |= {"n_policies": 2, "latent_dim": 16, "projection_arch": (32,)}
         model = PPO(
             f"{method.upper()}Policy", env, policy_kwargs=kwargs, n_steps=4 * length, batch_size=64 * length,
-            n_epochs=4, learning_rate=2e-3, ent_coef=0.01, gae_lambda=1.0,
+            n_epochs=4, learning_rate=lambda left: 2e-3 * left, ent_coef=0.01, gae_lambda=1.0,
             rollout_buffer_class=sb3_saf.TeamRolloutBuffer, **common,
         )  # fmt: skip
     return model.learn(n_episodes * length * 2)
