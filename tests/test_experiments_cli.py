@@ -80,7 +80,7 @@ BAD = {
     ("run", "joint", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",
     ("run", "joint", "--vary", "a:[1]"): "--vary is for a grid of your own: give its environments with --env",
     ("plan", "joint", "--methods", "safe"): "unknown method 'safe' (did you mean 'saf'?)",
-    ("run", "joint", "--tasks", "TeamSuport"): "unknown environment 'TeamSuport' (did you mean 'TeamSupport-v0'",
+    ("run", "joint", "--tasks", "TeamSuport"): "unknown environment 'TeamSuport' (did you mean 'TeamSupport'",
     ("run", "joint", "--seeds", "-1"): "seed must be a whole number from 0 to 4294967295, got -1",
     ("run", "joint", "--shard", "9/8"): "expected a part such as 3/8 (the third of eight), got '9/8'",
     ("run", "joint", "--workers", "0"): "argument --workers: must be at least 1, got 0",

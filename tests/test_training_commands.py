@@ -388,7 +388,7 @@ def failed(
     ("options", "words"),
     [
         (["--algo", "safe"], ("unknown algorithm 'safe'", "did you mean 'saf'")),
-        (["--env", "TeamTogehter-v0"], ("unknown environment", "did you mean 'TeamTogether-v0'")),
+        (["--env", "TeamTogehter-v0"], ("unknown environment", "did you mean 'TeamTogether'")),
         (["--size", "large"], ("unknown size 'large'", "paper, medium, small, smoke")),
         (["--env-kwargs", "coordination:9"], ("coordination must be an integer from 1 to 4", "got 9")),
         (["--env-kwargs", "coordination"], ("expects key:value", "coordination:2")),

@@ -135,7 +135,7 @@ def test_a_window_needs_a_display(
     ("options", "words"),
     [
         (["--algo", "safe"], "did you mean 'saf'"),
-        (["--env", "TeamTogehter-v0"], "did you mean 'TeamTogether-v0'"),
+        (["--env", "TeamTogehter-v0"], "did you mean 'TeamTogether'"),
         (["--algo", "ippo"], "python -m sb3_saf.train --algo ippo"),
         (["-f", "nowhere"], "there is no folder nowhere/saf; train first"),
         (["--exp-id", "9"], "there is no run 9 of TeamTogether-v0"),

@@ -172,7 +172,7 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"algo": "sfa"}, "did you mean 'saf'"),
-        ({"env_id": "TeamTogeter-v0"}, "did you mean 'TeamTogether-v0'"),
+        ({"env_id": "TeamTogeter-v0"}, "did you mean 'TeamTogether'"),
         ({"size": "smal"}, "did you mean 'small'"),
         ({"env_kwargs": {"coordinaton": 2}}, "did you mean 'coordination'"),
         ({"env_kwargs": {"coordination": 11}}, "coordination"),

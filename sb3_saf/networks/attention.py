@@ -16,7 +16,7 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_saf.networks.compiled import cached
+from hecogrid_envs.core.jit import cached
 from sb3_saf.networks.layers import Linear
 
 Floats = npt.NDArray[np.float32]

@@ -18,7 +18,7 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_saf.networks.compiled import cached
+from hecogrid_envs.core.jit import cached
 from sb3_saf.networks.tanh import tanh_of
 
 MemoryName = Literal["gru", "lstm"]

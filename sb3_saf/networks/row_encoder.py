@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_saf.networks.compiled import cached
+from hecogrid_envs.core.jit import cached
 from sb3_saf.networks.layers import InOrder, Rows, gather
 
 _WORD: Final = 8  # bytes in a machine word

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch as th
 from numba import njit
 
-from sb3_saf.networks.compiled import cached
+from hecogrid_envs.core.jit import cached
 
 _LIMIT: Final = np.float32(9.0)
 _P0, _P1, _P2, _P3, _P4 = (

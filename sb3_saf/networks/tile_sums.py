@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch as th
 from torch.autograd.function import once_differentiable
 
-from sb3_saf.networks.compiled import cached
+from hecogrid_envs.core.jit import cached
 
 Ints: TypeAlias = npt.NDArray[np.int64]
 Floats: TypeAlias = npt.NDArray[Any]

@@ -125,7 +125,8 @@ def find_environment(name: str) -> TeamEnvironment:
         module, _, function = name.partition(":")
         return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"environment {name!r}"))
     home, *others = sorted(suites().values(), key=lambda one: one.name != HOME)
-    ids = [*home.tasks, *(f"{one.name}/{task}" for one in others for task in one.examples)]
+    short = [task.removesuffix("-v0") for task in home.tasks]
+    ids = [*short, *(f"{one.name}/{task}" for one in others for task in one.examples)]
     nearest = " or ".join(map(repr, get_close_matches(name, ids, n=N_NEAREST)))
     did_you_mean = f" (did you mean {nearest}?)" if nearest else ""
     raise ValueError(f"unknown environment {name!r}{did_you_mean}; expected {HOW_TO_NAME}")
