@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3 import PPO
 
 from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, game_seeds, make_team_env
-from sb3_saf.checkpoints.environments import environment_state, load_environment_state
+from sb3_saf.checkpoints.states import environment_state, load_environment_state
 from sb3_saf.suites.registry import find_environment, suites
 from sb3_saf.teams.trees import decode, encode
 from sb3_saf.training.settings import load_settings

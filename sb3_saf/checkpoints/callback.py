@@ -7,18 +7,22 @@ import uuid
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
-from typing import BinaryIO, Final, NamedTuple, NoReturn
+from typing import BinaryIO, NamedTuple, NoReturn
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
-from sb3_saf.checkpoints.callback_states import all_callbacks, callback_states
-from sb3_saf.checkpoints.environments import environment_state
-from sb3_saf.checkpoints.logs import logger_state
-from sb3_saf.checkpoints.models import generator_states, is_off_policy, model_state, require_resumable
+from sb3_saf.checkpoints.models import (
+    generator_states,
+    is_off_policy,
+    logger_state,
+    model_state,
+    require_resumable,
+)
 from sb3_saf.checkpoints.runs import description, software
-from sb3_saf.checkpoints.store import CheckpointFolder, Loaded
+from sb3_saf.checkpoints.states import all_callbacks, callback_states, environment_state
+from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.trees import Tree, encode, write_tree
@@ -37,29 +41,12 @@ class Run(NamedTuple):
     description: dict[str, Tree]
 
 
-#: Entries of a checkpoint.
-_ENTRIES: Final = (
-    *("run", "game_steps", "software", "description", "model", "environment", "callbacks", "generators", "logger"),
-)
-
 _RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary()
 
 
 def enter_run(model: BaseAlgorithm, run: Run) -> None:
     """Set the run that a model continues."""
     _RUNS[model] = run
-
-
-def newest_checkpoint(folder: CheckpointFolder) -> Loaded | None:
-    """
-    Read the newest valid checkpoint of a run.
-
-    :raises CheckpointError: see :meth:`CheckpointFolder.newest`; also for a file with other content
-    """
-    newest = folder.newest()
-    if newest is not None and not (isinstance(newest.tree, dict) and newest.tree.keys() == set(_ENTRIES)):
-        raise CheckpointError(f"expected a checkpoint of {', '.join(_ENTRIES)}, got {newest.path} with other content")
-    return newest
 
 
 class TeamCheckpointCallback(BaseCallback):
@@ -116,7 +103,7 @@ class TeamCheckpointCallback(BaseCallback):
         if self.model not in _RUNS:
             enter_run(self.model, Run(uuid.uuid4().hex, description(self.model, self.others)))
         self._run = _RUNS[self.model]
-        newest = newest_checkpoint(self.store)
+        newest = self.store.newest()
         if newest is not None and newest.tree["run"] != self._run.name:
             self.store.release()
             raise CheckpointError(
@@ -124,27 +111,24 @@ class TeamCheckpointCallback(BaseCallback):
                 "sb3_saf.resume(folder, model, callbacks), or give this run a folder of its own"
             )
         self._written = None if newest is None else newest.tree["game_steps"]
-        if self.exact is None:
-            self.exact = self._can_be_exact()
-
-    def _can_be_exact(self) -> bool:
-        """Return whether all environments provide their state; warn if not."""
+        if self.exact is not None:
+            return
+        self.exact = True
         try:
             environment_state(self.training_env)
             callback_states(self.others)
         except CheckpointError as error:
+            self.exact = False
             message = (
                 f"{str(error).partition(';')[0]}. If this run is interrupted, it goes on with the weights, optimiser "
                 "and counters of its last checkpoint and begins new episodes"
             )
             warnings.warn(message, UserWarning, stacklevel=2)
             self.logger.log(message)
-            return False
-        return True
 
     def _on_rollout_start(self) -> None:
         self._between_rollouts = True  # until the first step
-        is_due = self._written is None or self._game_steps() - self._written >= self.every_game_steps
+        is_due = self._written is None or team_steps(self.model) - self._written >= self.every_game_steps
         if is_due or self._stop is not None or not is_off_policy(self.model):
             self._take()
         if is_due:
@@ -173,12 +157,9 @@ class TeamCheckpointCallback(BaseCallback):
         """
         self._stop = stop
 
-    def _game_steps(self) -> int:
-        return team_steps(self.model)
-
     def _take(self) -> None:
         """Copy the present state; with a replay buffer, to disk."""
-        steps = self._game_steps()
+        steps = team_steps(self.model)
         if not is_off_policy(self.model):
             self._last = (steps, encode(self._state()))
         elif steps != self._written:
@@ -187,7 +168,7 @@ class TeamCheckpointCallback(BaseCallback):
     def _state(self) -> dict[str, Tree]:
         return {
             "run": self._run.name,
-            "game_steps": self._game_steps(),
+            "game_steps": team_steps(self.model),
             "software": software(self.model),
             "description": self._run.description,
             "model": model_state(self.model),

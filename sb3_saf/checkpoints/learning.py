@@ -20,11 +20,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.callbacks.finite import FiniteCallback
 from sb3_saf.callbacks.game_steps import GameStepsCallback
-from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run, newest_checkpoint
-from sb3_saf.checkpoints.callback_states import all_callbacks, load_callback_states
-from sb3_saf.checkpoints.environments import load_environment_state
-from sb3_saf.checkpoints.logs import continue_logs
+from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run
 from sb3_saf.checkpoints.models import (
+    continue_logs,
     is_off_policy,
     load_generator_states,
     load_model_state,
@@ -32,10 +30,10 @@ from sb3_saf.checkpoints.models import (
     settings_restored_on_error,
 )
 from sb3_saf.checkpoints.runs import check_description, description, software, warn_of_differences
+from sb3_saf.checkpoints.states import all_callbacks, load_callback_states, load_environment_state
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.envs.game_copies import ForeignGamesError, check_signatures, pickled_games, sign_games
 from sb3_saf.teams.errors import CheckpointError, NonFiniteError
-from sb3_saf.teams.trees import Tree
 
 #: Torch's error message for action distributions with NaN parameters.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)
@@ -68,7 +66,9 @@ def resume(
         those of the first start, naming the first difference
     """
     require_resumable(model)
-    loaded = newest_checkpoint(CheckpointFolder(folder))
+    env = model.get_env()
+    assert env is not None
+    loaded = CheckpointFolder(folder).newest()
     if loaded is None:
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
     others = [one for one in all_callbacks(callback) if not isinstance(one, TeamCheckpointCallback)]
@@ -88,7 +88,17 @@ def resume(
         tree = {**tree, "environment": None, "callbacks": None}
     warn_of_differences(tree["software"], software(model))
     try:
-        _load(model, others, tree)
+        load_model_state(model, tree["model"])
+        if tree["environment"] is not None:
+            load_callback_states(others, tree["callbacks"])
+            load_environment_state(env, tree["environment"])
+        else:
+            # Not the seeds of the first start, whose games were played already.
+            env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
+            model._last_obs = None
+        continue_logs(model, tree["logger"])
+        enter_run(model, Run(tree["run"], tree["description"]))
+        load_generator_states(tree["generators"], model)  # last: the calls above may draw from them
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise CheckpointError(f"the checkpoint {loaded.path} does not fit: {reason}; make a new model") from error
@@ -97,21 +107,6 @@ def resume(
         message += "; they were unpickled from it, as this user signed them"
     model.logger.log(f"Resumed from {loaded.path}: {message}")
     return loaded.path
-
-
-def _load(model: BaseAlgorithm, others: Sequence[BaseCallback], tree: Tree) -> None:
-    assert model.env is not None
-    load_model_state(model, tree["model"])
-    if tree["environment"] is not None:
-        load_callback_states(others, tree["callbacks"])
-        load_environment_state(model.env, tree["environment"])
-    else:
-        # Not the seeds of the first start, whose games were played already.
-        model.env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
-        model._last_obs = None
-    continue_logs(model, tree["logger"])
-    enter_run(model, Run(tree["run"], tree["description"]))
-    load_generator_states(tree["generators"], model)  # last: the calls above may draw from them
 
 
 def resumable_learn(
@@ -174,47 +169,41 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
     """
     Save when training is interrupted.
 
-    :param at_rollout: whether signals stop it only at the start of the next rollout, where its state can be copied
+    :param at_rollout: whether the first signal stops it only at the start of the next rollout, where its state can be
+        copied; a second one always stops it now
     :param again: advice on how to continue
     """
-    signals = {signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}
-    with handled(signals, _stopper(checkpoints, at_rollout)):
-        try:
-            yield
-        except (KeyboardInterrupt, SystemExit):
-            checkpoints.write_last()
-            newest = checkpoints.store.checkpoints()
-            if newest:
-                print(f"\nStopped. {newest[0]} is saved; {again}", flush=True)
-            raise
-        except ValueError as error:
-            if not isinstance(error, NonFiniteError) and not _OF_TORCH.match(str(error)):
-                raise
-            checkpoints.write_last()  # the state before this rollout
-            newest = checkpoints.store.checkpoints()
-            last = f"the last good checkpoint is {newest[0]}" if newest else "there is no checkpoint yet"
-            what = str(error).partition("\n")[0].rstrip(":")
-            raise NonFiniteError(f"{what}; {last}") from error
-
-
-def _stopper(checkpoints: TeamCheckpointCallback, at_rollout: bool) -> Callable[[int, FrameType | None], None]:
-    """Return a signal handler that stops training now or at the next rollout; a second signal always stops it now."""
     waits = at_rollout
+
+    def stop(number: int) -> NoReturn:
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
 
     def handle(number: int, frame: FrameType | None) -> None:
         nonlocal waits
         if not waits:
-            _stop(number)
+            stop(number)
         waits = False
-        checkpoints.stop_soon(partial(_stop, number))
+        checkpoints.stop_soon(partial(stop, number))
 
-    return handle
+    def newest() -> Path | None:
+        checkpoints.write_last()  # the state before this rollout
+        return next(iter(checkpoints.store.checkpoints()), None)
 
-
-def _stop(number: int) -> NoReturn:
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise SystemExit(128 + number)
+    with handled({signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}, handle):
+        try:
+            yield
+        except (KeyboardInterrupt, SystemExit):
+            if path := newest():
+                print(f"\nStopped. {path} is saved; {again}", flush=True)
+            raise
+        except ValueError as error:
+            if not isinstance(error, NonFiniteError) and not _OF_TORCH.match(str(error)):
+                raise
+            last = f"the last good checkpoint is {path}" if (path := newest()) else "there is no checkpoint yet"
+            what = str(error).partition("\n")[0].rstrip(":")
+            raise NonFiniteError(f"{what}; {last}") from error
 
 
 @contextmanager

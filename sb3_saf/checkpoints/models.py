@@ -1,5 +1,5 @@
 """
-State of an SB3 algorithm between two rollouts, and of the random generators of its process.
+State of an SB3 algorithm between two rollouts: the model, its logger, and the random generators of the process.
 
 SB3 has no public interface to set most of it: its ``load`` sets the attributes from an unpickled file, and ``save``
 omits some. Only this module reads and sets them.
@@ -7,18 +7,21 @@ omits some. Only this module reads and sets them.
 
 from __future__ import annotations
 
+import os
 import random
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
+from sb3_saf.callbacks.game_steps import game_steps
 from sb3_saf.checkpoints.runs import constructor_arguments
 from sb3_saf.policies.memory import RememberingPolicy
 from sb3_saf.qplex.qplex import QPLEX
@@ -119,3 +122,42 @@ def load_generator_states(states: Tree, model: BaseAlgorithm) -> None:
     if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
         th.cuda.set_rng_state_all(states["cuda"])
     model.action_space.np_random.bit_generator.state = states["action_space"]
+
+
+def logger_state(logger: Logger) -> Tree:
+    """Return the name of the log folder, and the recorded values not yet written."""
+    numbers = {
+        name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))
+    }
+    has_tensorboard = any(isinstance(output, TensorBoardOutputFormat) for output in logger.output_formats)
+    return {
+        # Relative to the model's log folder, which may have been moved on resuming.
+        "tensorboard": os.path.basename(logger.get_dir() or "") if has_tensorboard else None,
+        "numbers": [
+            [name, value, list(logger.name_to_excluded[name] or ()), logger.name_to_count[name]]
+            for name, value in numbers.items()
+        ],
+    }
+
+
+def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
+    """Set a logger that continues in the same folder; a logger set by the caller is kept."""
+    if not hasattr(model, "logger"):
+        formats = ["stdout"] if model.verbose >= 1 else [""]
+        if state["tensorboard"] is None or model.tensorboard_log is None:
+            model.set_logger(configure(None, formats))
+        else:
+            from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+            folder = os.path.join(model.tensorboard_log, os.path.basename(state["tensorboard"]))
+            logger, board = configure(folder, formats), TensorBoardOutputFormat(folder)
+            logger.output_formats.append(board)
+            # TensorBoard hides entries written after the checkpoint, which are written again.
+            file_writer: Any = board.writer.file_writer
+            start = SessionLog(status=SessionLog.START)
+            file_writer.add_event(Event(step=(game_steps(model) or 0) + 1, session_log=start))
+            model.set_logger(logger)
+    for name, value, excluded, count in state["numbers"]:
+        model.logger.name_to_value[name] = value
+        model.logger.name_to_excluded[name] = tuple(excluded)
+        model.logger.name_to_count[name] = count

@@ -93,20 +93,18 @@ def _of_callback(callback: BaseCallback) -> dict[str, Tree]:
     return {**_arguments(callback), **environment}
 
 
-def _layers(venv: VecEnv) -> dict[str, Tree]:
-    seeds = game_seeds_of(venv)
-    return {
-        "seeds of the games": None if seeds is None else [None if seed is None else int(seed) for seed in seeds],
-        **_by_class(layers(venv), _of_layer),
-    }
-
-
 def _of_layer(layer: VecEnv) -> dict[str, Tree]:
     if isinstance(layer, Curriculum):
         stages = {f"stage {number}": _layers(stage) for number, stage in enumerate(layer.stages)}
         return {"ends": list(layer.ends), **stages}
     games = layer.settings() if isinstance(layer, TeamVecEnv) else {}
     return {"num_envs": layer.num_envs, **_arguments(layer), **games}
+
+
+def _layers(venv: VecEnv) -> dict[str, Tree]:
+    seeds = game_seeds_of(venv)
+    numbers = None if seeds is None else [None if seed is None else int(seed) for seed in seeds]
+    return {"seeds of the games": numbers, **_by_class(layers(venv), _of_layer)}
 
 
 def _by_class(parts: Iterable[Any], describe: Callable[[Any], dict[str, Tree]]) -> dict[str, Tree]:

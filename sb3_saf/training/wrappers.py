@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
-from sb3_saf.checkpoints.environments import load_normalization_statistics, normalization_statistics
+from sb3_saf.checkpoints.states import load_normalization_statistics, normalization_statistics
 from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.equal_spaces import EqualSpaces, masks_are_inside
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
