@@ -12,6 +12,7 @@ import numpy.typing as npt
 Rules = Literal["paper", "released"]
 AgentOrder = Literal["random", "index"]
 Observation = Literal["rgb", "tiles"]
+AgentColours = Literal["zone", "none", "action"]
 RenderMode = Literal["rgb_array", "human", "ansi"]
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from hecogrid_envs.constants import (
     MAX_ZONES_AT_STRIDE,
     ZONE_STRIDE,
+    AgentColours,
     AgentOrder,
     Observation,
     Rules,
@@ -49,6 +50,8 @@ class HECOGridParams:
     :param rules: ``"paper"``, or ``"released"`` for the behaviour of the code that published numbers came from
     :param agent_order: order in which agents act within a step, ``"random"`` (drawn anew each step) or ``"index"``
     :param observation: ``"rgb"`` pictures or ``"tiles"``, the same views as one code per cell
+    :param agent_colours: what an agent's colour in observations tells: its ``"zone"``, nothing (``"none"``), or the
+        integer of its last ``"action"``; with the last two, zones cannot be seen
     :raises ValueError: if a value is outside its range or the objects do not fit on the map
     """
 
@@ -67,6 +70,7 @@ class HECOGridParams:
     rules: Rules = "paper"
     agent_order: AgentOrder = "random"
     observation: Observation = "rgb"
+    agent_colours: AgentColours = "zone"
 
     def __post_init__(self) -> None:
         self._check_integers()
@@ -74,6 +78,7 @@ class HECOGridParams:
         self._check_choice("rules", get_args(Rules))
         self._check_choice("agent_order", get_args(AgentOrder))
         self._check_choice("observation", get_args(Observation))
+        self._check_choice("agent_colours", get_args(AgentColours))
         if self.observation == "tiles" and self.view_tile_size > MAX_CODED_TILE_SIZE:
             raise ValueError(
                 f"observation='tiles' needs a view_tile_size from 1 to {MAX_CODED_TILE_SIZE}, got "

@@ -90,7 +90,8 @@ Each agent sees the `view_size` x `view_size` cells around its front, turned so 
 middle column, `view_offset` rows above the bottom. Walls hide what lies behind them. With `observation="rgb"`:
 `Box(0, 255, (28, 28, 3), uint8)` for the defaults (7 cells of 4 pixels). With `observation="tiles"` the same view is
 one code per cell, a `TileSpace` of shape (7, 7): its `atlas` turns codes into exactly those pixels. An agent's colour
-tells its zone, or that it carries a key. In a cell with several agents the viewer draws itself, otherwise the first
+tells its zone, or that it carries a key; `agent_colours="none"` hides zones, `"action"` shows the integer of the
+agent's last action instead. In a cell with several agents the viewer draws itself, otherwise the first
 to arrive.
 
 ## State

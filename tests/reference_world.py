@@ -51,6 +51,7 @@ DEFAULTS: dict[str, Any] = {
     "rules": "paper",
     "agent_order": "random",
     "observation": "rgb",
+    "agent_colours": "zone",
 }
 TASKS = ("TeamTogether", "TeamSupport", "KeyForTreasure")
 
@@ -111,6 +112,7 @@ class ReferenceWorld:
         self.offset: int = values["view_offset"]
         self.radius: int = values["support_radius"]
         self.released: bool = values["rules"] == "released"
+        self.colours: str = values["agent_colours"]
 
     # ------------------------------------------------------------------------------------------------ World, State
 
@@ -144,6 +146,7 @@ class ReferenceWorld:
         self.cells: dict[Cell, list[int]] = {}  # agents in each occupied cell, in order of arrival
         for agent in range(n):
             self.cells.setdefault(self.pos[agent], []).append(agent)
+        self.last_action = [-1] * n
         self.last_shown: list[Colour] = [BLUE] * n  # released rules, row 2: blue before the first step
 
     def get_state(self) -> dict[str, npt.NDArray[Any]]:
@@ -217,6 +220,7 @@ class ReferenceWorld:
         for agent in order:
             # No other agent can move this agent, so its cell is still the one in which the step began.
             zone = self.zone_of_column(self.pos[agent][0])
+            self.last_action[agent] = int(actions[agent])
             self.last_shown[agent] = self._present_colour(agent)
             n_collected += self._act(agent, self.command(zone, int(actions[agent])))
         return [n_collected / self.n_agents] * self.n_agents
@@ -393,6 +397,10 @@ class ReferenceWorld:
     def _present_colour(self, agent: int) -> Colour:
         if self.has_key[agent]:
             return BLUE if self.released else PINK  # row 5
+        if self.colours == "action":
+            return ZONE_COLOURS[self.last_action[agent] + 1]
+        if self.colours == "none":
+            return ZONE_COLOURS[0]
         return ZONE_COLOURS[self.zone_of_column(self.pos[agent][0]) % len(ZONE_COLOURS)]
 
 

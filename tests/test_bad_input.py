@@ -40,6 +40,7 @@ WRONG_PARAMETERS: list[tuple[dict[str, Any], str]] = [
     ({"rules": "papers"}, "did you mean 'paper'"),
     ({"agent_order": 1}, "got 1"),
     ({"observation": "rbg"}, "did you mean 'rgb'"),
+    ({"agent_colours": "zones"}, "did you mean 'zone'"),
     ({"observation": "tiles", "view_tile_size": 11}, "view_tile_size from 1 to 10, got 11"),
     ({"grid_size": 12}, "140 cells, grid_size=12 has 100"),
     ({"grid_size": 5, "n_treasures": 0, "n_keys": 9, "clutter_density": 0.0}, "no cell|9 keys"),

@@ -32,6 +32,7 @@ USUAL: dict[str, st.SearchStrategy[Any]] = {
     "rules": st.sampled_from(("paper", "released")),
     "agent_order": st.sampled_from(("random", "index")),
     "observation": st.sampled_from(("rgb", "tiles")),
+    "agent_colours": st.sampled_from(("zone", "none", "action")),
 }
 ANYTHING = st.one_of(
     st.none(),

@@ -42,6 +42,7 @@ def configurations(draw: st.DrawFn, max_tile: int = 14) -> dict[str, Any]:
         "support_radius": draw(st.integers(0, 3)),
         "rules": draw(st.sampled_from(["paper", "released"])),
         "agent_order": draw(st.sampled_from(["random", "index"])),
+        "agent_colours": draw(st.sampled_from(["zone", "none", "action"])),
     }
 
 

@@ -8,7 +8,7 @@ from hecogrid_envs.constants import Terrain
 from hecogrid_envs.core.jit import hot, inlined, kernel
 from hecogrid_envs.core.occupancy import arrive, plane_offset, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
-from hecogrid_envs.core.types import Games, World
+from hecogrid_envs.core.types import Games, World, whole
 from hecogrid_envs.tiles import FIRST_TERRAIN
 
 _EMPTY = int(Terrain.EMPTY)
@@ -41,7 +41,7 @@ def begin(games: Games, world: World, e: int) -> None:
         games.crowd[e, cell] = 0
     for agent in range(world.n_agents):
         arrive(games, e, agent, games.y[e, agent] * world.width + games.x[e, agent])
-        games.colour[e, agent] = world.first_colour if world.released else present_colour(games, world, e, agent)
+        games.colour[e, agent] = world.first_colour if world.released else present_colour(games, world, e, agent, -1)
     redraw(games, world, e)
 
 
@@ -134,8 +134,10 @@ def _draw_terrain(games: Games, world: World, e: int) -> None:
 
 
 @inlined
-def present_colour(games: Games, world: World, e: int, agent: int) -> int:
-    """Return the palette index of an agent by its present zone and key."""
+def present_colour(games: Games, world: World, e: int, agent: int, action: int) -> int:
+    """Return the palette index of an agent by its key, its present zone, or its last action (-1 for none)."""
     if games.has_key[e, agent]:
         return world.key_colour
+    if world.shows_actions:
+        return whole(action) + 1
     return world.zone_colour[world.zone_of_column[games.x[e, agent]]]

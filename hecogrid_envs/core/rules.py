@@ -52,7 +52,7 @@ def act(games: Games, world: World, e: int, agent: int, action: int) -> None:
     command = world.command_of[world.zone_of_column[games.x[e, agent]], action]
     if world.released:
         # Others see the agent as it was when it acted, before its action.
-        games.colour[e, agent] = present_colour(games, world, e, agent)
+        games.colour[e, agent] = present_colour(games, world, e, agent, action)
     if command in (_LEFT, _RIGHT):
         turn = 3 if command == _LEFT else 1
         games.direction[e, agent] = (games.direction[e, agent] + turn) & 3
@@ -64,7 +64,7 @@ def act(games: Games, world: World, e: int, agent: int, action: int) -> None:
     elif command == _DROP:
         _drop(games, world, e, agent)
     if not world.released:
-        games.colour[e, agent] = present_colour(games, world, e, agent)
+        games.colour[e, agent] = present_colour(games, world, e, agent, action)
     redraw_cell(games, world, e, whole(games.x[e, agent]), whole(games.y[e, agent]))
 
 

@@ -43,6 +43,7 @@ class World(NamedTuple):
     :param zone_of_column: (W,)
     :param command_of: (Z, 7) command that an action integer triggers
     :param zone_colour: (Z,) palette index of an agent
+    :param shows_actions: whether an agent's colour tells its last action instead
     :param key_colour: palette index of an agent with a key
     :param first_colour: palette index of all agents after a reset, or -1 for their present colour
     :param blank_planes: (4 * plane_bytes,) the planes of a map with only its outer wall
@@ -76,6 +77,7 @@ class World(NamedTuple):
     zone_of_column: I32
     command_of: U8
     zone_colour: U8
+    shows_actions: bool
     key_colour: int
     first_colour: int
     blank_planes: U8
