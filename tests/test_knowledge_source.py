@@ -92,11 +92,11 @@ def test_agrees_with_an_independent_account(source: KnowledgeSource) -> None:
         nn.init.normal_(parameter, std=0.5)
     source = source.double()
     messages, states = random_team().double(), random_team().double()
-    written, read = source.write(messages), source(messages, states)
+    written, read = source.write(messages), source(messages, states).read
     for team in range(N_TEAMS):
         slots, attention, answers = reference(source, messages[team].numpy(), states[team].numpy())
-        np.testing.assert_allclose(written.slots[team].detach().numpy(), slots, rtol=1e-9)
-        np.testing.assert_allclose(written.attention[team].detach().numpy(), attention, rtol=1e-9)
+        np.testing.assert_allclose(written.values[team].detach().numpy(), slots, rtol=1e-9)
+        np.testing.assert_allclose(written.weights[team].detach().numpy(), attention, rtol=1e-9)
         np.testing.assert_allclose(read[team].detach().numpy(), answers, rtol=1e-9)
 
 
@@ -105,19 +105,19 @@ def test_agrees_with_an_independent_account(source: KnowledgeSource) -> None:
 
 def test_agents_permuted_with_their_embeddings_write_the_same(source: KnowledgeSource) -> None:
     messages, states, order = random_team(), random_team(), th.randperm(N_AGENTS)
-    before, read = source.write(messages), source(messages, states)
+    before, read = source.write(messages), source(messages, states).read
     with th.no_grad():
         source.agent_embeddings.copy_(source.agent_embeddings[order])
     after = source.write(messages[:, order])
-    th.testing.assert_close(after.slots, before.slots, rtol=0, atol=1e-6)
-    th.testing.assert_close(after.attention, before.attention[:, :, order], rtol=0, atol=1e-6)
-    th.testing.assert_close(source(messages[:, order], states[:, order]), read[:, order], rtol=0, atol=1e-6)
+    th.testing.assert_close(after.values, before.values, rtol=0, atol=1e-6)
+    th.testing.assert_close(after.weights, before.weights[:, :, order], rtol=0, atol=1e-6)
+    th.testing.assert_close(source(messages[:, order], states[:, order]).read, read[:, order], rtol=0, atol=1e-6)
 
 
 def test_every_agent_is_heard_by_every_other(source: KnowledgeSource) -> None:
     messages = random_team().requires_grad_()
     for reader in range(N_AGENTS):
-        heard = th.autograd.grad(source(messages, random_team())[:, reader].sum(), messages)[0]
+        heard = th.autograd.grad(source(messages, random_team()).read[:, reader].sum(), messages)[0]
         assert (heard.abs().sum(dim=2) > 0).all()
 
 
@@ -125,21 +125,21 @@ def test_inactive_agents_are_not_heard(source: KnowledgeSource) -> None:
     messages, active = random_team(), th.ones(N_TEAMS, N_AGENTS, dtype=th.bool)
     active[0, 2] = active[1, :4] = False
     written = source.write(messages, active)
-    assert (written.attention.transpose(1, 2)[~active] == 0).all()
-    th.testing.assert_close(written.attention.sum(dim=2), th.ones(N_TEAMS, 4))
+    assert (written.weights.transpose(1, 2)[~active] == 0).all()
+    th.testing.assert_close(written.weights.sum(dim=2), th.ones(N_TEAMS, 4))
     changed = messages.clone()
     changed[~active] = 1e3
-    assert th.equal(source.write(changed, active).slots, written.slots)
+    assert th.equal(source.write(changed, active).values, written.values)
     # A team of only the active agents writes the same.
     alone = KnowledgeSource(4, SIZE)
     alone.load_state_dict(source.state_dict() | {"agent_embeddings": source.agent_embeddings[[0, 1, 3, 4]]})
-    th.testing.assert_close(alone.write(messages[:1, [0, 1, 3, 4]]).slots, written.slots[:1], rtol=0, atol=1e-6)
+    th.testing.assert_close(alone.write(messages[:1, [0, 1, 3, 4]]).values, written.values[:1], rtol=0, atol=1e-6)
 
 
 def test_a_team_without_active_agents_gives_numbers(source: KnowledgeSource) -> None:
     active = th.zeros(N_TEAMS, N_AGENTS, dtype=th.bool)
     messages = random_team().requires_grad_()
-    read = source(messages, random_team(), active)
+    read = source(messages, random_team(), active).read
     read.sum().backward()
     assert read.isfinite().all()
     assert messages.grad is not None and (messages.grad == 0).all()
@@ -151,7 +151,7 @@ def test_cost_is_linear_in_the_number_of_agents() -> None:
     def cost(n_agents: int) -> int:
         module = KnowledgeSource(n_agents, SIZE)
         with FlopCounterMode(display=False) as counter:
-            module(random_team(n_agents), random_team(n_agents)).sum().backward()
+            module(random_team(n_agents), random_team(n_agents)).read.sum().backward()
         return int(counter.get_total_flops())
 
     fixed, per_agent = 2 * cost(5) - cost(10), (cost(10) - cost(5)) // 5
@@ -161,7 +161,7 @@ def test_cost_is_linear_in_the_number_of_agents() -> None:
 
 def test_all_weights_are_trained(source: KnowledgeSource) -> None:
     orthogonal_init(source)
-    source(random_team(), random_team()).square().sum().backward()
+    source(random_team(), random_team()).read.square().sum().backward()
     for name, parameter in source.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
 
@@ -180,7 +180,7 @@ def test_critic_is_the_papers_chain() -> None:
     views, teams = th.randn(4, SIZE), th.tensor([[0, 1, 2, 3, 0], [2, 2, 2, 1, 3]])
     z = views[teams]
     s = critic.state_net(z)
-    m = critic.knowledge_source(critic.message_net(z), s)
+    m = critic.knowledge_source(critic.message_net(z), s).read
     s_saf = critic.combine_net(th.cat([s, m], dim=2))
     assert isinstance(critic.value_head, nn.Module)
     expected = critic.value_head(s_saf.flatten(0, 1)).view(2, N_AGENTS)
@@ -193,7 +193,7 @@ def test_critic_on_the_team_reads_everyones_state(heads: str) -> None:
     teams = th.arange(N_TEAMS * N_AGENTS).view(N_TEAMS, N_AGENTS)
     states = critic.states(th.randn(N_TEAMS * N_AGENTS, SIZE), teams).detach().requires_grad_()
     for agent in range(N_AGENTS):
-        gradient = th.autograd.grad(critic.value_head(states)[:, agent].sum(), states)[0]
+        gradient = th.autograd.grad(critic.values(states)[:, agent].sum(), states)[0]
         assert (gradient.abs().sum(dim=2) > 0).all()
 
 

@@ -65,11 +65,11 @@ class Attention(nn.Module):
         """
         queries = queries @ ((self.query.weight.t() * self.scale) @ self.key.weight)
         on_cpu = sources.device.type == "cpu" and sources.dtype == th.float32 and not th.compiler.is_compiling()
-        taken, weights = (_taken_on_cpu if on_cpu else _taken)(queries, sources, active)
+        taken, weights = _Taken.apply(queries, sources, active) if on_cpu else _taken(queries, sources, active)
         return Attended(nn.functional.linear(taken, self.out.weight @ self.value.weight, self.out.bias), weights)
 
 
-def _taken(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> Attended:
+def _taken(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
     """Return weighted sums of sources (G, Q, d) and the weights softmax(queries sources^T), (G, Q, S)."""
     scores = queries @ sources.transpose(1, 2)
     if active is None:
@@ -78,16 +78,12 @@ def _taken(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> 
         # The lowest finite number instead of -inf: a row without sources gives zeros instead of NaN.
         shown = active.unsqueeze(1)
         weights = scores.masked_fill(~shown, th.finfo(scores.dtype).min).softmax(dim=2) * shown
-    return Attended(weights @ sources, weights)
-
-
-def _taken_on_cpu(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> Attended:
-    """Compute :func:`_taken` compiled."""
-    taken, weights = _Taken.apply(queries, sources, active)
-    return Attended(taken, weights)
+    return weights @ sources, weights
 
 
 class _Taken(th.autograd.Function):
+    """Compute :func:`_taken` compiled."""
+
     @staticmethod
     def forward(
         ctx: Any, queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None

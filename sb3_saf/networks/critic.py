@@ -13,6 +13,7 @@ from typing import Literal, cast
 import torch as th
 from torch import nn
 
+from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import AgentHeads, NetworkSpec, Rows, mlp, side_by_side
 from sb3_saf.networks.memory import Memory
 
@@ -24,13 +25,15 @@ class TeamCritic(nn.Module, ABC):
     """
     Base of critics that read the observations of the whole team: states of the agents, or one of the team, then values.
 
-    A memory is between the two: values depend on what it returns for the states of successive steps.
+    A memory is between the two: values depend on what it returns for the states of successive steps. Subclasses make
+    ``value_head``, whose inputs are the states, or the memory's outputs.
 
     :param n_states: U, states of a team: N, or 1
     :param memory: the memory of each state; None for none
     """
 
     memory: Memory | None
+    value_head: OwnValueHead | JointValueHead
 
     def __init__(self, n_states: int, memory: Memory | None = None):
         super().__init__()
@@ -48,7 +51,6 @@ class TeamCritic(nn.Module, ABC):
         :return: (G, U, S)
         """
 
-    @abstractmethod
     def values(self, states: th.Tensor) -> th.Tensor:
         """
         Return the value of every agent of every team.
@@ -56,6 +58,7 @@ class TeamCritic(nn.Module, ABC):
         :param states: (G, U, S) states, or (G, U, H) of their memory
         :return: (G, N)
         """
+        return self.value_head.of_teams(states)
 
     def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """
@@ -64,19 +67,6 @@ class TeamCritic(nn.Module, ABC):
         :return: (G, N)
         """
         return self.values(self.states(features, teams, active))
-
-
-class StateCritic(nn.Module, ABC):
-    """Base of critics that read only the state of the game."""
-
-    @abstractmethod
-    def forward(self, states: th.Tensor) -> th.Tensor:
-        """
-        Return the value of every agent of every game.
-
-        :param states: (G, *state) states, as SB3 preprocesses observations
-        :return: (G, N)
-        """
 
 
 class OwnValueHead(nn.Module):
@@ -142,7 +132,7 @@ class JointValueHead(nn.Module):
         n_heads = 1 if heads == "shared" else spec.n_agents
         self.heads = nn.ModuleList(mlp([n_inputs, *spec.value_hidden, 1], spec.activation_fn) for _ in range(n_heads))
 
-    def forward(self, features: th.Tensor) -> th.Tensor:
+    def of_teams(self, features: th.Tensor) -> th.Tensor:
         """
         Return values of whole teams.
 
@@ -150,20 +140,50 @@ class JointValueHead(nn.Module):
         :return: (G, N)
         """
         joint = features.flatten(1)
-        if self.agent_identity:
-            return self._with_identity(joint)
+        if self.agent_identity:  # the joint part of the first layer is computed once per team
+            first, *rest = cast(nn.Sequential, self.heads[0])
+            assert isinstance(first, nn.Linear)
+            weight_joint, weight_agent = first.weight.split([joint.shape[1], self.n_agents], dim=1)
+            x = nn.functional.linear(joint, weight_joint, first.bias).unsqueeze(1) + weight_agent.t()
+            for layer in rest:
+                x = layer(x)
+            return x.squeeze(2)
         if len(self.heads) == 1:
             of_team: th.Tensor = self.heads[0](joint)
             return of_team.expand(-1, self.n_agents)
         (values,) = side_by_side([cast(list[nn.Sequential], list(self.heads))], joint)
         return values.squeeze(2).t()
 
-    def _with_identity(self, joint: th.Tensor) -> th.Tensor:
-        """Return values (G, N) of [joint features, one-hot agent]; the joint part is computed once per team."""
-        first, *rest = cast(nn.Sequential, self.heads[0])
-        assert isinstance(first, nn.Linear)
-        weight_joint, weight_agent = first.weight.split([joint.shape[1], self.n_agents], dim=1)
-        x = nn.functional.linear(joint, weight_joint, first.bias).unsqueeze(1) + weight_agent.t()
-        for layer in rest:
-            x = layer(x)
-        return x.squeeze(2)
+
+class StateCritic(nn.Module):
+    """
+    V_i from the encoded state of the game.
+
+    :param spec: spec of the policy; an encoded state is as large as an encoded observation
+    :param heads: one head for all agents, or one for each
+    :param agent_identity: whether a shared head reads the agent's index
+    :raises ValueError: if rows have no state, or the critic is to have a memory
+    """
+
+    def __init__(self, spec: NetworkSpec, heads: Heads, agent_identity: bool):
+        super().__init__()
+        if spec.memory is not None:
+            raise ValueError(
+                "critic_input='state' has no critic with memory; pass critic_memory=False, or leave critic_input out"
+            )
+        if spec.state_space is None:
+            raise ValueError(
+                "critic_input='state' needs observations with 'state', and these have none; build the environment "
+                "with sb3_saf.make_team_env(..., state=True), or leave critic_input out"
+            )
+        self.encoder = ObservationEncoder(spec.state_space, spec.features_dim)
+        self.value_head = JointValueHead(spec, spec.features_dim, heads, agent_identity)
+
+    def forward(self, states: th.Tensor) -> th.Tensor:
+        """
+        Return the value of every agent of every game.
+
+        :param states: (G, *state) states, as SB3 preprocesses observations
+        :return: (G, N)
+        """
+        return self.value_head.of_teams(self.encoder(states))

@@ -15,18 +15,6 @@ from sb3_saf.networks.attention import Attended, Attention
 from sb3_saf.networks.layers import mlp
 
 
-class Written(NamedTuple):
-    """
-    State of the knowledge source after writing.
-
-    :param slots: (G, L, d)
-    :param attention: (G, L, N), attention of each slot to each agent; sums to 1 over agents
-    """
-
-    slots: th.Tensor
-    attention: th.Tensor
-
-
 class Exchanged(NamedTuple):
     """
     Result of writing and reading.
@@ -121,7 +109,7 @@ class KnowledgeSource(nn.Module):
         self.read_source_norm = nn.LayerNorm(features_dim)
         self.read_attention = Attention(features_dim)
 
-    def write(self, messages: th.Tensor, active: th.Tensor | None = None) -> Written:
+    def write(self, messages: th.Tensor, active: th.Tensor | None = None) -> Attended:
         """
         Fill the slots.
 
@@ -132,37 +120,16 @@ class KnowledgeSource(nn.Module):
         slots, attention = self.write_block(self.slots, messages + self.agent_embeddings, active)
         for block in self.slot_blocks:
             slots = block(slots)
-        return Written(slots, attention)
+        return Attended(slots, attention)
 
-    def read(self, states: th.Tensor, slots: th.Tensor) -> Attended:
+    def forward(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
         """
-        Read from the slots with the agents' queries.
+        Write, then read from the slots with the agents' states as queries.
 
+        :param messages: (G, N, d), m' of every agent
         :param states: (G, N, d), s of every agent
-        :param slots: (G, L, d)
-        :return: m (G, N, d) and read attention (G, N, L)
+        :param active: (G, N) bool, agents whose messages are written; all if None
         """
-        return self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
-
-    def exchange(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
-        """
-        Write, then read; return the attention weights, too.
-
-        :param messages: (G, N, d)
-        :param states: (G, N, d)
-        :param active: (G, N) bool or None
-        """
-        written = self.write(messages, active)
-        read = self.read(states, written.slots)
-        return Exchanged(read.values, written.attention, read.weights)
-
-    def forward(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> th.Tensor:
-        """
-        Write, then read.
-
-        :param messages: (G, N, d)
-        :param states: (G, N, d)
-        :param active: (G, N) bool or None
-        :return: m (G, N, d)
-        """
-        return self.exchange(messages, states, active).read
+        slots, written = self.write(messages, active)
+        read = self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
+        return Exchanged(read.values, written, read.weights)

@@ -34,10 +34,6 @@ class OwnCritic(TeamCritic):
         """See :class:`TeamCritic`; (G, N, d)."""
         return gather(features, teams)
 
-    def values(self, states: th.Tensor) -> th.Tensor:
-        """See :class:`TeamCritic`."""
-        return self.value_head.of_teams(states)
-
 
 @dataclass(frozen=True)
 class IPPOParts(TeamParts):

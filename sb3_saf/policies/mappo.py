@@ -13,13 +13,7 @@ from typing import ClassVar, Final
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_saf.networks.critic import (
-    JointValueHead,
-    OwnValueHead,
-    StateCritic,
-    TeamCritic,
-)
-from sb3_saf.networks.encoders import ObservationEncoder
+from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import NetworkSpec, Rows, gather
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.parts import (
@@ -32,7 +26,6 @@ from sb3_saf.policies.parts import (
     team_policies,
 )
 from sb3_saf.teams.checks import check_choice
-from sb3_saf.teams.rows import STATE_KEY
 
 
 class JointCritic(TeamCritic):
@@ -55,38 +48,6 @@ class JointCritic(TeamCritic):
         if active is not None:
             members = members * active.unsqueeze(2)
         return members.flatten(1).unsqueeze(1)
-
-    def values(self, states: th.Tensor) -> th.Tensor:
-        """See :class:`TeamCritic`."""
-        return self.value_head(states)
-
-
-class JointStateCritic(StateCritic):
-    """
-    V_i from the encoded state of the game.
-
-    :param spec: of the policy; an encoded state is as large as an encoded observation
-    :param parts: ``heads`` and ``agent_identity``
-    :raises ValueError: if rows have no state, or the critic is to have a memory
-    """
-
-    def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
-        super().__init__()
-        if spec.memory is not None:
-            raise ValueError(
-                "critic_input='state' has no critic with memory; pass critic_memory=False, or leave critic_input out"
-            )
-        if spec.state_space is None:
-            raise ValueError(
-                f"critic_input='state' needs observations with {STATE_KEY!r}, and these have none; build the "
-                "environment with sb3_saf.make_team_env(..., state=True), or leave critic_input out"
-            )
-        self.encoder = ObservationEncoder(spec.state_space, spec.features_dim)
-        self.value_head = JointValueHead(spec, spec.features_dim, parts.heads, parts.agent_identity)
-
-    def forward(self, states: th.Tensor) -> th.Tensor:
-        """See :class:`StateCritic`."""
-        return self.value_head(self.encoder(states))
 
 
 @dataclass(frozen=True)
@@ -114,7 +75,9 @@ class MAPPOParts(TeamParts):
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """Make the critic: V_i from [z_1, ..., z_N], or from the state."""
-        return JointStateCritic(spec, self) if self.critic_input == "state" else JointCritic(spec, self)
+        if self.critic_input == "state":
+            return StateCritic(spec, self.heads, self.agent_identity)
+        return JointCritic(spec, self)
 
 
 class MAPPOPolicy(TeamActorCriticPolicy):

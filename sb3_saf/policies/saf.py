@@ -62,7 +62,6 @@ class SAFCritic(TeamCritic):
         self.knowledge_source = KnowledgeSource(spec.n_agents, parts.latent_dim, parts.n_slots)
         self.combine_net = projection(2 * parts.latent_dim)  # g_phi
         head_dim = state_dim if self.memory is None else spec.memory_size
-        self.value_head: OwnValueHead | JointValueHead
         if parts.critic_input == "own":
             self.value_head = OwnValueHead(spec, head_dim, parts.heads)
         else:
@@ -89,12 +88,7 @@ class SAFCritic(TeamCritic):
         # g_theta and g_omega depend on one observation only: computed once per unique observation, then gathered.
         ((own_messages, own_states),) = side_by_side([[self.message_net, self.state_net]], features)
         messages, states = gather(own_messages, teams), gather(own_states, teams)
-        return Communicated(states, self.knowledge_source.exchange(messages, states, active))
-
-    def values(self, states: th.Tensor) -> th.Tensor:
-        """See :class:`TeamCritic`."""
-        head = self.value_head
-        return head.of_teams(states) if isinstance(head, OwnValueHead) else head(states)
+        return Communicated(states, self.knowledge_source(messages, states, active))
 
 
 @dataclass(frozen=True)
