@@ -155,7 +155,7 @@ def test_decides_as_the_model_does(name: str, exports: Callable[[str], Exported]
         tensors = {key: th.as_tensor(value) for key, value in rows.items()}
         with th.no_grad():
             distribution = policy.get_distribution(tensors)
-            likelihoods = policy._likelihood(distribution, th.as_tensor(actions))
+            likelihoods = distribution.log_prob(th.as_tensor(actions))
         np.testing.assert_allclose(actor.log_prob(obs, actions), likelihoods, rtol=1e-5, atol=1e-5)
         if isinstance(policy.action_space, spaces.Discrete):
             probabilities = distribution.distribution.probs.numpy()

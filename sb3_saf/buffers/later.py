@@ -3,37 +3,67 @@ Values of a rollout's steps, computed many steps at a time.
 
 Values are not needed before the end of a rollout, where advantages are computed. For the few rows of a single step, the
 overhead of calling the critic dominates; evaluating many steps together takes a fraction of the time.
+
+Letters: E games, N agents, B = E N rows, U states of the critic for a team; M, Ma, Mc sizes of the memory of a game, of
+the actor, and of one of the critic's states.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Final, Generic, Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
 
 import torch as th
+
+from sb3_saf.networks.row_encoder import Encoded
+from sb3_saf.teams.rows import ACTIVE_KEY, AGENT_KEY
 
 #: Rows whose values are computed at once: enough to amortise the calls, few enough for the cache.
 ROWS_AT_ONCE: Final = 1024
 
 
-class AnyStep(Protocol):
-    """Input of a critic."""
+@dataclass
+class Step:
+    """
+    Critic's input of one step of all games, and the memory before it.
+
+    :param obs: entries of the rows that critics read (agent indices, active agents)
+    :param encoded: their encoded observations, without the observations themselves
+    :param starts: (B,) bool, rows whose episode begins with the step; None for policies without memory
+    :param actor: (B, Ma) the actor's memory before the step
+    :param critic: (E U, Mc) the critic's memory before the step, if it has one; known when values are computed
+    :param values: (B, 1) values, as soon as they are computed
+    :param n_games: E, for policies with memory
+    """
+
+    obs: dict[str, th.Tensor]
+    encoded: Encoded
+    starts: th.Tensor | None = None
+    actor: th.Tensor | None = None
+    critic: th.Tensor | None = None
+    values: th.Tensor | None = None
+    n_games: int = 0
+
+    @classmethod
+    def of(cls, obs: th.Tensor | Mapping[str, th.Tensor], encoded: Encoded) -> Step:
+        """Return the critic's input of a step; critics read features, so observations are dropped."""
+        entries = {} if isinstance(obs, th.Tensor) else obs
+        own = encoded.own._replace(observations=encoded.own.features.new_empty(0))
+        return cls({key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}, encoded._replace(own=own))
 
     @property
     def memory(self) -> th.Tensor | None:
-        """
-        The memory (E, M) of games before the step; None for policies without memory.
-
-        It is complete when the values of the step are computed.
-        """
+        """Memory of the games before the step, (E, M): that of all agents, then the critic's."""
+        parts = [part.reshape(self.n_games, -1) for part in (self.actor, self.critic) if part is not None]
+        return th.cat(parts, dim=1) if parts else None
 
 
-Step = TypeVar("Step", bound=AnyStep)
 #: Maps the critic's inputs of several steps to the values of each, (B, 1).
-Compute = Callable[[Sequence[Step]], list[th.Tensor]]
+Compute: TypeAlias = Callable[[Sequence[Step]], list[th.Tensor]]
 
 
-class LaterValues(th.Tensor, Generic[Step]):
+class LaterValues(th.Tensor):
     """
     Lazily computed values of one step, (B, 1).
 
@@ -41,11 +71,11 @@ class LaterValues(th.Tensor, Generic[Step]):
     """
 
     step: Step
-    compute: Compute[Step]
+    compute: Compute
     known: th.Tensor | None
 
     @classmethod
-    def of(cls, step: Step, like: th.Tensor, compute: Compute[Step]) -> LaterValues[Step]:
+    def of(cls, step: Step, like: th.Tensor, compute: Compute) -> LaterValues:
         """
         Make values to be computed later.
 
@@ -65,7 +95,7 @@ class LaterValues(th.Tensor, Generic[Step]):
         return func(*map(_known, args), **{name: _known(value) for name, value in (kwargs or {}).items()})
 
 
-def compute_together(steps: Sequence[LaterValues[Any]]) -> list[th.Tensor]:
+def compute_together(steps: Sequence[LaterValues]) -> list[th.Tensor]:
     """
     Compute the values of several steps of one policy.
 

@@ -215,7 +215,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
         self._allocated = False
         self._returns = RolloutReturns(np.zeros(0), self._agents[:0])
-        self._later: list[tuple[int, LaterValues[Any]]] = []
+        self._later: list[tuple[int, LaterValues]] = []
         self._waiting[id(observation_space)] = self
         #: (T / L, E, M), the memory of games before each sequence, of policies that have one.
         self.memories: th.Tensor | None = None

@@ -116,17 +116,31 @@ class EncodedTeams(NamedTuple):
         return flat if self.rows is None else gather(flat, self.rows)
 
 
-def joined_rows(parts: Sequence[EncodedRows]) -> EncodedRows:
+class Encoded(NamedTuple):
+    """
+    Encoded rows.
+
+    :param own: encoded own observations of the rows
+    :param teams: encoded teams of the rows; None if the critic does not read them
+    """
+
+    own: EncodedRows
+    teams: EncodedTeams | None
+
+
+def joined(parts: Sequence[Encoded]) -> Encoded:
     """
     Concatenate encoded rows.
 
     :param parts: rows that were encoded separately
     """
-    return EncodedRows(
-        th.cat([part.observations for part in parts]),
-        th.cat([part.features for part in parts]),
-        _joined([part.inverse for part in parts], [len(part.features) for part in parts]),
+    own, teams = [part.own for part in parts], [part.teams for part in parts]
+    rows = EncodedRows(
+        th.cat([part.observations for part in own]),
+        th.cat([part.features for part in own]),
+        _joined([part.inverse for part in own], [len(part.features) for part in own]),
     )
+    return Encoded(rows, None if None in teams else joined_teams([part for part in teams if part is not None]))
 
 
 def joined_teams(parts: Sequence[EncodedTeams]) -> EncodedTeams:

@@ -9,7 +9,7 @@ rows, N agents.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from inspect import signature
@@ -24,7 +24,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.buffers.later import LaterValues
+from sb3_saf.buffers.later import LaterValues, Step
 from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
 from sb3_saf.networks.critic import StateCritic, TeamCritic
@@ -32,21 +32,18 @@ from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
 from sb3_saf.networks.memory import Memory, MemoryName
-from sb3_saf.networks.row_encoder import EncodedRows, joined_rows, joined_teams
+from sb3_saf.networks.row_encoder import Encoded, EncodedRows, joined
 from sb3_saf.networks.value_normalizer import ValueNormalizer
-from sb3_saf.policies.memory import Encoded, Masks, RememberingPolicy, Step, step_of
+from sb3_saf.policies.memory import Masks, RememberingPolicy, RunningMemory
 from sb3_saf.policies.parts import TeamParts
-from sb3_saf.policies.rows import ChunkSize, entry_of, pop_named
-from sb3_saf.teams.checks import check_choice
+from sb3_saf.policies.rows import ChunkSize, entry_of
+from sb3_saf.teams.checks import check_choice, check_count, check_flag
 from sb3_saf.teams.rows import STATE_KEY
 
-#: A head of the actor: (K, d) features and (K,) agents or None, to (K, ...).
-Head = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
+#: Arguments of Adam that exclude its fused implementation, or choose it.
+_OTHER_THAN_FUSED: Final = {"fused", "foreach", "differentiable"}
 
 NetArch = list[int] | dict[str, list[int]]
-
-#: Arguments of SB3's base class for gSDE only; team policies do not support gSDE and do not save them.
-_SDE_ARGUMENTS: Final = ("use_sde", "squash_output", "full_std", "use_expln")
 
 
 class TeamPolicy(RememberingPolicy):
@@ -126,8 +123,14 @@ class TeamPolicy(RememberingPolicy):
         features_extractor_kwargs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ):
-        _refuse(bool(use_sde), share_features_extractor)
-        if use_sde is not None and self.normalizes_values and not TeamRolloutBuffer.waits_for(observation_space):
+        if use_sde:
+            raise ValueError("team policies have no state-dependent exploration (gSDE): leave use_sde=False")
+        if not share_features_extractor:
+            raise ValueError(
+                "team policies share the features extractor between actor and critic: leave "
+                "share_features_extractor=True"
+            )
+        if use_sde is not None and self.takes_team_buffer and not TeamRolloutBuffer.waits_for(observation_space):
             warnings.warn(
                 f"{type(self).__name__} is trained on minibatches of SB3's own rollout buffer, which stores each "
                 "observation once more for every agent and splits teams: slower, with the same result. Train with "
@@ -138,16 +141,20 @@ class TeamPolicy(RememberingPolicy):
             )
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
         self._warned_of_minibatch = False
-        self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
+        self.parts = self._pop_parts(kwargs)
         check_choice("normalize_values", normalize_values, (True, False, "agent"))
-        if normalize_values and not self.normalizes_values:
+        if normalize_values and not self.takes_team_buffer:
             raise ValueError(
                 f"normalize_values=True needs TeamRolloutBuffer, which the algorithms of {type(self).__name__} do not "
                 "take; leave normalize_values=False, or use PPO with SAFPolicy, MAPPOPolicy or IPPOPolicy"
             )
         self.normalize_values = normalize_values
-        self._check_arguments(kwargs)
-        self._read_memory(memory, memory_size, critic_memory)
+        check_count("memory_size", memory_size)
+        check_flag("critic_memory", critic_memory)
+        self.memory, self.memory_size, self.critic_memory = memory, memory_size, critic_memory
+        self.running, self.actor_memory = RunningMemory(), None
+        if memory is not None:
+            self._check_memory()
         # The next class in the MRO is SB3's or sb3-contrib's, which has more arguments than BasePolicy.
         super().__init__(
             observation_space,
@@ -159,17 +166,18 @@ class TeamPolicy(RememberingPolicy):
             **kwargs,
         )
 
-    def _check_arguments(self, kwargs: Mapping[str, Any]) -> None:
-        """Raise TypeError for arguments of neither this policy nor SB3's."""
+    def _pop_parts(self, kwargs: dict[str, Any]) -> TeamParts:
+        """Take the fields of the parts out of the keyword arguments; TypeError for names that nobody knows."""
+        names = [field.name for field in fields(self.parts_class)]
         known = {name for base in type(self).__mro__ if "__init__" in vars(base) for name in signature(base).parameters}
-        unknown = [name for name in kwargs if name not in known]
+        unknown = [name for name in kwargs if name not in known.union(names)]
         if unknown:
-            own, name = [field.name for field in fields(self.parts_class)], type(self).__name__
             raise TypeError(
-                f"{name} has no argument {unknown[0]!r}, which may be one of another method; it takes "
-                f"{', '.join(own)}, and those of SB3's policies. Settings of the method are "
+                f"{type(self).__name__} has no argument {unknown[0]!r}, which may be one of another method; it takes "
+                f"{', '.join(names)}, and those of SB3's policies. Settings of the method are "
                 f"sb3_saf.ppo_settings(env, {self.parts_class.__name__.removesuffix('Parts').lower()!r})"
             )
+        return self.parts_class(**{name: kwargs.pop(name) for name in names if name in kwargs})
 
     # --- construction -----------------------------------------------------------------------------------------------
 
@@ -201,18 +209,21 @@ class TeamPolicy(RememberingPolicy):
             orthogonal_init(self.value_net)
         n_scales = self.team_spaces.n_agents if self.normalize_values == "agent" else None
         self.value_normalizer = ValueNormalizer(n_scales) if self.normalize_values else None
-        learning_rate = lr_schedule(1)
-        kwargs = _with_fused_steps(self.optimizer_class, self.optimizer_kwargs)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=learning_rate, **kwargs)  # type: ignore[call-arg]
+        kwargs = dict(self.optimizer_kwargs)
+        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not kwargs.keys() & _OTHER_THAN_FUSED:
+            kwargs["fused"] = True  # takes a third of the time
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
     def _network_spec(self) -> NetworkSpec:
-        actor_hidden, value_hidden = _hidden_sizes(self.net_arch)
+        sizes = self.net_arch if isinstance(self.net_arch, dict) else {"pi": self.net_arch, "vf": self.net_arch}
+        if set(sizes) != {"pi", "vf"}:
+            raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(sizes)}")
         return NetworkSpec(
             self.features_dim,
             self.team_spaces.n_agents,
             self.action_space,
-            actor_hidden,
-            value_hidden,
+            list(sizes["pi"]),
+            list(sizes["vf"]),
             self.activation_fn,
             self.log_std_init,
             self.team_spaces.state,
@@ -220,7 +231,7 @@ class TeamPolicy(RememberingPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        for name in _SDE_ARGUMENTS:
+        for name in ("use_sde", "squash_output", "full_std", "use_expln"):  # of gSDE
             data.pop(name, None)
         names = ("encode_once", "chunk_size", "normalize_values", "memory", "memory_size", "critic_memory")
         return data | asdict(self.parts) | {name: getattr(self, name) for name in names}
@@ -229,10 +240,10 @@ class TeamPolicy(RememberingPolicy):
     def log_std(self) -> th.Tensor:
         """(policies, D) log standard deviations of Box actions; AttributeError for other actions."""
         heads = [module for module in self.actor.modules() if isinstance(module, ActionHead)]
-        found: list[th.Tensor] = [head.log_std for head in heads if head.log_std is not None]
-        if not found:
+        log_stds: list[th.Tensor] = [head.log_std for head in heads if head.log_std is not None]
+        if not log_stds:
             raise AttributeError("only policies with Box actions have a log_std")
-        return th.stack(found)
+        return th.stack(log_stds)
 
     # --- what SB3 calls ---------------------------------------------------------------------------------------------
 
@@ -275,7 +286,9 @@ class TeamPolicy(RememberingPolicy):
         encoded = self._encoded(obs)
         latents = None if self.actor_memory is None else self._latents_of_sequences(obs, encoded)
         distribution = self._distribution(obs, encoded.own, action_masks, latents)
-        return self._values(obs, encoded), self._likelihood(distribution, actions), distribution.entropy()
+        if isinstance(self.action_space, spaces.MultiBinary):
+            actions = actions.float()  # sb3-contrib's buffers give integers
+        return self._values(obs, encoded), distribution.log_prob(actions), distribution.entropy()
 
     def get_distribution(self, obs: PyTorchObs, action_masks: Masks | None = None) -> Distribution:
         """
@@ -306,8 +319,9 @@ class TeamPolicy(RememberingPolicy):
         :param obs: rows
         :return: (B, 1)
         """
-        if self._remembering_critic is not None and not isinstance(obs, TeamMinibatch):
-            return self._values_of_running_games(obs, self._remembering_critic)
+        critic = None if self.memory is None else self._remembering_critic
+        if critic is not None and not isinstance(obs, TeamMinibatch):
+            return self._values_of_running_games(obs, critic)
         return self._values(obs, self._encoded(obs))
 
     def _check_minibatch(self, obs: PyTorchObs) -> None:
@@ -319,7 +333,7 @@ class TeamPolicy(RememberingPolicy):
             return  # padding rows have no team
         advice = (
             "Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which leaves them out."
-            if self.normalizes_values
+            if self.takes_team_buffer
             else f"The buffers of {type(self).__name__}'s algorithms cannot leave them out; PPO with "
             "sb3_saf.TeamRolloutBuffer can."
         )
@@ -333,17 +347,9 @@ class TeamPolicy(RememberingPolicy):
 
     def _encoded(self, obs: PyTorchObs, of_step: bool = False) -> Encoded:
         """Encode the inputs of actor and critic; ``of_step`` as in :meth:`encode_teams`."""
-        if self._critic_reads_teams:
+        if isinstance(self.value_net, TeamCritic):
             return Encoded(*self.encode_teams(obs, of_step))
         return Encoded(self.encode_own(obs), None)
-
-    @property
-    def _critic_reads_teams(self) -> bool:
-        return isinstance(self.value_net, TeamCritic)
-
-    def _likelihood(self, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
-        """Return log-likelihoods (B,); sb3-contrib's buffers give MultiBinary actions as integers."""
-        return distribution.log_prob(actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions)
 
     def _distribution(
         self, obs: PyTorchObs, own: EncodedRows, action_masks: Masks | None = None, latents: th.Tensor | None = None
@@ -355,9 +361,9 @@ class TeamPolicy(RememberingPolicy):
         """
         agent = self._agent(obs) if self.actor.reads_agent else None
         masks = self._legal(obs, action_masks, own.features.device)
-        if latents is not None:
-            return self._distribution_of(lambda module: module(latents, agent), masks)
-        return self._distribution_of(lambda module: self.row_encoder.apply(module, own, agent), masks)
+        head = self.actor if masks is None else self.actor.unmixed
+        parameters = self.row_encoder.apply(head, own, agent) if latents is None else head(latents, agent)
+        return self.actor.distribution(parameters, masks)
 
     def _legal(self, obs: PyTorchObs, action_masks: Masks | None, device: th.device) -> th.Tensor | None:
         """Return the choices (B, M) allowed by both the rows' own masks and ``action_masks``; None if all are."""
@@ -383,11 +389,6 @@ class TeamPolicy(RememberingPolicy):
             return output
         return output._replace(actions=masked_parameters(self.action_space, output.actions, legal))
 
-    def _distribution_of(self, apply: Callable[[Head], th.Tensor], masks: th.Tensor | None) -> Distribution:
-        """Return the actor's distribution; ``apply`` calls a head for all rows, masks apply to every policy."""
-        parameters = apply(self.actor if masks is None else self.actor.unmixed)
-        return self.actor.distribution(parameters, masks)
-
     def _values(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
         """Return values (B, 1)."""
         critic, teams = self.value_net, encoded.teams
@@ -398,7 +399,12 @@ class TeamPolicy(RememberingPolicy):
                 states = self._over_time(critic.memory, states, obs, teams.active)
             values = teams.of_rows(critic.values(states))
         elif isinstance(critic, StateCritic):
-            values = self._values_of_states(obs, critic)
+            space = self.team_spaces.state
+            assert space is not None
+            games = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
+            unique = self.row_encoder.find(games)  # equal states are encoded once
+            of_games = self._in_chunks(critic, games[unique.index], space)
+            values = gather_agents(of_games, unique.inverse, self._agent(obs))
         else:
             values = self.row_encoder.apply(critic, encoded.own, self._agent(obs) if critic.reads_agent else None)
         return self._raw_values(obs, values)
@@ -407,7 +413,7 @@ class TeamPolicy(RememberingPolicy):
         """Return values (B, 1) of a step of all games; in a rollout, many steps are evaluated together."""
         if step is None and (self.training or th.is_grad_enabled() or isinstance(self.value_net, StateCritic)):
             return self._values(obs, encoded)
-        step = step_of(obs, encoded) if step is None else step
+        step = Step.of(obs, encoded) if step is None else step
         if isinstance(self.value_net, StateCritic):
             step.values = self._values(obs, encoded)
         features = encoded.own.features
@@ -415,17 +421,14 @@ class TeamPolicy(RememberingPolicy):
 
     def _values_of_steps(self, steps: Sequence[Step]) -> list[th.Tensor]:
         """Return values (B, 1) of each step."""
-        if self._remembering_critic is not None:
-            self._compute_waiting(self._remembering_critic)
+        if self.memory is not None:
+            self._compute_waiting()
         known = [step.values for step in steps if step.values is not None]
         if len(known) == len(steps):
             return known
         with th.no_grad():
             obs = {key: th.cat([step.obs[key] for step in steps]) for key in steps[0].obs}
-            own = joined_rows([step.encoded.own for step in steps])
-            found = [step.encoded.teams for step in steps]
-            teams = None if None in found else joined_teams([one for one in found if one is not None])
-            values = self._values(obs, Encoded(own, teams))
+            values = self._values(obs, joined([step.encoded for step in steps]))
             return list(th.split(values, [step.encoded.own.n_rows for step in steps]))
 
     def _raw_values(self, obs: PyTorchObs, outputs: th.Tensor) -> th.Tensor:
@@ -441,15 +444,6 @@ class TeamPolicy(RememberingPolicy):
         agents = self._agent(obs).unsqueeze(1) if self.normalize_values == "agent" else None
         return self.value_normalizer(values, takes_part, agents)
 
-    def _values_of_states(self, obs: PyTorchObs, critic: StateCritic) -> th.Tensor:
-        """Return values (B,), with equal states encoded once."""
-        space = self.team_spaces.state
-        assert space is not None
-        states = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
-        found = self.row_encoder.find(states)
-        values = self._in_chunks(critic, states[found.index], space)
-        return gather_agents(values, found.inverse, self._agent(obs))
-
 
 def _refuse_to_train(gradient: th.Tensor) -> NoReturn:
     raise ValueError(
@@ -459,17 +453,10 @@ def _refuse_to_train(gradient: th.Tensor) -> NoReturn:
     )
 
 
-def _with_fused_steps(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments of Adam with the fused implementation, unless one is given; it takes a third of the time."""
-    if optimizer_class not in (th.optim.Adam, th.optim.AdamW) or kwargs.keys() & {"fused", "foreach", "differentiable"}:
-        return kwargs
-    return {**kwargs, "fused": True}
-
-
 class TeamActorCriticPolicy(TeamPolicy, ActorCriticPolicy):  # type: ignore[misc]  # value_net, log_std: ours
     """Policy for PPO, A2C and TRPO on rows of teams; see :class:`TeamPolicy` for the parameters."""
 
-    normalizes_values: ClassVar[bool] = True
+    takes_team_buffer: ClassVar[bool] = True
 
 
 class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore[misc]  # value_net: ours
@@ -486,21 +473,3 @@ class TeamMaskablePolicy(TeamPolicy, MaskableActorCriticPolicy):  # type: ignore
 
     #: Unused: Box actions have no masks.
     log_std_init: float = 0.0
-
-
-def _refuse(use_sde: bool, share_features_extractor: bool) -> None:
-    if use_sde:
-        raise ValueError("team policies have no state-dependent exploration (gSDE): leave use_sde=False")
-    if not share_features_extractor:
-        raise ValueError(
-            "team policies share the features extractor between actor and critic: leave share_features_extractor=True"
-        )
-
-
-def _hidden_sizes(net_arch: NetArch) -> tuple[list[int], list[int]]:
-    """Return the hidden sizes of action heads and of value heads."""
-    if not isinstance(net_arch, dict):
-        return list(net_arch), list(net_arch)
-    if set(net_arch) != {"pi", "vf"}:
-        raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(net_arch)}")
-    return list(net_arch["pi"]), list(net_arch["vf"])

@@ -1,5 +1,5 @@
 """
-Memory of policies while games are played and over the sequences of a rollout.
+Memory of policies while games are played and over the sequences of a rollout; other policies run nothing of it.
 
 Letters: E games, N agents, B = E N rows, L steps of S sequences, G = L S teams, U states of the critic for a team;
 M, Ma, Mc sizes of the memory of a game, of the actor, and of one of the critic's states.
@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,59 +20,18 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_saf.buffers.later import ROWS_AT_ONCE
+from sb3_saf.buffers.later import ROWS_AT_ONCE, Step
 from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import gather
 from sb3_saf.networks.memory import MEMORY_NAMES, Memory, MemoryName
-from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, joined_teams
+from sb3_saf.networks.row_encoder import Encoded, EncodedRows, EncodedTeams, joined_teams
 from sb3_saf.policies.rows import TeamRowsPolicy
-from sb3_saf.teams.checks import check_choice, check_count, check_flag
-from sb3_saf.teams.rows import ACTIVE_KEY, AGENT_KEY, EPISODE_START_KEY, TerminalRow
+from sb3_saf.teams.checks import check_choice
+from sb3_saf.teams.rows import EPISODE_START_KEY, TerminalRow
 
 #: Action masks of MaskablePPO, (B, M).
 Masks = npt.NDArray[Any] | th.Tensor
-
-
-class Encoded(NamedTuple):
-    """
-    Encoded rows.
-
-    :param own: encoded own observations of the rows
-    :param teams: encoded teams of the rows; None if the critic does not read them
-    """
-
-    own: EncodedRows
-    teams: EncodedTeams | None
-
-
-@dataclass
-class Step:
-    """
-    Critic's input of one step of all games, and the memory before it.
-
-    :param obs: entries of the rows that critics read (agent indices, active agents)
-    :param encoded: their encoded observations
-    :param starts: (B,) bool, rows whose episode begins with the step; None for policies without memory
-    :param actor: (B, Ma) the actor's memory before the step
-    :param critic: (E U, Mc) the critic's memory before the step, if it has one; known when values are computed
-    :param values: (B, 1) values, as soon as they are computed
-    :param n_games: E, for policies with memory
-    """
-
-    obs: dict[str, th.Tensor]
-    encoded: Encoded
-    starts: th.Tensor | None = None
-    actor: th.Tensor | None = None
-    critic: th.Tensor | None = None
-    values: th.Tensor | None = None
-    n_games: int = 0
-
-    @property
-    def memory(self) -> th.Tensor | None:
-        """Memory of the games before the step, (E, M): that of all agents, then the critic's."""
-        parts = [part.reshape(self.n_games, -1) for part in (self.actor, self.critic) if part is not None]
-        return th.cat(parts, dim=1) if parts else None
 
 
 @dataclass
@@ -88,13 +47,6 @@ class RunningMemory:
     actor: th.Tensor | None = None
     critic: th.Tensor | None = None
     waiting: list[Step] = field(default_factory=list)
-
-
-def step_of(obs: PyTorchObs, encoded: Encoded) -> Step:
-    """Return the critic's input of one step of all games; critics read features, so observations can be dropped."""
-    entries = {} if isinstance(obs, th.Tensor) else obs
-    own = encoded.own._replace(observations=encoded.own.features.new_empty(0))
-    return Step({key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}, encoded._replace(own=own))
 
 
 def starts_of_states(starts: th.Tensor, n_states: int) -> th.Tensor:
@@ -118,26 +70,21 @@ class RememberingPolicy(TeamRowsPolicy):
     actor_memory: Memory | None
     #: Memory in the games that are played.
     running: RunningMemory
-    #: Whether the algorithm supports TeamRolloutBuffer, which ``normalize_values`` and ``memory`` need.
-    normalizes_values: ClassVar[bool] = False
+    #: Whether the policy's algorithms take TeamRolloutBuffer, which ``normalize_values`` and ``memory`` need.
+    takes_team_buffer: ClassVar[bool] = False
 
-    def _read_memory(self, memory: MemoryName | None, memory_size: int, critic_memory: bool) -> None:
-        check_count("memory_size", memory_size)
-        check_flag("critic_memory", critic_memory)
-        self.memory, self.memory_size, self.critic_memory = memory, memory_size, critic_memory
-        self.running, self.actor_memory = RunningMemory(), None
-        if memory is None:
-            return
-        check_choice("memory", memory, MEMORY_NAMES)
-        if not self.normalizes_values:
+    def _check_memory(self) -> None:
+        """Raise ValueError for a policy that cannot have a memory."""
+        check_choice("memory", self.memory, MEMORY_NAMES)
+        if not self.takes_team_buffer:
             raise ValueError(
-                f"memory={memory!r} needs TeamRolloutBuffer, which {type(self).__name__}'s algorithms do not take: "
-                "use PPO, A2C or TRPO with SAFPolicy, MAPPOPolicy or IPPOPolicy, which read action masks from "
+                f"memory={self.memory!r} needs TeamRolloutBuffer, which {type(self).__name__}'s algorithms do not "
+                "take: use PPO, A2C or TRPO with SAFPolicy, MAPPOPolicy or IPPOPolicy, which read action masks from "
                 "observations"
             )
         if not self.team_spaces.has_starts:
             raise ValueError(
-                f"memory={memory!r} needs rows with {EPISODE_START_KEY!r}, got {self.team_spaces.keys}; build the "
+                f"memory={self.memory!r} needs rows with {EPISODE_START_KEY!r}, got {self.team_spaces.keys}; build the "
                 "environment with sb3_saf.make_team_env, or wrap it in sb3_saf.CentralizedValueWrapper"
             )
 
@@ -226,7 +173,7 @@ class RememberingPolicy(TeamRowsPolicy):
             if critic is not None and critic.memory is not None:
                 n_states = n_rows // self.team_spaces.n_agents * critic.n_states
                 self.running.critic = features.new_zeros(n_states, critic.memory.state_dim)
-        step = step_of(obs, encoded)
+        step = Step.of(obs, encoded)
         step.starts, step.actor = self._starts(obs), self.running.actor
         step.n_games = n_rows // self.team_spaces.n_agents
         if critic is not None:
@@ -238,8 +185,11 @@ class RememberingPolicy(TeamRowsPolicy):
         return step, latents
 
     @th.no_grad()
-    def _compute_waiting(self, critic: TeamCritic) -> None:
+    def _compute_waiting(self) -> None:
         """Compute the values of the waiting steps, and the critic's memory before each and after the last."""
+        critic = self._remembering_critic
+        if critic is None:
+            return
         steps, self.running.waiting = self.running.waiting, []
         net, memory = critic.memory, self.running.critic
         at_once = max(1, ROWS_AT_ONCE // steps[0].encoded.own.n_rows) if steps else 1
@@ -263,7 +213,7 @@ class RememberingPolicy(TeamRowsPolicy):
     @th.no_grad()
     def _values_of_running_games(self, obs: PyTorchObs, critic: TeamCritic) -> th.Tensor:
         """Return values (B, 1) of the next step of all games, of last rows, or of rows of games that begin."""
-        self._compute_waiting(critic)
+        self._compute_waiting()
         n_agents, agent, flags, net = self.team_spaces.n_agents, self._agent(obs), self._starts(obs), critic.memory
         assert net is not None
         memory, starts = self.running.critic, None

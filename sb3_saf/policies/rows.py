@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 import torch as th
@@ -17,13 +17,12 @@ from torch import nn
 from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.networks.encoders import encoded
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
+from sb3_saf.policies.from_game import CLASSIC, Given, given_by_game, own_observations
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.conversion import AgentConversion, pixels_to_codes
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
     AGENT_KEY,
-    ALL_KEYS,
     EPISODE_START_KEY,
     OBS_KEY,
     STATE_KEY,
@@ -33,35 +32,9 @@ from sb3_saf.teams.rows import (
     check_masks,
 )
 
-#: Keys of PettingZoo's observations with masks.
-_CLASSIC: Final = {"observation", ACTION_MASK_KEY}
-
 Observation = np.ndarray | Mapping[str, Any]
 ChunkSize: TypeAlias = int | Literal["auto"] | None
 _CHUNK_OF_CONVOLUTIONS: Final = 512
-
-
-class Given(NamedTuple):
-    """
-    What a game gives some agents, as rows.
-
-    :param rows: entries of the rows
-    :param action_masks: (B, M), masks of policies of MaskablePPO whose rows have none
-    :param conversions: of the rows' agents; None if rows are the game's
-    :param agents: their names; None for one agent without name
-    """
-
-    rows: dict[str, np.ndarray]
-    action_masks: np.ndarray | None
-    conversions: Sequence[AgentConversion] | None
-    agents: list[Any] | None
-
-    def actions_of_game(self, actions: np.ndarray) -> Any:
-        """Convert actions of the rows to those of the game: by agent, or the one agent's."""
-        of_game = list(actions)
-        if self.conversions is not None:
-            of_game = [one.game_action(action) for one, action in zip(self.conversions, actions, strict=True)]
-        return of_game[0] if self.agents is None else dict(zip(self.agents, of_game, strict=True))
 
 
 class TeamRowsPolicy(BasePolicy):
@@ -164,36 +137,17 @@ class TeamRowsPolicy(BasePolicy):
         :return: actions and the next state; ``{agent: action}`` for observations by agent
         """
         given = self.given_by_game(observation, kwargs.get("action_masks"))
-        if given is None:
-            if isinstance(observation, Mapping):  # critics' entries, whose shapes depend on the size of the team
-                observation = {key: value for key, value in observation.items() if key not in self._not_for_acting}
-            return self._predict_rows(observation, state, episode_start, deterministic, **kwargs)
-        masks = {} if given.action_masks is None else {"action_masks": given.action_masks}
-        return self.act_in_game(given, self._predict_rows, state, episode_start, deterministic, **masks)
+        if given is not None:
+            return given.act(self._predict_rows, state, episode_start, deterministic)
+        if isinstance(observation, Mapping):  # critics' entries have shapes that depend on the size of the team
+            unread = {TEAM_KEY, ACTIVE_KEY, STATE_KEY} | (set() if self.acts_by_index else {AGENT_KEY})
+            observation = {key: value for key, value in observation.items() if key not in unread}
+        return self._predict_rows(observation, state, episode_start, deterministic, **kwargs)
 
-    @staticmethod
-    def act_in_game(
-        given: Given, predict: Callable[..., tuple[Any, Any]], state: Any, episode_start: Any, *args: Any, **kwargs: Any
-    ) -> tuple[Any, Any]:
-        """
-        Act on what a game gives; of observations by agent, the state is by agent, too.
-
-        :param given: rows and agents
-        :param predict: acts on rows, as SB3's ``predict``
-        :param state: see :meth:`predict`
-        :param episode_start: see :meth:`predict`
-        """
-        agents, memory, starts = given.agents, state, episode_start
-        if agents is not None and state:
-            blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
-            memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
-            starts = np.array([agent not in state for agent in agents])
-            if episode_start is not None:
-                starts |= np.asarray(episode_start).astype(bool)
-        actions, after = predict(given.rows, memory, starts, *args, **kwargs)
-        if agents is not None and after is not None:
-            after = dict(zip(agents, zip(*after, strict=True), strict=True))
-        return given.actions_of_game(actions), after
+    def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
+        """Convert what a game gives to rows (see :meth:`predict`); None for rows."""
+        takes_masks = self.team_spaces.action_mask is not None or isinstance(self, MaskableActorCriticPolicy)
+        return given_by_game(self.team_spaces, observation, action_masks, takes_masks)
 
     def _predict_rows(
         self, rows: Any, state: Any, episode_start: np.ndarray | None, deterministic: bool, **kwargs: Any
@@ -202,119 +156,9 @@ class TeamRowsPolicy(BasePolicy):
         return super().predict(rows, state, episode_start, deterministic, **kwargs)
 
     @property
-    def _not_for_acting(self) -> set[str]:
-        """Entries of rows that the actor does not read."""
-        return {TEAM_KEY, ACTIVE_KEY, STATE_KEY} | (set() if self.acts_by_index else {AGENT_KEY})
-
-    @property
     def acts_by_index(self) -> bool:
         """Whether actions depend on the agent's index; otherwise the policy acts in teams of any size."""
         return True
-
-    def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
-        """
-        Convert what a game gives to rows (see :meth:`predict`).
-
-        :param observation: rows, or observations of the game
-        :param action_masks: masks in the form of the observation; None for those in observations and infos
-        :return: None for rows
-        :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
-        """
-        infos: Mapping[Any, Any] = {}
-        if (
-            isinstance(observation, tuple)
-            and len(observation) == 2
-            and all(isinstance(x, Mapping) for x in observation)
-        ):
-            observation, infos = observation
-        names, conversions = self.team_spaces.names, self.team_spaces.conversions
-        agents = self._agents_in(observation)
-        if agents is not None:
-            entries = [observation[agent] for agent in agents]
-            given = [(infos.get(agent) or {}).get(ACTION_MASK_KEY) for agent in agents]
-            if isinstance(action_masks, Mapping):
-                given = [action_masks[agent] for agent in agents]
-            indices = list(range(len(agents))) if names is None else [names.index(agent) for agent in agents]
-            known = indices if names is not None or len(agents) == self.team_spaces.n_agents else None
-            kinds = None if conversions is None else [conversions[index] for index in indices]
-            return self._given(entries, given, kinds, known, agents)
-        fitting = [] if conversions is None else [i for i, one in enumerate(conversions) if one.fits(observation)]
-        if conversions is None or not fitting:
-            return None
-        kind = conversions[fitting[0]]
-        if any(conversions[index] != kind for index in fitting):
-            if isinstance(observation, np.ndarray) and observation.shape == self.team_spaces.own_shape:
-                return None
-            agent = 0 if names is None else names[fitting[0]]
-            raise ValueError(
-                f"expected to know whose observation this is, which several kinds of agents have; name the agent: "
-                f"predict({{{agent!r}: observation}})"
-            )
-        return self._given([observation], [action_masks], [kind], fitting if len(fitting) == 1 else None, None)
-
-    def _agents_in(self, observation: object) -> list[Any] | None:
-        """Return the agents of ``{agent: observation}``; None for any other observation."""
-        if not isinstance(observation, Mapping) or not observation:
-            return None
-        agents, names, n_agents = list(observation), self.team_spaces.names, self.team_spaces.n_agents
-        if names is None:
-            if set(agents) & (ALL_KEYS | _CLASSIC):
-                return None
-            if len(agents) > n_agents:
-                raise ValueError(f"expected observations of at most {n_agents} agents, got {len(agents)}")
-            return agents
-        unknown = [agent for agent in agents if agent not in names]
-        if not unknown:
-            return agents
-        conversions = self.team_spaces.conversions or ()
-        if set(agents) & (ALL_KEYS | _CLASSIC) or any(one.fits(observation) for one in conversions):
-            return None
-        raise ValueError(
-            f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, got "
-            f"{unknown[0]!r}"
-        )
-
-    def _given(
-        self,
-        entries: list[Any],
-        masks: list[Any],
-        conversions: Sequence[AgentConversion] | None,
-        indices: list[int] | None,
-        agents: list[Any] | None,
-    ) -> Given:
-        """Convert observations and masks of some agents; without ``conversions`` they have the form of rows."""
-        takes_masks = self.team_spaces.action_mask is not None or isinstance(self, MaskableActorCriticPolicy)
-        own: list[np.ndarray] = []
-        legal: list[Any] = []
-        for number, (entry, mask) in enumerate(zip(entries, masks, strict=True)):
-            try:
-                if conversions is None:
-                    inside = isinstance(entry, Mapping) and set(entry) == _CLASSIC
-                    own.append(np.asarray(entry["observation"] if inside else entry))
-                    legal.append(entry[ACTION_MASK_KEY] if inside and mask is None else mask)
-                    continue
-                conversion = conversions[number]
-                observation, inside_mask = conversion.split(entry)
-                own.append(conversion.own(observation))
-                if inside_mask is not None and conversion.mask_key is None and not takes_masks:
-                    raise ValueError(f"expected no {ACTION_MASK_KEY!r}, because this policy was trained without masks")
-                legal.append(inside_mask if mask is None else mask)
-                if self.team_spaces.action_mask is not None or (takes_masks and legal[-1] is not None):
-                    legal[-1] = conversion.mask(legal[-1])
-            except ValueError as error:
-                raise ValueError(
-                    f"observation of {'the agent' if agents is None else agents[number]}: {error}"
-                ) from None
-        if len(shapes := {array.shape for array in own}) > 1:
-            raise ValueError(
-                f"expected observations of one shape, that of rows, {self.team_spaces.own_shape}, got {sorted(shapes)}"
-            )
-        rows = {OBS_KEY: np.stack(own)} | ({} if indices is None else {AGENT_KEY: np.array(indices)})
-        has_masks = takes_masks and all(mask is not None for mask in legal)
-        given = np.stack([np.asarray(mask) for mask in legal]) if has_masks else None
-        if given is None or self.team_spaces.action_mask is None:
-            return Given(rows, given, conversions, agents)
-        return Given({**rows, ACTION_MASK_KEY: given}, None, conversions, agents)
 
     def obs_to_tensor(self, observation: Observation) -> tuple[PyTorchObs, bool]:
         """
@@ -326,16 +170,22 @@ class TeamRowsPolicy(BasePolicy):
         """
         entries = observation if isinstance(observation, Mapping) else {OBS_KEY: observation}
         keys = self.team_spaces.keys
-        if set(entries) == _CLASSIC and ACTION_MASK_KEY in keys:
+        if set(entries) == CLASSIC and ACTION_MASK_KEY in keys:
             entries = {OBS_KEY: entries["observation"], ACTION_MASK_KEY: entries[ACTION_MASK_KEY]}
         unknown = [key for key in entries if key not in keys]
         if unknown:
             raise ValueError(f"expected observations with the keys {', '.join(map(repr, keys))}, got {unknown[0]!r}")
         arrays = {key: np.asarray(value) for key, value in entries.items()}
         if OBS_KEY in arrays:
-            arrays[OBS_KEY] = _checked_own(_codes(arrays[OBS_KEY], self.team_spaces.own), self.team_spaces.own)
+            arrays[OBS_KEY] = own_observations(arrays[OBS_KEY], self.team_spaces.own)
         if AGENT_KEY in arrays:
-            arrays[AGENT_KEY] = self._checked_agent(arrays[AGENT_KEY])
+            agent, n_agents = arrays[AGENT_KEY], self.team_spaces.n_agents
+            agent = arrays[AGENT_KEY] = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
+            if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
+                raise ValueError(
+                    f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}: this policy depends on the index of an "
+                    f"agent, and was trained with {n_agents}"
+                )
         tensors, is_batch = super().obs_to_tensor(arrays)
         assert isinstance(tensors, dict)
         if isinstance(observation, TerminalRow):
@@ -344,16 +194,6 @@ class TeamRowsPolicy(BasePolicy):
             lengths = ", ".join(f"{key!r} {len(tensor)}" for key, tensor in tensors.items())
             raise ValueError(f"expected as many rows under each key of an observation, got {lengths}")
         return tensors, is_batch
-
-    def _checked_agent(self, agent: np.ndarray) -> np.ndarray:
-        n_agents = self.team_spaces.n_agents
-        agent = agent[:, 0] if agent.ndim == 2 and agent.shape[1] == 1 else agent
-        if agent.size and (agent.min() < 0 or agent.max() >= n_agents):
-            raise ValueError(
-                f"{AGENT_KEY!r} must be in 0..{n_agents - 1}, got {agent}: this policy depends on the index of an "
-                f"agent, and was trained with {n_agents}"
-            )
-        return agent
 
     # --- entries of rows --------------------------------------------------------------------------------------------
 
@@ -431,7 +271,8 @@ class TeamRowsPolicy(BasePolicy):
             observations, rows, active, _ = obs.teams
             members = self.row_encoder.rows(observations.flatten(0, 1))
             own = members if rows is None else members.at(rows)
-            return own, EncodedTeams(members.features, members.arranged(observations.shape[:2]), rows, active)
+            arranged = members.arranged(observations.shape[:2])
+            return own, EncodedTeams(members.features, arranged, rows, active)
         own, active = self.encode_own(obs), self._active(obs)
         if not self._are_whole_teams(obs, of_step):
             return own, self.row_encoder.joint_rows(self._team(obs), self._agent(obs), own, active)
@@ -481,29 +322,6 @@ class TeamRowsPolicy(BasePolicy):
         return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
 
 
-def _codes(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
-    """Convert pixels to tile codes for a model trained on codes; return any other observation unchanged."""
-    atlas = getattr(space, "atlas", None)
-    if atlas is None or space.shape is None or len(space.shape) != 2:
-        return observation
-    height, width = (cells * atlas.shape[1] for cells in space.shape)
-    if observation.shape[-3:] not in ((height, width, atlas.shape[3]), (atlas.shape[3], height, width)):
-        return observation
-    return pixels_to_codes(observation, atlas).astype(space.dtype)
-
-
-def _checked_own(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
-    """Raise ValueError for NaN, and for tile codes that the atlas lacks, in inputs of predict."""
-    if observation.dtype.kind == "f" and not np.isfinite(observation).all():
-        raise ValueError(f"{OBS_KEY!r} must be finite, got {observation[~np.isfinite(observation)][0]}")
-    atlas = getattr(space, "atlas", None)
-    if atlas is not None and observation.shape[-2:] == space.shape:
-        largest = observation.max(initial=0)
-        if observation.min(initial=0) < 0 or largest >= len(atlas):
-            raise ValueError(f"{OBS_KEY!r} must be tile codes in 0..{len(atlas) - 1}, got {largest}")
-    return observation
-
-
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
     """Return an entry of rows, or raise an error that ``reader`` needs it."""
     if isinstance(obs, th.Tensor) or (key not in obs and not isinstance(obs, TeamMinibatch)):
@@ -514,8 +332,3 @@ def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:
             f"sb3_saf.CentralizedValueWrapper{index if key == AGENT_KEY else ''}"
         )
     return obs[key]
-
-
-def pop_named(kwargs: dict[str, Any], names: set[str]) -> dict[str, Any]:
-    """Remove named entries from ``kwargs`` and return them."""
-    return {name: kwargs.pop(name) for name in list(kwargs) if name in names}

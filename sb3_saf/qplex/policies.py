@@ -19,7 +19,7 @@ from sb3_saf.buffers.replay import TeamSteps
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
-from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy, pop_named
+from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy
 from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
 from sb3_saf.qplex.parts import QPLEXParts, QPLEXPoolParts
@@ -115,9 +115,10 @@ class QPLEXPolicy(TeamRowsPolicy):
         **kwargs: Any,
     ):
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
-        self.parts = self.parts_class(**pop_named(kwargs, {field.name for field in fields(self.parts_class)}))
-        if kwargs:
-            raise TypeError(f"{type(self).__name__} takes no argument {next(iter(kwargs))!r}")
+        names = {field.name for field in fields(self.parts_class)}
+        if unknown := [name for name in kwargs if name not in names]:
+            raise TypeError(f"{type(self).__name__} takes no argument {unknown[0]!r}")
+        self.parts = self.parts_class(**kwargs)
         super().__init__(
             observation_space,
             action_space,

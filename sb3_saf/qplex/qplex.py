@@ -272,7 +272,7 @@ class QPLEX(OffPolicyAlgorithm):
         """
         given = self.policy.given_by_game(observation)
         if given is not None:
-            return self.policy.act_in_game(given, self.predict, state, episode_start, deterministic)
+            return given.act(self.predict, state, episode_start, deterministic)
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
         if deterministic or not self.exploration_rate:
             return actions, state

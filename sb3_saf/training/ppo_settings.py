@@ -67,7 +67,7 @@ def ppo_settings(
     hints, taken = algorithm_arguments(algorithm), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
     policy: Any = algorithm.policy_aliases[spec.policy]
     found = {key: convert(key, source[key], hints[key]) for key in taken if key in source and key in hints}
-    if not policy.normalizes_values:  # masks and sequences need buffers of their own
+    if not policy.takes_team_buffer:  # masks and sequences need buffers of their own
         found = {key: value for key, value in found.items() if key not in _OF_BUFFER}
     if "batch_size" in hints:
         rollout = source["n_steps"] * source["n_envs"]  # game steps, in all games
@@ -80,7 +80,7 @@ def ppo_settings(
         policy_kwargs["memory"] = memory
     if encoder is not None:
         policy_kwargs["features_extractor_class"] = encoder
-    if not policy.normalizes_values:
+    if not policy.takes_team_buffer:
         policy_kwargs.pop("normalize_values", None)
     policy_kwargs |= overrides.get("policy_kwargs") or {}
     if shares_reward(env):
