@@ -62,7 +62,7 @@ class Campaign(NamedTuple):
 
 def _kills(name: str, options: str, number: int = 8, needs: tuple[str, ...] = ()) -> Campaign:
     return Campaign(
-        f"kills, {name}", f"-m tests.kill_harness {options} --rollouts 7 --kills {{n}}", number, needs=needs
+        f"kills, {name}", f"-m tests.kill_harness {options} --rollouts 7 --kills {{n}}", number, least=8, needs=needs
     )
 
 
@@ -73,12 +73,29 @@ def _mutated(name: str, of: str, number: int) -> Campaign:
 CAMPAIGNS: Final = (
     _kills("SAF, HECOGrid", "--algo saf", 12),
     _kills("QPLEX, HECOGrid", "--algo qplex", 12),
+    _kills("SAF with a GRU, HECOGrid", "--algo saf-gru"),
+    _kills("QPLEX with a GRU, HECOGrid", "--algo qplex-gru"),
+    _kills("IPPO by A2C, HECOGrid", "--algo ippo-a2c"),
+    _kills("MAPPO by TRPO, HECOGrid", "--algo mappo-trpo"),
+    _kills("SAF, a curriculum", "--game curriculum"),
+    _kills("SAF by MaskablePPO, agents that die and join", "--algo maskable --game dying"),
+    _kills("MAPPO with an LSTM, agents that die and join", "--algo mappo-lstm --game dying"),
+    _kills("SAF with VecNormalize, agents that die and join", "--algo normalized --game dying"),
     _kills("SAF, simple_spread_v3", "--game spread", needs=("mpe2",)),
     _kills("QPLEX, simple_spread_v3", "--algo qplex --game spread", needs=("mpe2",)),
     _kills("SAF, simple_spread_v3 in two processes", "--game spread --cpus 2", needs=("mpe2",)),
     _kills("SAF, pursuit_v5", "--game pursuit", needs=("pymunk",)),
     _kills("SAF, a game that makes its generator late", "--game lazy"),
-    _kills("SAF, JaxMARL's MPE in a batch", "--game jax", 4, needs=("jaxmarl",)),
+    _kills("SAF, JaxMARL's MPE in a batch", "--game jax", needs=("jaxmarl",)),
+    *(
+        Campaign(f"kills, {name}", f"-m tests.kill_harness --command {key} --kills {{n}}", 8, least=8)
+        for name, key in (
+            ("sb3_saf.train", "train"),
+            ("sb3_saf.train with VecNormalize", "train-normalize"),
+            ("sb3_saf.train, QPLEX with a GRU", "train-memory"),
+            ("sb3_saf.experiments with two workers", "grid"),
+        )
+    ),
     Campaign(
         "each of bit flips, truncations, bytes too many in checkpoints",
         f"{PYTEST} tests/test_checkpoints_files.py",

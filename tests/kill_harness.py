@@ -13,6 +13,7 @@ clock       at any moment of the run's time; the run's phase at that moment is r
 =========== ==================================================================================================
 
 All kinds but the last are counted inside the run, so the same seed kills at the same moments on every machine.
+``--command`` kills the processes of a command by the clock.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from __future__ import annotations
 import argparse
 import ctypes
 import io
+import json
 import multiprocessing as mp
 import os
 import random
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -43,6 +46,7 @@ import torch as th
 import sb3_saf
 from sb3_saf.checkpoints.callback import TeamCheckpointCallback
 from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.export.weights import read_weights
 from tests.killed_runs import ALGOS, GAMES, ROLLOUT, Games, Run, make_run
 
 #: Events that are counted in a run.
@@ -285,16 +289,115 @@ def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: in
     return done, equal
 
 
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+_GAME: Final = ("--size", "smoke", "-n", "600", "--env-kwargs", "max_cycles:20")
+_TRAIN: Final = ("-m", "sb3_saf.train", "--env", "TeamSupport", *_GAME, "--seed", "3", "--resume", "-f", "{folder}")
+_EVALUATED: Final = ("--eval-freq", "100", "--eval-episodes", "2", "--checkpoint-freq", "100")
+#: Commands that go on when they are repeated, by name; ``grid`` has two worker processes.
+COMMANDS: Final = {
+    "train": (*_TRAIN, *_EVALUATED, "--algo", "saf"),
+    "train-normalize": (*_TRAIN, *_EVALUATED, "--algo", "mappo", "-params", "normalize:true"),
+    "train-memory": (*_TRAIN, *_EVALUATED, "--algo", "qplex-gru"),
+    "grid": (
+        *("-m", "sb3_saf.experiments", "run", "--env", "TeamSupport", *_GAME, "-f", "{folder}"),
+        *("--methods", "saf", "mappo-gru", "--seeds", "0", "1", "--episodes", "8", "--workers", "2"),
+    ),
+}
+
+
+def kill_command(name: str, kills: int, seed: int) -> tuple[int, int]:
+    """
+    Kill a command at random moments after it has begun to write, each time in a new folder; repeat and compare it.
+
+    :return: numbers of kills and of bit-equal results
+    :raises RuntimeError: if a repeated command fails, or a killed one leaves processes behind
+    """
+    rng, equal, done = random.Random(seed), 0, 0
+    with tempfile.TemporaryDirectory() as root:
+        began = time.monotonic()
+        process, whole = _start_command(name, Path(root, "whole"))
+        begun = time.monotonic()
+        if process.wait():
+            raise RuntimeError(f"{name} failed with exit code {process.returncode}")
+        print(f"{name}, undisturbed: {begun - began:.1f} s until it writes, {time.monotonic() - begun:.1f} s after it")
+        seconds, result = time.monotonic() - begun, _results(whole)
+        while done < kills:
+            process, folder = _start_command(name, Path(root, "killed"))
+            when = rng.uniform(0, seconds)
+            time.sleep(when)
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+                _wait_for_children(process.pid)
+                done += 1
+                process, _ = _start_command(name, folder)
+                if process.wait():
+                    raise RuntimeError(
+                        f"{name} failed with exit code {process.returncode} after a kill at {when:.2f} s"
+                    )
+                is_equal = _results(folder) == result
+                equal += is_equal
+                print(f"{name} killed after {when:.2f} s: {'bit-equal' if is_equal else 'DIFFERENT'}", flush=True)
+            rmtree(folder)
+    return done, equal
+
+
+def _start_command(name: str, folder: Path) -> tuple[subprocess.Popen[bytes], Path]:
+    """Start a command in a session of its own, and wait until it has written something."""
+    words = [word.format(folder=folder) for word in COMMANDS[name]]
+    with Path(f"{folder}.log").open("ab") as log:
+        process = subprocess.Popen([sys.executable, *words], stdout=log, stderr=log, start_new_session=True)
+    while process.poll() is None and not any(folder.rglob("run.json")):
+        time.sleep(0.05)
+    return process, folder
+
+
+def _wait_for_children(session: int, seconds: float = 30) -> None:
+    """Wait until no process of a session is left."""
+    ends = time.monotonic() + seconds
+    while True:
+        try:
+            os.killpg(session, 0)
+        except ProcessLookupError:
+            return
+        if time.monotonic() > ends:
+            raise RuntimeError(f"processes of session {session} are left {seconds:g} s after it was killed")
+        time.sleep(0.1)
+
+
+def _results(folder: Path) -> dict[str, Any]:
+    """Return weights, evaluations, episodes and test returns of a command, by file."""
+    results: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".zip":
+            results[name] = {key: value.numpy().tobytes() for key, value in read_weights(path).items()}
+        elif path.name == "evaluations.npz":
+            with np.load(path) as arrays:
+                results[name] = {key: arrays[key].tobytes() for key in arrays.files}
+        elif path.name == "monitor.csv":
+            results[name] = _episodes(path.parent)
+        elif path.parent.name == "tests":
+            results[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "wall_seconds"}
+    return results
+
+
 def main() -> None:
     """Run the harness."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
     parser.add_argument("--algo", choices=ALGOS, default="saf")
     parser.add_argument("--game", choices=GAMES, default="hecogrid")
     parser.add_argument("--cpus", type=int, default=1, help="worker processes of games of others")
+    parser.add_argument("--command", choices=COMMANDS, help="kill this command in place of a script's run")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--rollouts", type=int, default=40, help="length of the run")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     options = parser.parse_args()
+    if options.command is not None:
+        kills, equal_ones = kill_command(options.command, options.kills, options.seed)
+        print(f"{options.command}: {equal_ones} of {kills} end bit-equal")
+        sys.exit(equal_ones != kills)
     games = Games(options.game, options.cpus)
     if games.start_method == "fork":
         make_run(options.algo, None, games).warm_up()  # they inherit compiled code
