@@ -369,34 +369,45 @@ def test_evaluation_callback(tmp_path: Path) -> None:
 # --- export -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("policy", "kwargs"), [("QPLEXPoolPolicy", {}), ("QPLEXPolicy", {"heads": "per_agent"})])
+@pytest.mark.parametrize(
+    ("policy", "kwargs"),
+    [
+        ("QPLEXPoolPolicy", {}),
+        ("QPLEXPolicy", {"heads": "per_agent"}),
+        ("QPLEXPolicy-gru", {}),
+        ("QPLEXPoolPolicy-lstm", {}),
+    ],
+)
 def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], tmp_path: Path) -> None:
     env = make_team_env("TeamSupport", n_envs=4, n_agents=3, grid_size=9, n_treasures=3)
     model = make_model(env, policy, policy_kwargs={"features_extractor_class": LightEncoder} | kwargs).learn(60 * 3)
-    # Heads must differ: a short training leaves their values close to zero.
-    for parameter in model.policy.actor.parameters():
+    memory = model.policy.actor_memory
+    # Heads, and the memory's, must differ: a short training leaves their values close to zero.
+    for parameter in [*model.policy.actor.parameters(), *([] if memory is None else memory.parameters())]:
         parameter.data.add_(th.randn_like(parameter) * 0.3)
     export_actors(model, tmp_path / "actor")
-    obs = env.reset()
-    for agent in range(3):
-        actor = Actor.load(tmp_path / "actor", agent=agent)
-        own = obs["obs"][agent::3]
-        expected = model.predict({"obs": own, "agent": np.full(4, agent)}, deterministic=True)[0]
-        assert np.array_equal(actor.act(own), expected)
-        assert np.array_equal(actor.act(own, deterministic=False), expected)
-        assert actor.act(own[0]) == expected[0]
+    actors = [Actor.load(tmp_path / "actor", agent=agent) for agent in range(3)]
+    of_teams = [actor.new_memory() if memory is not None else None for actor in actors]
+    of_one = of_teams[0] and actors[0].new_memory()
+    obs, state = env.reset(), None
+    for _ in range(4):
+        expected, state = model.predict(obs, state, deterministic=True)
+        for agent, actor in enumerate(actors):
+            own = obs["obs"][agent::3]
+            again = copy.deepcopy(of_teams[agent])
+            assert np.array_equal(actor.act(own, memory=of_teams[agent]), expected[agent::3])
+            assert np.array_equal(actor.act(own, deterministic=False, memory=again), expected[agent::3])
+        assert actors[0].act(obs["obs"][0], memory=of_one) == expected[0]
         with pytest.raises(ValueError, match="highest value: nothing is drawn"):
-            actor.probabilities(own)
+            actors[0].probabilities(obs["obs"][::3], memory=of_teams[0])
+        obs = env.step(expected)[0]
+    if memory is not None:
+        assert np.array_equal(of_teams[2].states["last_action"].argmax(axis=1), expected[2::3])
 
 
 def test_a_policy_of_ppo_is_refused_with_those_that_fit() -> None:
     with pytest.raises(ValueError, match=r"expected one of QPLEX's policies, 'QPLEXPolicy', .*, got 'SAFPolicy'"):
         QPLEX("SAFPolicy", toy_env())
-
-
-def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match=r"its memory reads the agent's last action, too; act with model\.predict"):
-        export_actors(make_model(policy="QPLEXPolicy-lstm"), tmp_path / "actor")
 
 
 def test_exported_actors_keep_to_masks(tmp_path: Path) -> None:

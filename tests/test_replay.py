@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import PPO
 
 import sb3_saf
@@ -100,7 +101,16 @@ def test_methods_without_parts(policy: str, tmp_path: Path) -> None:
     assert run["of_team"] == policy.startswith("QPLEX") and "values" in run
 
 
-def test_exported_actors_and_models_side_by_side(model: PPO, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["memoryless", "heads per agent, memory", "qplex with memory"])
+def test_exported_actors_and_models_side_by_side(kind: str, model: Any, tmp_path: Path) -> None:
+    if kind != "memoryless":
+        algorithm: Any = sb3_saf.QPLEX if kind.startswith("qplex") else PPO
+        kwargs = {"memory": "gru", "heads": "per_agent"}
+        model = algorithm(
+            f"{'QPLEX' if algorithm is not PPO else 'MAPPO'}Policy", make_env(), seed=0, policy_kwargs=kwargs
+        )
+        for parameter in model.policy.parameters():
+            parameter.data.add_(0.3 * th.randn_like(parameter))
     sb3_saf.export_actors(model, tmp_path / "actor")
     players: dict[str, Any] = {"model": model, "<b>actor</b>": sb3_saf.Actor.load(tmp_path / "actor")}
     page = replay(players, make_env(), tmp_path / "page.html", deterministic=True)

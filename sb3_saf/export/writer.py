@@ -38,6 +38,7 @@ from sb3_saf.networks.distributions import (
 )
 from sb3_saf.networks.encoders import encoded
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
+from sb3_saf.qplex.heads import AgentMemory
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.errors import ExportError
@@ -69,8 +70,8 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
     reads the folder. Actors of models with action masks need a mask with each observation, those of models with memory
     a memory (see :class:`~sb3_saf.Actor`). Files of an earlier export are replaced, each atomically.
 
-    :param model: an algorithm with a SAF, MAPPO or IPPO policy, also with memory or maskable; QPLEX without memory; or
-        the policy itself
+    :param model: an algorithm with a SAF, MAPPO or IPPO policy, also maskable, or of QPLEX, QMIX or VDN, each also with
+        memory; or the policy itself
     :param folder: output folder
     :return: the folder
     :raises ImportError: without ``pip install -e '.[export]'``
@@ -109,11 +110,6 @@ def _checked_policy(model: object) -> ExportablePolicy:
             f"expected model with SAFPolicy, MAPPOPolicy or IPPOPolicy, or of QPLEX, got {type(policy).__name__}; "
             "policies of Stable-Baselines3 itself read whole rows and have no actor of one agent"
         )
-    if isinstance(policy, QPLEXPolicy) and policy.actor_memory is not None:
-        raise ExportError(
-            f"{type(policy).__name__} cannot be exported: its memory reads the agent's last action, too; act with "
-            "model.predict, which carries the state, or train PPO with memory, which can be exported"
-        )
     if type(policy.actor) not in (SinglePolicy, PolicyPool):
         raise ExportError(f"expected the actor SinglePolicy or PolicyPool, got {type(policy.actor).__name__}")
     for space in (policy.team_spaces.own, policy.action_space):
@@ -139,7 +135,7 @@ def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, 
         "policy": type(policy).__name__,
         "n_agents": policy.team_spaces.n_agents,
         "agents": list(names) if names and all(isinstance(name, (str, int)) for name in names) else None,
-        "reads_agent": policy.actor.reads_agent,
+        "reads_agent": network.reads_agent,
         "action_mask": masks if policy.team_spaces.action_mask is None else "required",
         "greedy": network.greedy,
         "states": network.state_shapes,
@@ -189,11 +185,14 @@ class ActingNetwork(nn.Module):
         self.n_agents, self.normalize_images = policy.team_spaces.n_agents, policy.normalize_images
         self.greedy = isinstance(policy, QPLEXPolicy)
         self.has_masks = policy.team_spaces.action_mask is not None or isinstance(policy, TeamMaskablePolicy)
-        memory = policy.actor_memory if isinstance(policy, TeamPolicy) else None
-        self.extractor, self.actor, self.memory = copy.deepcopy((policy.features_extractor, policy.actor, memory))
+        self.reads_agent = policy.acts_by_index
+        modules = policy.features_extractor, policy.actor, policy.actor_memory
+        self.extractor, self.actor, self.memory = copy.deepcopy(modules)
         self.state_shapes: dict[str, tuple[int, ...]] = {}
         if self.memory is not None:
             self.state_shapes["memory"] = (self.memory.state_dim,)
+        if isinstance(self.memory, AgentMemory):
+            self.state_shapes["last_action"] = (self.memory.n_actions,)
         if isinstance(self.action_space, spaces.Box):
             self.register_buffer("low", th.as_tensor(self.action_space.low, dtype=th.float32))
             self.register_buffer("high", th.as_tensor(self.action_space.high, dtype=th.float32))
@@ -219,7 +218,7 @@ class ActingNetwork(nn.Module):
         space, generator = copy.deepcopy(self.own), th.Generator().manual_seed(0)
         space.seed(0)
         inputs = {"observation": th.as_tensor(np.stack([np.asarray(space.sample()) for _ in range(_N_CHECKED)]))}
-        if self.actor.reads_agent:
+        if self.reads_agent:
             inputs["agent"] = th.arange(_N_CHECKED) % self.n_agents
         if self.has_masks:
             inputs["action_mask"] = th.ones(_N_CHECKED, sum(choices_of(self.action_space)), dtype=th.bool)
@@ -244,17 +243,23 @@ class ActingNetwork(nn.Module):
     def of_features(self, features: th.Tensor, inputs: Tensors) -> tuple[th.Tensor, ...]:
         """Return the outputs for features (rows, d) of the observations, and the other inputs."""
         states: list[th.Tensor] = []
+        if isinstance(self.memory, AgentMemory):
+            identity = nn.functional.one_hot(inputs["agent"], self.n_agents)
+            features = th.cat([features, inputs["last_action"], identity.to(features.dtype)], dim=1)
         if self.memory is not None:
             features, after = self.memory.step(features, inputs["memory"])
             states.append(after)
-        output = self.actor.evaluate(features, inputs.get("agent"))
+        output = self.actor.evaluate(features, inputs["agent"] if self.actor.reads_agent else None)
         if "action_mask" in inputs:
             output = output._replace(
                 actions=masked_parameters(self.action_space, output.actions, inputs["action_mask"])
             )
         favourite = policy_parameters(output.actions, output.log_weights.argmax(dim=1))
         if self.greedy:
-            return favourite.argmax(dim=1), favourite, *states
+            best = favourite.argmax(dim=1)
+            if isinstance(self.memory, AgentMemory):
+                states.append(nn.functional.one_hot(best, self.memory.n_actions).to(favourite.dtype))
+            return best, favourite, *states
         is_mixture = isinstance(self.actor, PolicyPool) and self.actor.selection == "mixture"
         likeliest = likeliest_action(self.action_space, favourite)
         if is_mixture:

@@ -7,6 +7,7 @@ Letters: T game steps, N agents, A actions, U policies, L slots.
 from __future__ import annotations
 
 import base64
+import copy
 import json
 from collections.abc import Mapping
 from html import escape
@@ -28,7 +29,7 @@ from sb3_saf.inspection.figures import png
 from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, record_episodes
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTION_MASK_KEY, OBS_KEY, TeamSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, EPISODE_START_KEY, OBS_KEY, TeamSpaces
 from sb3_saf.teams.vec_env import require_n_agents
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
@@ -203,18 +204,24 @@ def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
 
 def _play_actor(actor: Actor, env: VecEnv, episodes: int, seed: int, deterministic: bool) -> list[_Episode]:
     """Play one episode of each game with an exported actor, on own observations and masks."""
-    if actor.has_memory or actor.reads_agent:
-        raise ValueError(
-            "expected an exported actor without memory and heads per agent to replay; replay the model that it "
-            "was exported from"
-        )
     n_agents = require_n_agents(env)
     frames: list[Picture] = []
+    actors = [copy.copy(actor) for _ in range(n_agents)]
+    memories = [actor.new_memory() if actor.has_memory else None for _ in range(n_agents)]
+    for index, one in enumerate(actors):
+        one.agent = index
 
     def act(obs: Any, starts: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         if env.render_mode == "rgb_array" and (frame := picture(env)) is not None:
             frames.append(frame)
-        return np.asarray(actor.act(obs[OBS_KEY], deterministic, action_mask=obs.get(ACTION_MASK_KEY)))
+        masks, actions = obs.get(ACTION_MASK_KEY), []
+        for index, (one, memory) in enumerate(zip(actors, memories, strict=True)):
+            rows = slice(index, None, n_agents)
+            for state in () if memory is None else memory.states.values():  # also where agents join
+                state[obs[EPISODE_START_KEY][rows].astype(bool).reshape(-1)] = 0
+            mask = None if masks is None else masks[rows]
+            actions.append(one.act(obs[OBS_KEY][rows], deterministic, action_mask=mask, memory=memory))
+        return np.stack(actions, axis=1).reshape(env.num_envs, *(env.action_space.shape or ()))
 
     with own_randomness(seed, th.device("cpu")):
         env.seed(seed)
