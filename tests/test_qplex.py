@@ -387,7 +387,7 @@ def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], tmp_p
         parameter.data.add_(th.randn_like(parameter) * 0.3)
     export_actors(model, tmp_path / "actor")
     actors = [Actor.load(tmp_path / "actor", agent=agent) for agent in range(3)]
-    of_teams = [actor.new_memory() if memory is not None else None for actor in actors]
+    of_teams: Any = [actor.new_memory() if memory is not None else None for actor in actors]
     of_one = of_teams[0] and actors[0].new_memory()
     obs, state = env.reset(), None
     for _ in range(4):
