@@ -389,7 +389,8 @@ def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], tmp_p
     actors = [Actor.load(tmp_path / "actor", agent=agent) for agent in range(3)]
     of_teams: Any = [actor.new_memory() if memory is not None else None for actor in actors]
     of_one = of_teams[0] and actors[0].new_memory()
-    obs, state = env.reset(), None
+    obs: Any = env.reset()
+    state: Any = None
     for _ in range(4):
         expected, state = model.predict(obs, state, deterministic=True)
         for agent, actor in enumerate(actors):
