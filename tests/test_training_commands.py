@@ -230,6 +230,9 @@ def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert f"the weights and the optimiser of {first}; no code is loaded" in capsys.readouterr().out
     other = ["--algo", "mappo", "--size", "smoke", "--env", ENV, "-f", str(tmp_path), "-i", str(first)]
     assert "do not fit MAPPOPolicy" in failed(other, capsys)
+    damaged = tmp_path / "damaged.zip"
+    damaged.write_bytes(first.read_bytes()[:-100])
+    assert "damaged.zip does not hold the tensors of a saved model" in failed([*other, "-i", str(damaged)], capsys)
     assert "another algorithm's" in failed([*other, "--algo", "saf", "-params", "algorithm:A2C"], capsys)
     pairs = zip(*(weights(PPO.load(path)).values() for path in (first, second)), strict=True)
     assert all(th.allclose(a.float(), b.float(), atol=1e-5) for a, b in pairs)

@@ -23,6 +23,7 @@ from sb3_saf.callbacks.game_steps import GameStepsCallback
 from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.checkpoints.models import settings_restored_on_error
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.export.weights import read_weights
 from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import atomic_file
@@ -284,8 +285,9 @@ def load_parameters(model: BaseAlgorithm, path: Path) -> None:
     Load weights and optimiser state of a saved model, a ``.zip``. Only tensors are read: no code of the file is run.
 
     :param model: model with the policy and the ``policy_kwargs`` of the saved one
-    :raises ValueError: if the file does not fit
+    :raises ValueError: if the file is damaged or does not fit
     """
+    read_weights(path)  # a damaged file is named as such
     optimizer = model.policy.optimizer
     settings = set(optimizer.param_groups[0])
     try:
