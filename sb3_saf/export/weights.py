@@ -95,6 +95,8 @@ def read_weights(path: Path) -> dict[str, th.Tensor]:
         if path.suffix == ".safetensors":
             return load(path.read_bytes())
         with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} in it is damaged")
             data = archive.read("policy.pth")
         tensors = th.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # zips, the unpickler and safetensors have no common class of errors
