@@ -11,8 +11,9 @@ In every probe an agent sees a few numbers and has two actions; rewards are func
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,8 +32,9 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "probe_v0", "render_modes": [], "is_parallelizable": True}
-    #: Numbers, each -1 or 1, that each agent sees.
+    #: Numbers, each -1 or 1, that each agent sees; actions of each agent.
     n_bits: ClassVar[int] = 1
+    n_actions: ClassVar[int] = 2
 
     def __init__(self, n_agents: int = 2, length: int = 1):
         self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
@@ -43,7 +45,7 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
         self.bits: Floats = np.zeros((n_agents, self.n_bits))
         self._rng: np.random.Generator | None = None
         self._observation_space = spaces.Box(-1.0, 1.0, (self._n_numbers(),), np.float32)
-        self._action_space = spaces.Discrete(2)
+        self._action_space = spaces.Discrete(self.n_actions)
 
     def _n_numbers(self) -> int:
         return self.n_bits + self.length - 1
@@ -124,16 +126,11 @@ class ConstantReward(Probe):
         return np.ones(len(bits))
 
 
-class OwnObservation(Probe):
-    """The reward is the number that the agent sees, and so is the value."""
-
-    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
-        return bits[:, 0]
-
-
 class DelayedReward(Probe):
-    """The same, but only after the last step: the value is ``gamma ** steps_left`` times the number."""
+    """
+    The reward is the number that the agent sees, but only after the last step: the value is ``gamma ** steps_left``
+    times the number.
+    """
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
         """See the class."""
@@ -164,17 +161,6 @@ class JointAction(Probe):
         """See the class."""
         solved = float((actions == (bits[:, 0] > 0)).all())
         return np.full(len(bits), solved + self.noise * bits[:, 1].sum())
-
-
-class OwnActionInOthersNoise(JointAction):
-    """
-    Every agent has its own reward: 1 if it chose as in :class:`OwnAction`, plus ``noise`` times the second number of
-    the *next* agent. To predict it, a critic must see the team and know whose value to compute.
-    """
-
-    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
-        return (actions == (bits[:, 0] > 0)) + self.noise * np.roll(bits[:, 1], -1)
 
 
 class ZoneAction(Probe):
@@ -225,3 +211,91 @@ class MessageWithoutPlace(Message):
     def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
         """Return only the base class's numbers."""
         return Probe.observe(self, bits, time)
+
+
+#: QPLEX's and QTRAN's example: only the joint action (0, 0) has a positive payoff.
+ONE_STEP: Final = np.array([[8.0, -12.0, -12.0], [-12.0, 0.0, 0.0], [-12.0, 0.0, 0.0]])
+
+
+class MatrixGame(Probe):
+    """Two agents that see their index; the team's reward is the payoff (A, A) of the joint action, divided equally."""
+
+    payoffs: ClassVar[Floats] = ONE_STEP
+    n_actions: ClassVar[int] = 3
+
+    def _n_numbers(self) -> int:
+        return 2
+
+    def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
+        """Return the agents' indices, one-hot."""
+        return np.eye(2, dtype=np.float32)
+
+    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
+        """See the class."""
+        return np.full(2, self.payoffs[tuple(actions)] / 2)
+
+
+class TwoStates(MatrixGame):
+    """
+    Two states (Wang et al. 2021, arXiv 2006.00587): in state 1 the joint action (0, 0) is rewarded with 1 and stays,
+    (0, 1) and (1, 0) stay, (1, 1) leads to state 0, which has no rewards and no way out. Agents see the state. The time
+    limit does not terminate: the value of state 1 is 1 / (1 - gamma).
+
+    With uniform data, additive factorisation fits (0, 0) with 3/4 + 5/4 gamma V, so its values diverge for gamma > 4/5.
+    """
+
+    payoffs: ClassVar[Floats] = np.array([[1.0, 0.0], [0.0, 0.0]])
+    n_actions: ClassVar[int] = 2
+    state_now = 1
+
+    def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
+        """Return the state, one-hot."""
+        self.state_now = 1 if time == 0 else self.state_now
+        return np.eye(2, dtype=np.float32)[[self.state_now] * 2]
+
+    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
+        """See the class."""
+        paid = super().rewards(bits, actions, time) * self.state_now
+        self.state_now = int(self.state_now and not actions.all())
+        return paid
+
+
+class Buttons(Probe):
+    """Agents with roles: all see the same, and agent i is rewarded for pressing button i."""
+
+    n_actions: ClassVar[int] = 3
+
+    def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
+        """Return ones."""
+        return np.ones((len(bits), *(self._observation_space.shape or ())), dtype=np.float32)
+
+    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
+        """See the class."""
+        return (actions == np.arange(len(bits))).astype(np.float64)
+
+
+class Arms(Probe):
+    """
+    Agent i sees its index and is paid its scale for arm i; episodes of four steps.
+
+    :param scales: pay of each agent
+    :param shared: whether all agents are paid the sum
+    """
+
+    n_actions: ClassVar[int] = 4
+
+    def __init__(self, scales: Sequence[float] = (1.0, 1000.0), shared: bool = False) -> None:
+        self.scales, self.shared = np.array(scales), shared
+        super().__init__(len(scales), length=4)
+
+    def _n_numbers(self) -> int:
+        return len(self.scales)
+
+    def observe(self, bits: Floats, time: int) -> npt.NDArray[np.float32]:
+        """Return the agents' indices, one-hot."""
+        return np.eye(len(bits), dtype=np.float32)
+
+    def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
+        """See the class."""
+        paid = self.scales * (actions == np.arange(len(bits)))
+        return np.full(len(bits), paid.sum()) if self.shared else paid

@@ -129,16 +129,6 @@ def test_tiles_and_pictures_have_the_same_weights_and_features(
     th.testing.assert_close(of_last(pictures.permute(0, 2, 3, 1)), expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("encoder_class", [PaperCNN, LightEncoder])
-def test_features_depend_on_every_cell(encoder_class: type[BaseFeaturesExtractor], codes: th.Tensor) -> None:
-    encoder = encoder_class(CodeSpace())
-    before = encoder(codes[:1])
-    for row, column in np.ndindex(3, 3):
-        changed = codes[:1].clone()
-        changed[0, row, column] = (changed[0, row, column] + 1) % 20
-        assert (encoder(changed) - before).abs().max() > 1e-6
-
-
 def test_light_encoder_embeds_each_tile_by_one_shared_layer() -> None:
     encoder = LightEncoder(PICTURE)
     assert sum(parameter.numel() for parameter in encoder.parameters()) == (48 * 16 + 16) + (144 * 128 + 128) + (
@@ -146,6 +136,8 @@ def test_light_encoder_embeds_each_tile_by_one_shared_layer() -> None:
     )
     assert LightEncoder(PICTURE, tile_size=6).embed.in_features == 108
     assert LightEncoder(CodeSpace(), tile_size=6).tile_size == 4
+    with pytest.raises(ValueError, match=r"one_hot_codes=True needs tile codes, .* got pictures \(3, 12, 12\); leave"):
+        LightEncoder(PICTURE, one_hot_codes=True)
     with pytest.raises(ValueError, match=r"whole tiles, got 12 x 12 pixels with tile_size=5; pass features_extractor"):
         LightEncoder(PICTURE, tile_size=5)
 
@@ -162,11 +154,6 @@ def test_one_hot_codes_tell_tiles_apart_that_look_alike(monkeypatch: pytest.Monk
     assert (first - second).abs().max() > 0.01
     monkeypatch.setattr(PixelInput, "looks_up", lambda *_: False)
     th.testing.assert_close(one_hot(views), looked_up, rtol=0, atol=1e-5)
-
-
-def test_one_hot_codes_need_codes() -> None:
-    with pytest.raises(ValueError, match=r"one_hot_codes=True needs tile codes, .* got pictures \(3, 12, 12\); leave"):
-        LightEncoder(PICTURE, one_hot_codes=True)
 
 
 @pytest.mark.parametrize(

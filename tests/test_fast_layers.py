@@ -31,6 +31,7 @@ def test_the_tanh_is_the_tanh() -> None:
     of_columns = th.randn(7, 5).t()
     for found, expected in zip(gradients(Tanh(), of_columns), gradients(th.tanh, of_columns), strict=True):
         th.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+    assert [type(mlp([2, 3, 1], activation)[1]) for activation in (nn.Tanh, nn.ReLU)] == [Tanh, nn.ReLU]
 
 
 def test_the_tanh_of_a_number_does_not_depend_on_its_place() -> None:

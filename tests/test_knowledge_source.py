@@ -12,7 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.knowledge_source import KnowledgeSource
-from sb3_saf.networks.layers import NetworkSpec, orthogonal_init
+from sb3_saf.networks.layers import NetworkSpec
 from sb3_saf.policies.parts import CriticInput
 from sb3_saf.policies.saf import SAFCritic, SAFParts
 
@@ -114,13 +114,6 @@ def test_agents_permuted_with_their_embeddings_write_the_same(source: KnowledgeS
     th.testing.assert_close(source(messages[:, order], states[:, order]).read, read[:, order], rtol=0, atol=1e-6)
 
 
-def test_every_agent_is_heard_by_every_other(source: KnowledgeSource) -> None:
-    messages = random_team().requires_grad_()
-    for reader in range(N_AGENTS):
-        heard = th.autograd.grad(source(messages, random_team()).read[:, reader].sum(), messages)[0]
-        assert (heard.abs().sum(dim=2) > 0).all()
-
-
 def test_inactive_agents_are_not_heard(source: KnowledgeSource) -> None:
     messages, active = random_team(), th.ones(N_TEAMS, N_AGENTS, dtype=th.bool)
     active[0, 2] = active[1, :4] = False
@@ -157,13 +150,6 @@ def test_cost_is_linear_in_the_number_of_agents() -> None:
     fixed, per_agent = 2 * cost(5) - cost(10), (cost(10) - cost(5)) // 5
     for n_agents in (1, 20, 320):
         assert cost(n_agents) == fixed + per_agent * n_agents
-
-
-def test_all_weights_are_trained(source: KnowledgeSource) -> None:
-    orthogonal_init(source)
-    source(random_team(), random_team()).read.square().sum().backward()
-    for name, parameter in source.named_parameters():
-        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
 
 
 # --- the critic around it ---------------------------------------------------------------------------------------------

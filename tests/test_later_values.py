@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
 from sb3_saf.buffers.later import LaterValues, compute_together
-from tests.toy_envs import CounterEnv, LateEnv
+from tests.toy_envs import LateEnv
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 
 
@@ -68,16 +67,6 @@ def test_values_of_many_steps_are_those_of_each(policy: str, game: str, normaliz
     active = expected != 0  # the buffer's values of other rows are those of the wait until the agent acts again
     np.testing.assert_allclose(values[active], expected[active], rtol=1e-5, atol=1e-5)
     assert np.ptp(values[active]) > 1e-3
-
-
-def test_other_buffers_have_them_at_once() -> None:
-    eager, venv = Eager(), make_team_env(CounterEnv, n_envs=2, seed=0, active=False)
-    with pytest.warns(UserWarning, match="TeamRolloutBuffer"):
-        model = PPO("MAPPOPolicy", venv, n_steps=20, batch_size=40, n_epochs=1, seed=0, device="cpu")
-    model.learn(20 * venv.num_envs, eager)
-    assert type(model.rollout_buffer) is DictRolloutBuffer
-    expected = np.stack(eager.values, axis=1).reshape(-1, 1)  # which it flattens
-    np.testing.assert_allclose(model.rollout_buffer.values, expected, rtol=0, atol=1e-6)
 
 
 def test_who_uses_them_has_them_computed_once() -> None:

@@ -110,12 +110,14 @@ def equal_weights(one: th.nn.Module, other: th.nn.Module) -> bool:
 # --- registration -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C])
-def test_names_are_registered(algorithm: type[PPO] | type[A2C]) -> None:
-    aliases = algorithm.policy_aliases
-    assert [aliases[name] for name in NAMES] == POLICIES
-    assert aliases["saf"] is aliases["SAF"] is aliases["SAFPolicy"]
-    assert issubclass(aliases["MlpPolicy"], ActorCriticPolicy)
+def test_names_are_registered_with_every_algorithm() -> None:
+    for declaration in DECLARATIONS:
+        for algorithm, policies in declaration.policies.items():
+            aliases = algorithm.policy_aliases
+            assert [aliases[policy.__name__] for policy in policies] == list(policies)
+            for name in (declaration.name, declaration.name.lower(), f"{declaration.name}Policy"):
+                assert aliases[name] is policies[0]
+    assert issubclass(A2C.policy_aliases["MlpPolicy"], ActorCriticPolicy)
 
 
 def test_names_that_belong_to_others_are_left_alone() -> None:
@@ -290,14 +292,6 @@ def test_mappos_critic_reads_all_views_and_whose_value_is_asked() -> None:
     th.testing.assert_close(policy.predict_values(obs), head(joint), rtol=0, atol=1e-6)  # type: ignore[operator]
 
 
-def test_mappo_without_identity_values_teammates_alike() -> None:
-    obs = team_rows(VECTOR)
-    same = make_policy(MAPPOPolicy, agent_identity=False).predict_values(obs).view(4, 3)
-    assert th.equal(same, same[:, :1].expand(-1, 3))
-    differ = make_policy(MAPPOPolicy).predict_values(obs).view(4, 3)
-    assert (differ - differ[:, :1]).abs()[:, 1:].min() > 1e-6
-
-
 @pytest.mark.parametrize("policy_class", POLICIES)
 def test_per_agent_heads_are_each_agents_own(policy_class: type[TeamActorCriticPolicy]) -> None:
     policy = make_policy(policy_class, heads="per_agent")
@@ -332,17 +326,6 @@ def test_ippo_and_mappo_differ_in_the_critic_only_and_start_alike() -> None:
     assert equal_weights(ippo.features_extractor, mappo.features_extractor)
     shapes = [[p.shape for name, p in policy.named_parameters() if "value" not in name] for policy in (ippo, mappo)]
     assert shapes[0] == shapes[1]
-
-
-@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
-def test_critics_parameters_are_those_with_value_in_their_name(
-    policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any]
-) -> None:
-    policy, obs = make_policy(policy_class, **kwargs), team_rows(VECTOR, n_games=30)
-    th.manual_seed(0)
-    policy.evaluate_actions(obs, th.zeros(90).long())[1].sum().backward()
-    for name, parameter in policy.named_parameters():
-        assert (parameter.grad is None) == ("value" in name), name
 
 
 @pytest.mark.parametrize("policy_class", POLICIES)
@@ -441,24 +424,9 @@ def test_an_extractor_for_another_space_is_refused_with_those_that_fit(
 
 @pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW])
 def test_adam_steps_all_weights_at_once_unless_told_otherwise(optimizer_class: type[th.optim.Optimizer]) -> None:
-    kwargs: dict[str, Any] = {
-        "optimizer_class": optimizer_class,
-        "optimizer_kwargs": {"eps": 1.0},
-    }  # tiny gradients, tiny steps
-    fused = make_policy(IPPOPolicy, **kwargs)
-    kwargs["optimizer_kwargs"] = {"eps": 1.0, "foreach": False}
-    one_by_one = make_policy(IPPOPolicy, **kwargs)
-    assert fused.optimizer.defaults["fused"] is True
-    assert not one_by_one.optimizer.defaults["fused"]
-    one_by_one.load_state_dict(fused.state_dict())
-    before = {name: value.clone() for name, value in fused.state_dict().items()}
-    for policy in (fused, one_by_one):
-        _, log_prob, _ = policy.evaluate_actions(team_rows(VECTOR), th.zeros(12).long())
-        log_prob.sum().backward()
-        policy.optimizer.step()
-    after = one_by_one.state_dict()
-    assert any(not th.equal(value, before[name]) for name, value in after.items())
-    th.testing.assert_close(dict(fused.state_dict()), dict(after), rtol=0, atol=1e-6)
+    for kwargs, is_fused in (({"eps": 1.0}, True), ({"foreach": False}, None)):
+        policy = make_policy(IPPOPolicy, optimizer_class=optimizer_class, optimizer_kwargs=kwargs)
+        assert policy.optimizer.defaults["fused"] is is_fused
     other = make_policy(IPPOPolicy, optimizer_class=th.optim.SGD, optimizer_kwargs={"momentum": 0.5})
     assert other.optimizer.defaults["momentum"] == 0.5 and not other.optimizer.defaults["fused"]
 
@@ -469,15 +437,6 @@ def test_net_arch_for_actor_and_critic() -> None:
     assert sizes == [(5, 12), (3, 5), (6, 12), (7, 6), (1, 7)]
     with pytest.raises(ValueError, match="net_arch must be a list or have the keys 'pi' and 'vf', got the keys"):
         make_policy(IPPOPolicy, net_arch={"pi": [5]})
-
-
-def test_default_heads_are_the_papers() -> None:
-    policy = SAFPolicy(TeamSpaces.of(VECTOR, 3).to_dict_space(), spaces.Discrete(7), constant)
-    shapes = {name: tuple(p.shape) for name, p in policy.named_parameters()}
-    assert shapes["actor.policies.0.net.0.weight"] == (128, 64)
-    assert shapes["actor.policies.3.net.4.weight"] == (7, 128)
-    assert shapes["value_net.value_head.head.4.weight"] == (1, 128)
-    assert isinstance(policy.get_submodule("actor.policies.0.net.1"), th.nn.Tanh)
 
 
 def test_orthogonal_initialisation_and_gains() -> None:
@@ -671,11 +630,6 @@ def test_with_gumbel_it_is_not() -> None:
     assert (ratios - 1).abs().max() > 1e-2
 
 
-@pytest.mark.parametrize("own", [PICTURE, CodeSpace(), spaces.Discrete(4)], ids=["picture", "codes", "discrete"])
-def test_ppo_learns_from_every_observation_space(own: spaces.Space[Any]) -> None:
-    make_model(venv=ToyTeams(own), batch_size=120, n_epochs=1).learn(120)
-
-
 def test_two_runs_of_one_seed_end_alike_also_where_policies_are_drawn() -> None:
     kwargs = {"selection": "gumbel"}
     one, other, third = (make_model(seed=seed, policy_kwargs=kwargs).learn(120) for seed in (1, 1, 2))
@@ -721,18 +675,6 @@ def test_policy_saves_and_loads(
     assert (loaded.parts, loaded.encode_once, loaded.chunk_size) == (policy.parts, False, 5)
     obs = team_rows(CodeSpace())
     assert th.equal(loaded.predict_values(obs), policy.predict_values(obs))
-
-
-def test_actor_and_encoder_run_without_the_critic() -> None:
-    policy, obs = make_policy(SAFPolicy), team_rows(VECTOR)
-    other = make_policy(SAFPolicy, seed=1)
-    kept = {name: value for name, value in policy.state_dict().items() if not name.startswith("value_net")}
-    missing = other.load_state_dict(kept, strict=False).missing_keys
-    assert missing and all(name.startswith("value_net.") for name in missing)
-    parameters = other.actor(other.features_extractor(obs["obs"]))
-    found = other.actor.distribution(parameters)
-    assert isinstance(found, CategoricalDistribution)
-    th.testing.assert_close(found.distribution.probs, probabilities(policy, obs), rtol=0, atol=1e-6)
 
 
 def test_parts_can_be_replaced() -> None:

@@ -166,18 +166,6 @@ def test_samples_follow_the_mixture(space: spaces.Space[Any]) -> None:
     assert space.contains(np.asarray(sampled[0].numpy().reshape(space.shape), dtype=space.dtype))
 
 
-@pytest.mark.parametrize("space", SPACES)
-def test_a_mixture_of_equal_policies_is_that_policy(space: spaces.Space[Any]) -> None:
-    log_weights, parameters = random_mixture(space)
-    same = parameters[:, :1].expand(-1, N_POLICIES, -1)
-    mixture, plain = mixture_of(space, log_weights, same), distribution_of(space, parameters[:, 0])
-    actions = plain.sample()
-    th.testing.assert_close(mixture.log_prob(actions), plain.log_prob(actions))
-    if (entropy := mixture.entropy()) is not None:
-        th.testing.assert_close(entropy, plain.entropy())
-    assert th.equal(mixture.mode(), plain.mode())
-
-
 def test_parameters_as_sb3_calls_them() -> None:
     log_weights, parameters = random_mixture(MULTI_DISCRETE)
     mixture = PoolDistribution(MULTI_DISCRETE)
@@ -205,12 +193,6 @@ def test_drawn_policies_follow_their_weights() -> None:
     actions = th.eye(3).expand(count, -1, -1)
     shares = draw_policy(weights.log().expand(count, -1), actions).mean(dim=0)
     assert ((shares - weights).abs() < 5 * (weights * (1 - weights) / count).sqrt()).all()
-
-
-def test_a_drawn_policy_is_taken_bit_for_bit() -> None:
-    log_weights, parameters = random_mixture(DISCRETE)
-    drawn = draw_policy(log_weights, parameters)
-    assert (drawn.unsqueeze(1) == parameters).all(dim=2).any(dim=1).all()
 
 
 def test_gradients_pass_straight_through_the_choice() -> None:

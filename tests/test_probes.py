@@ -27,8 +27,6 @@ from tests.probe_envs import (
     Message,
     MessageWithoutPlace,
     OwnAction,
-    OwnActionInOthersNoise,
-    OwnObservation,
     Probe,
     ZoneAction,
 )
@@ -109,51 +107,6 @@ def probability_of_right(policy: TeamActorCriticPolicy, probe: Probe, is_1_right
 
 def rmse(found: Array, expected: Array) -> float:
     return float(np.sqrt(((found - expected) ** 2).mean()))
-
-
-PROBES = [
-    ConstantReward,
-    OwnObservation,
-    DelayedReward,
-    OwnAction,
-    JointAction,
-    OwnActionInOthersNoise,
-    ZoneAction,
-    Message,
-    MessageWithoutPlace,
-]
-
-
-@pytest.mark.parametrize("probe_class", PROBES)
-@pytest.mark.parametrize("length", [1, 4])
-def test_probes_are_what_they_say(probe_class: type[Probe], length: int) -> None:
-    probe = probe_class(n_agents=3, length=length)
-    contexts = probe.contexts()
-    assert len(contexts) == len(np.unique(contexts, axis=0)) == 2 ** (3 * probe.n_bits)
-    for seed in range(5):
-        observations, _ = probe.reset(seed=seed)
-        bits = probe.bits.copy()
-        assert (contexts == bits).all(axis=(1, 2)).sum() == 1
-        for time in range(length):
-            assert all(probe.observation_space(agent).contains(observations[agent]) for agent in probe.agents)
-            np.testing.assert_array_equal(list(observations.values()), probe.observe(bits, time))
-            actions = np.array([0, 1, seed % 2])
-            expected = probe.rewards(bits, actions, time)
-            result = probe.step(dict(zip(probe.agents, actions, strict=True)))
-            observations, rewards, terminations, truncations, _ = result
-            np.testing.assert_array_equal(list(rewards.values()), expected)
-            assert list(terminations.values()) == [False] * 3
-            assert list(truncations.values()) == [time == length - 1] * 3
-        assert probe.agents == []
-
-
-def test_what_others_see_decides_only_where_it_should() -> None:
-    """Means of agent 0's rewards over all contexts, by what it sees, are all that IPPO's critic can know."""
-    for probe_class, means in ((Message, [0.0, 0.0]), (OwnObservation, [-1.0, 1.0])):
-        probe = probe_class(n_agents=3)
-        rewards = np.array([probe.rewards(bits, np.zeros(3, dtype=np.int64), 0)[0] for bits in probe.contexts()])
-        own = probe.contexts()[:, 0, 0]
-        assert [rewards[own == bit].mean() for bit in (-1.0, 1.0)] == means
 
 
 # --- values -----------------------------------------------------------------------------------------------------------

@@ -4,64 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
-from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
 from sb3_saf import TeamRolloutBuffer, make_team_env, ppo_settings
 from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.policies.base import TeamActorCriticPolicy
+from tests.probe_envs import Arms
 
-N_ARMS: Final = 4
 SCALES: Final = (1.0, 30.0, 300.0, 1000.0)
-
-
-class Arms(ParallelEnv[str, Any, Any]):
-    """
-    Agent i sees its index and is paid its scale for arm i; episodes of four steps.
-
-    :param scales: pay of each agent
-    :param shared: whether all agents are paid the sum
-    """
-
-    metadata: ClassVar[dict[str, Any]] = {"name": "arms"}
-
-    def __init__(self, scales: Sequence[float] = (1.0, 1000.0), shared: bool = False) -> None:
-        self.possible_agents = [f"agent_{i}" for i in range(len(scales))]
-        self.scales, self.shared = scales, shared
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        return spaces.Box(0, 1, (len(self.scales),), np.float32)
-
-    def action_space(self, agent: str) -> spaces.Space[Any]:
-        return spaces.Discrete(N_ARMS)
-
-    def _seen(self) -> dict[str, Any]:
-        return dict(zip(self.possible_agents, np.eye(len(self.scales), dtype=np.float32), strict=True))
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        self.agents, self.steps = list(self.possible_agents), 0
-        return self._seen(), {agent: {} for agent in self.agents}
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        self.steps += 1
-        paid = [scale * (actions[f"agent_{i}"] == i) for i, scale in enumerate(self.scales)]
-        rewards = [sum(paid)] * len(paid) if self.shared else paid
-        team, over = self.possible_agents, self.steps == 4
-        self.agents = [] if over else list(team)
-        ends = dict.fromkeys(team, over)
-        return (
-            self._seen(),
-            dict(zip(team, map(float, rewards), strict=True)),
-            ends,
-            dict.fromkeys(team, False),
-            {agent: {} for agent in team},
-        )
 
 
 def make(policy: str, scales: Sequence[float], normalize_values: bool = False, **kwargs: Any) -> PPO:
@@ -85,7 +40,7 @@ def right_arms(model: PPO) -> np.ndarray[Any, Any]:
         distribution: Any = model.policy.get_distribution(model.policy.obs_to_tensor(env.reset())[0])
     probabilities: np.ndarray[Any, Any] = distribution.distribution.probs.numpy()
     agents = np.arange(env.n_agents)
-    return probabilities[agents, agents % N_ARMS]
+    return probabilities[agents, agents % Arms.n_actions]
 
 
 @pytest.mark.parametrize("normalize_values", [False, True])

@@ -2,51 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
-from gymnasium import spaces
-from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
+from tests.probe_envs import Buttons
 
-SEEN = np.ones(2, np.float32)
-
-
-class Buttons(ParallelEnv[str, np.ndarray, int]):
-    """Agent i is rewarded for pressing button i; all see the same."""
-
-    metadata: dict[str, Any] = {"name": "buttons"}
-
-    def __init__(self) -> None:
-        self.possible_agents = ["a", "b", "c"]
-        self.own, self.choices = spaces.Box(0.0, 1.0, (2,), np.float32), spaces.Discrete(3)
-
-    def observation_space(self, agent: str) -> spaces.Box:
-        return self.own
-
-    def action_space(self, agent: str) -> spaces.Discrete:
-        return self.choices
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        self.agents, self.steps = self.possible_agents[:], 0
-        return dict.fromkeys(self.agents, SEEN), {name: {} for name in self.agents}
-
-    def step(self, actions: dict[str, int]) -> Any:
-        self.steps += 1
-        names, over = self.agents, self.steps == 10
-        rewards = {name: float(actions[name] == number) for number, name in enumerate(names)}
-        self.agents = [] if over else names
-        nobody, everybody = dict.fromkeys(names, False), dict.fromkeys(names, over)
-        return dict.fromkeys(names, SEEN), rewards, nobody, everybody, {name: {} for name in names}
+BUTTONS = partial(Buttons, n_agents=3, length=10)
+SEEN = np.ones(10, np.float32)
 
 
 def test_roles_are_learned_by_actors_that_read_who_acts() -> None:
     model = PPO(
         "MAPPOPolicy",
-        make_team_env(Buttons, n_envs=4, seed=0),
+        make_team_env(BUTTONS, n_envs=4, seed=0),
         n_steps=50,
         batch_size=150,
         n_epochs=8,
@@ -65,7 +37,7 @@ def test_roles_are_learned_by_actors_that_read_who_acts() -> None:
 def test_one_agent_alone_must_say_who_it_is() -> None:
     model = PPO(
         "MAPPOPolicy",
-        make_team_env(Buttons, seed=0),
+        make_team_env(BUTTONS, seed=0),
         policy_kwargs={"actor_identity": True, "net_arch": [8]},
         device="cpu",
     )

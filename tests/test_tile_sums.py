@@ -12,8 +12,6 @@ from torch import nn
 
 from sb3_saf import LightEncoder, PaperCNN, make_vec_env
 from sb3_saf.networks.encoders import PixelInput
-from sb3_saf.networks.layers import mlp
-from sb3_saf.networks.tanh import Tanh
 from sb3_saf.networks.tile_sums import (
     Places,
     places_of_convolution,
@@ -100,18 +98,3 @@ def test_encoders_by_looking_up_and_by_pixels(
         results.append([features.detach(), *(weight.grad for weight in encoder.parameters())])
     for found, expected in zip(*results, strict=True):
         th.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_tanh_is_tanh() -> None:
-    x = th.cat([th.linspace(-20, 20, 1001), th.tensor([0.0, -0.0, 1e-6, 1e30, -1e30])]).requires_grad_()
-    y = Tanh()(x)
-    assert (y - x.tanh()).abs().max() < 2.5e-7
-    gradient, expected = (th.autograd.grad(z.sum(), x, create_graph=True)[0] for z in (y, x.tanh()))
-    th.testing.assert_close(gradient, expected, rtol=0, atol=1e-6)
-    second, expected = (th.autograd.grad(z.sum(), x)[0] for z in (gradient, expected))
-    th.testing.assert_close(second, expected, rtol=0, atol=1e-6)
-
-
-def test_networks_take_the_fast_tanh_and_leave_other_activations() -> None:
-    assert type(mlp([2, 3, 1], nn.Tanh)[1]) is Tanh
-    assert type(mlp([2, 3, 1], nn.ReLU)[1]) is nn.ReLU

@@ -18,8 +18,9 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_saf.buffers.rollout import check_rows
 from sb3_saf.teams.checks import check_count, check_form, check_whole_teams
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, AGENT_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 Indices = npt.NDArray[np.int64]
 
@@ -125,10 +126,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self.optimize_memory_usage = True
         self.handle_timeout_termination = True
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
-        self._allocate(int(action_space.n))
-        self._check_memory()
-
-    def _allocate(self, n_actions: int) -> None:
+        n_actions = int(action_space.n)
         #: One more slot than steps, for the observation after the newest step.
         self.n_slots = self.buffer_size + 1
         shape = (self.n_slots, self.n_games)
@@ -151,6 +149,15 @@ class TeamReplayBuffer(ReplayBuffer):
         self._n_steps = 0
         #: Whether any agent took part since the last reset.
         self._has_played = False
+        available = psutil.virtual_memory().available
+        if self.nbytes > available:
+            warnings.warn(
+                f"The replay buffer of {self.buffer_size * self.n_games} game steps takes {self.nbytes / 1e9:.2f} GB, "
+                f"but {available / 1e9:.2f} GB are free; lower buffer_size, or take observations of fewer bytes "
+                '(observation="tiles")',
+                UserWarning,
+                stacklevel=2,
+            )
 
     def reset(self) -> None:
         """Remove all steps."""
@@ -171,17 +178,6 @@ class TeamReplayBuffer(ReplayBuffer):
     def n_stored(self) -> int:
         """Number of game steps that can be sampled, over all games."""
         return self.size() * self.n_games
-
-    def _check_memory(self) -> None:
-        available = psutil.virtual_memory().available
-        if self.nbytes > available:
-            warnings.warn(
-                f"The replay buffer of {self.buffer_size * self.n_games} game steps takes {self.nbytes / 1e9:.2f} GB, "
-                f"but {available / 1e9:.2f} GB are free; lower buffer_size, or take observations of fewer bytes "
-                '(observation="tiles")',
-                UserWarning,
-                stacklevel=3,
-            )
 
     # --- adding -----------------------------------------------------------------------------------------------------
 
@@ -207,7 +203,7 @@ class TeamReplayBuffer(ReplayBuffer):
         :param episode_starts: (B,) whether an episode starts with ``obs``; None to infer it from the ends of episodes
         :raises ValueError: if the rows are not whole teams in index order
         """
-        now, after = self._parts(obs, "obs"), self._parts(next_obs, "next_obs")
+        now, after = self._parts(obs), self._parts(next_obs)
         self._has_played |= ACTIVE_KEY not in now or bool(now[ACTIVE_KEY].any())
         slot = self.pos
         self._begin(slot, now, None if episode_starts is None else np.asarray(episode_starts)[:: self.n_agents])
@@ -217,7 +213,9 @@ class TeamReplayBuffer(ReplayBuffer):
         self.rewards[slot] = np.asarray(reward).reshape(self.n_games, self.n_agents).sum(axis=1, dtype=np.float64)
         self.ended[slot], self.terminal[slot] = ended, ended & ~truncated
         self.pos = (slot + 1) % self.n_slots
-        self._release(self.pos)
+        places = self.aside_index[self.pos]
+        self._free += places[places >= 0].tolist()
+        self.aside_index[self.pos] = _IN_NEXT_SLOT
         for key, part in after.items():
             self.seen[key][self.pos] = part
         self._n_steps = min(self.size() + 1, self.buffer_size)
@@ -227,22 +225,10 @@ class TeamReplayBuffer(ReplayBuffer):
         """Return the number of steps of each game that can be sampled."""
         return self._n_steps
 
-    def _parts(self, obs: Mapping[str, Array], what: str) -> dict[str, Array]:
+    def _parts(self, obs: Mapping[str, Array]) -> dict[str, Array]:
         """Check rows and return their stored parts by game: (B, ...) -> (E, N, ...) or (E, ...)."""
-        own, agents = np.asarray(obs[OBS_KEY]), np.asarray(obs[AGENT_KEY]).reshape(-1)
-        expected, dtype = (self.n_envs, *self.team_spaces.own_shape), self.team_spaces.team.dtype
-        if own.shape != expected or not np.can_cast(own.dtype, dtype, "same_kind"):
-            raise ValueError(
-                f"expected {OBS_KEY!r} of {what} of shape {expected} and dtype {dtype}, got {own.shape} and {own.dtype}"
-                "; fill the buffer from the environment that it was made for"
-            )
-        if not np.array_equal(agents, self._agents):
-            raise ValueError(
-                f"expected rows game-major, then agent, with {AGENT_KEY!r} 0 to {self.n_agents - 1} in each team, got "
-                f"{agents[: 2 * self.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may reorder rows"
-            )
-        by_agent = (self.n_games, self.n_agents)
-        parts = {OBS_KEY: own.reshape(*by_agent, *expected[1:])}
+        own, by_agent = check_rows(obs, self.team_spaces, self._agents), (self.n_games, self.n_agents)
+        parts = {OBS_KEY: own.reshape(*by_agent, *own.shape[1:])}
         if ACTION_MASK_KEY in self.seen:
             parts[ACTION_MASK_KEY] = np.asarray(obs[ACTION_MASK_KEY]).reshape(*by_agent, -1)
         for key in (ACTIVE_KEY, STATE_KEY):
@@ -261,31 +247,17 @@ class TeamReplayBuffer(ReplayBuffer):
                 other |= (self.seen[key][slot] != part).reshape(self.n_games, -1).any(axis=1)
             self.starts[slot] = self.ended[before] | other if starts is None else starts.astype(bool)
             for game in np.flatnonzero((other | self.starts[slot]) & ~self.terminal[before]).tolist():
-                self._put_aside(before, game)
+                if not self._free:  # at most one place per step is in use
+                    n_places = len(self.aside[OBS_KEY])
+                    n_more = max(n_places, self.n_games)
+                    for key, array in self.aside.items():
+                        self.aside[key] = np.concatenate([array, np.zeros((n_more, *array.shape[1:]), array.dtype)])
+                    self._free = list(range(n_places, n_places + n_more))[::-1]
+                place = self.aside_index[before, game] = self._free.pop()
+                for key, array in self.seen.items():
+                    self.aside[key][place] = array[slot, game]
         for key, part in now.items():
             self.seen[key][slot] = part
-
-    def _put_aside(self, slot: int, game: int) -> None:
-        if not self._free:
-            self._grow()
-        place = self._free.pop()
-        self.aside_index[slot, game] = place
-        for key, array in self.seen.items():
-            self.aside[key][place] = array[(slot + 1) % self.n_slots, game]
-
-    def _grow(self) -> None:
-        """Add places to ``aside``; at most one per step is in use."""
-        n_places = len(self.aside[OBS_KEY])
-        n_more = max(n_places, self.n_games)
-        for key, array in self.aside.items():
-            self.aside[key] = np.concatenate([array, np.zeros((n_more, *array.shape[1:]), dtype=array.dtype)])
-        self._free = list(range(n_places, n_places + n_more))[::-1]
-
-    def _release(self, slot: int) -> None:
-        """Free the places in ``aside`` of a step that is overwritten."""
-        places = self.aside_index[slot]
-        self._free += places[places >= 0].tolist()
-        self.aside_index[slot] = _IN_NEXT_SLOT
 
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
@@ -408,22 +380,18 @@ class TeamReplayBuffer(ReplayBuffer):
         steps, games = np.divmod(batch_inds, self.n_games)
         slots = self._slots(steps)
         now = {key: array[slots, games] for key, array in self.seen.items()}
+        after = {key: array[(slots + 1) % self.n_slots, games] for key, array in self.seen.items()}
+        places = self.aside_index[slots, games]
+        if (apart := places >= 0).any():
+            for key, array in after.items():
+                array[apart] = self.aside[key][places[apart]]
         return TeamReplaySamples(
             now=self._team_steps(now),
             actions=self.to_torch(self.actions[slots, games].astype(np.int64)),
-            after=self._team_steps(self._after(slots, games)),
+            after=self._team_steps(after),
             rewards=self.to_torch(self.rewards[slots, games]),
             dones=self.to_torch(self.terminal[slots, games].astype(np.float32)),
         )
-
-    def _after(self, slots: Indices, games: Indices) -> dict[str, Array]:
-        after = {key: array[(slots + 1) % self.n_slots, games] for key, array in self.seen.items()}
-        places = self.aside_index[slots, games]
-        apart = places >= 0
-        if apart.any():
-            for key, array in after.items():
-                array[apart] = self.aside[key][places[apart]]
-        return after
 
     def _team_steps(self, parts: dict[str, Array]) -> TeamSteps:
         tensors = {key: self.to_torch(part, copy=False) for key, part in parts.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, ItemsView
+from collections.abc import Generator, ItemsView, Mapping
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 from weakref import WeakValueDictionary
 
@@ -137,6 +137,31 @@ class TeamMinibatch(dict[str, th.Tensor]):
         """Return all entries including ``"team"``, which SB3's own policies read."""
         self.__missing__(TEAM_KEY)
         return super().items()
+
+
+def check_rows(obs: Mapping[str, Array], team: TeamSpaces, agents: Array) -> Array:
+    """
+    Return the own observations of rows, (B, *shape).
+
+    :param obs: Dict observation of B rows
+    :param team: form of the rows
+    :param agents: (B,) agents of the rows of whole teams in index order
+    :raises ValueError: for rows of another form, or in another order
+    """
+    own, found = np.asarray(obs[OBS_KEY]), np.asarray(obs[AGENT_KEY]).reshape(-1)
+    shape, dtype = (len(agents), *team.own_shape), team.team.dtype
+    if own.shape != shape or not np.can_cast(own.dtype, dtype, "same_kind"):
+        raise ValueError(
+            f"expected {OBS_KEY!r} of shape {shape} and dtype {dtype}, got {own.shape} and {own.dtype}; fill the "
+            "buffer from the environment that it was made for, and change or normalise observations below "
+            "CentralizedValueWrapper"
+        )
+    if not np.array_equal(found, agents):
+        raise ValueError(
+            f"expected rows game-major, then agent, with {AGENT_KEY!r} 0 to {team.n_agents - 1} in each team, got "
+            f"{found[: 2 * team.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may reorder rows"
+        )
+    return own
 
 
 class TeamRolloutBuffer(DictRolloutBuffer):
@@ -282,7 +307,14 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param log_prob: (B,)
         :raises ValueError: if the rows are not whole teams in index order
         """
-        self._check_rows(obs)
+        own, team = check_rows(obs, self.team_spaces, self._agents), np.asarray(obs[TEAM_KEY])
+        # Equality once for each rollout: a wrapper above CentralizedValueWrapper may change one of the two.
+        is_of_rows = team.shape == (self.n_envs, self.n_agents, *self.team_spaces.own_shape)
+        if not is_of_rows or (self.pos == 0 and not np.array_equal(team[:: self.n_agents].reshape(own.shape), own)):
+            raise ValueError(
+                f"expected {TEAM_KEY!r} to hold the {OBS_KEY!r} of the team's own rows, got another one of shape "
+                f"{team.shape}; change or normalise observations below CentralizedValueWrapper only"
+            )
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
                 array[self.pos] = self._of_games(obs, key, array)
@@ -385,33 +417,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         mean = total / playing.sum(axis=1, keepdims=True).clip(min=1)
         return np.where(playing, by_team, mean).astype(values.dtype).reshape(values.shape)
 
-    def _check_rows(self, obs: dict[str, Array]) -> None:
-        own, team, agents = (np.asarray(obs[key]) for key in (OBS_KEY, TEAM_KEY, AGENT_KEY))
-        self._check_shapes(own, team)
-        if not np.array_equal(agents.reshape(-1), self._agents):
-            raise ValueError(
-                f"expected rows game-major, then agent, with {AGENT_KEY!r} 0 to {self.n_agents - 1} in each team, got "
-                f"{agents.reshape(-1)[: 2 * self.n_agents].tolist()} ...; no wrapper above CentralizedValueWrapper may "
-                "reorder rows"
-            )
-        # Once for each rollout: a wrapper above CentralizedValueWrapper may change one of the two.
-        if self.pos == 0 and not np.array_equal(team[:: self.n_agents].reshape(own.shape), own):
-            raise ValueError(
-                f"expected {TEAM_KEY!r} to hold the {OBS_KEY!r} of the team's own rows, but they differ; change or "
-                "normalise observations below CentralizedValueWrapper only"
-            )
-
-    def _check_shapes(self, own: Array, team: Array) -> None:
-        own_shape = (self.n_envs, *self.team_spaces.own_shape)
-        team_shape = (self.n_envs, self.n_agents, *self.team_spaces.own_shape)
-        dtype = self.observations[OBS_KEY].dtype
-        if own.shape != own_shape or team.shape != team_shape or not np.can_cast(own.dtype, dtype, "same_kind"):
-            raise ValueError(
-                f"expected {OBS_KEY!r} of shape {own_shape} and dtype {dtype} and {TEAM_KEY!r} of shape {team_shape}, "
-                f"got {own.shape} and {own.dtype}, and {team.shape}; fill the buffer from the environment that it was "
-                "made for, and change or normalise observations below CentralizedValueWrapper"
-            )
-
     def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:  # type: ignore[override]
         """
         Yield minibatches of the whole rollout, with teams in random order.
@@ -426,7 +431,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         teams_per_batch = self.buffer_size * self.n_games
         if batch_size is not None:
             teams_per_batch = max(1, batch_size // self.n_agents)
-        sequences = self._playing_teams()[:, np.newaxis]
+        # Team steps with at least one active agent, each ``step * E + game``.
+        playing = np.arange(self.buffer_size * self.n_games)
+        if self.active is not None:
+            playing = np.flatnonzero(self.active.any(axis=2))
+        if not len(playing):
+            raise ValueError(
+                f"expected agents that take part, got none in {self.buffer_size} steps of {self.n_games} games; there "
+                f"is nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or collect longer rollouts"
+            )
+        sequences = playing[:, np.newaxis]
         if self.memories is not None:
             stride = self.sequence_length * self.n_games
             firsts = np.unique(sequences // stride * stride + sequences % self.n_games)
@@ -436,18 +450,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         per_batch = max(1, teams_per_batch // sequences.shape[1])
         for start in range(0, len(order), per_batch):
             yield self._get_samples(order[start : start + per_batch].T)
-
-    def _playing_teams(self) -> npt.NDArray[np.int64]:
-        """Return team steps with at least one active agent, each ``step * E + game``."""
-        if self.active is None:
-            return np.arange(self.buffer_size * self.n_games)
-        playing = np.flatnonzero(self.active.any(axis=2))
-        if not len(playing):
-            raise ValueError(
-                f"expected agents that take part, got none in {self.buffer_size} steps of {self.n_games} games; there "
-                f"is nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or collect longer rollouts"
-            )
-        return playing
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None
@@ -467,7 +469,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         }
         own = self._gather(self.observations[OBS_KEY], batch_inds)
         entries = {OBS_KEY: own.flatten(end_dim=1), **self._entries(batch_inds)}
-        active = None if self.active is None else self._of_team_steps(self.active, batch_inds)
+        active = None if self.active is None else self._of_games_at(self.active, batch_inds)
         rows = None
         if active is not None and not active.all():
             rows = th.as_tensor(np.flatnonzero(active), device=self.device)
@@ -495,7 +497,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         rows = th.as_tensor(cut * self.n_games + game, device=self.memories.device)
         return Sequences(starts, self.memories.flatten(0, 1)[rows].to(self.device))
 
-    def _of_team_steps(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
+    def _of_games_at(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
         """Select team steps: (T, E, ...) -> (K, ...)."""
         return array.reshape(self.buffer_size * self.n_games, *array.shape[2:]).take(team_steps, axis=0)
 
@@ -513,6 +515,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             entries[EPISODE_START_KEY] = self._gather(self.starts, team_steps).flatten(end_dim=1).long()
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
-                by_game = self.to_torch(self._of_team_steps(array, team_steps), copy=False)
+                by_game = self.to_torch(self._of_games_at(array, team_steps), copy=False)
                 entries[key] = by_game.repeat_interleave(self.n_agents, dim=0)
         return entries

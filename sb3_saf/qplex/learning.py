@@ -11,13 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch as th
-from torch import nn
 
-from sb3_saf.buffers.replay import Sequences, TeamReplaySamples, TeamSteps
+from sb3_saf.buffers.replay import TeamReplaySamples, TeamSteps
 from sb3_saf.networks.layers import gather
-from sb3_saf.networks.row_encoder import UniqueRows
-from sb3_saf.qplex.heads import q_values
 from sb3_saf.qplex.mixers import JointChoice, Mixed
+from sb3_saf.qplex.parts import q_values
 from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
 
 
@@ -47,85 +45,57 @@ class Features(NamedTuple):
     after: th.Tensor
 
 
-class _Views(NamedTuple):
-    """Unique own observations (K, *shape), with the ``n_now`` before steps first, and each agent's index, (G, N)."""
-
-    views: th.Tensor
-    now: th.Tensor
-    after: th.Tensor
-    n_now: int
-
-    @classmethod
-    def of(cls, policy: QPLEXPolicy, samples: TeamReplaySamples) -> _Views:
-        """Find the unique observations of a batch."""
-        shape = samples.now.own.shape[:2]
-        both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
-        found: UniqueRows = policy.row_encoder.find(both)
-        now, after = found.inverse.view(2, *shape)
-        return cls(both[found.index], now, after, int(now.max()) + 1)
-
-
 def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -> TeamError:
     """
     Compute temporal-difference errors; the gradient goes into the online networks.
+
+    Each unique observation is encoded once per network; those before steps come first.
 
     :param policy: the policy with its online and target networks
     :param samples: joint transitions
     :param gamma: discount per game step
     """
-    views = _Views.of(policy, samples)
-    online, latents = _online(policy, views, samples)
-    agent = _agents(samples.actions)
-    values = _q_values(policy.online, latents.now, agent, samples.now, draw=True)
-    mixed = _mix(policy, policy.online, values, samples.now, online.now, samples.actions)
+    shape = samples.actions.shape
+    both = th.cat([samples.now.own.flatten(0, 1), samples.after.own.flatten(0, 1)])
+    unique = policy.row_encoder.find(both)
+    views, (now, after) = both[unique.index], unique.inverse.view(2, *shape)
+    online, n_now = policy.online, int(now.max()) + 1
+    known = policy.encode_with(online.encoder, views[:n_now])
+    with th.no_grad():  # no gradient for observations that only occur after a step
+        every, new = known.detach(), views[n_now:]
+        if len(new):
+            every = th.cat([every, policy.encode_with(online.encoder, new)])
+    features = Features(gather(known, now), gather(every, after))
+    latents = _recall(online, features, samples)
+    values = _q_values(online, latents.now, samples.now, draw=True)
+    td, weights = _mix(policy, online, values, samples.now, features.now, samples.actions)
     with th.no_grad():
-        best = _q_values(policy.online, latents.after, agent, samples.after).argmax(dim=2)
-        features, remembered = _target(policy, views, samples)
-        following = _q_values(policy.target, remembered.after, agent, samples.after)
+        best = _q_values(online, latents.after, samples.after).argmax(dim=2)
+        features = _target_features(policy, views, now, after)
+        following = _q_values(policy.target, _recall(policy.target, features, samples).after, samples.after)
         value = _mix(policy, policy.target, following, samples.after, features.after, best).q_tot
         target = samples.rewards + gamma * (1.0 - samples.dones) * value
-    return _counted(TeamError(mixed.q_tot - target, mixed.q_tot, mixed.weights), samples.sequences)
-
-
-def _counted(error: TeamError, sequences: Sequences | None) -> TeamError:
-    if sequences is None:
+    error = TeamError(td - target, td, weights)
+    if samples.sequences is None:
         return error
-    td, q_tot, weights = error
-    kept = sequences.counted
-    return TeamError(td[kept], q_tot[kept], None if weights is None else weights[kept])
+    counted = samples.sequences.counted
+    return TeamError(*(None if part is None else part[counted] for part in error))  # type: ignore[arg-type]
 
 
-def _agents(actions: th.Tensor) -> th.Tensor:
-    """Return the agents' indices, (G N,)."""
-    n_steps, n_agents = actions.shape
-    return th.arange(n_agents, device=actions.device).repeat(n_steps)
-
-
-# --- encoding, each unique observation once per network ---------------------------------------------------------------
-
-
-def _online(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
-    """Encode with the online networks; no gradient for observations that only occur after a step."""
-    encoder = policy.online.encoder
-    known = policy.encode_with(encoder, views.views[: views.n_now])
-    with th.no_grad():
-        new = views.views[views.n_now :]
-        every = known.detach() if not len(new) else th.cat([known.detach(), policy.encode_with(encoder, new)])
-    features = Features(gather(known, views.now), gather(every, views.after))
-    return features, _recall(policy.online, features, samples)
-
-
-def _target(policy: QPLEXPolicy, views: _Views, samples: TeamReplaySamples) -> tuple[Features, Features]:
-    """Encode with the target networks; without memory, only the observations after a step."""
+def _target_features(policy: QPLEXPolicy, views: th.Tensor, now: th.Tensor, after: th.Tensor) -> Features:
+    """Encode views with the target networks; without memory, only those after a step."""
     networks = policy.target
     if networks.memory is not None:
-        every = policy.encode_with(networks.encoder, views.views)
-        features = Features(gather(every, views.now), gather(every, views.after))
-        return features, _recall(networks, features, samples)
-    seen, rows = views.after.unique(return_inverse=True)
-    after = gather(policy.encode_with(networks.encoder, views.views[seen]), rows)
-    features = Features(after, after)  # the target's features before the step are unused
-    return features, features
+        every = policy.encode_with(networks.encoder, views)
+        return Features(gather(every, now), gather(every, after))
+    occurring, rows = after.unique(return_inverse=True)
+    features = gather(policy.encode_with(networks.encoder, views[occurring]), rows)
+    return Features(features, features)  # the target's features before the step are unused
+
+
+def _agents(x: th.Tensor) -> th.Tensor:
+    """Return the agents' indices (G N,) for the rows of a tensor (G, N, ...)."""
+    return th.arange(x.shape[1], device=x.device).repeat(len(x))
 
 
 def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples) -> Features:
@@ -162,11 +132,9 @@ def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples)
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-def _q_values(
-    networks: QNetworks, latents: th.Tensor, agent: th.Tensor, steps: TeamSteps, draw: bool = False
-) -> th.Tensor:
+def _q_values(networks: QNetworks, latents: th.Tensor, steps: TeamSteps, draw: bool = False) -> th.Tensor:
     """Compute (G, N, A) values of agents' actions, -inf for illegal ones, from (G, N, H)."""
-    masks = None if steps.masks is None else steps.masks.flatten(0, 1)
+    masks, agent = None if steps.masks is None else steps.masks.flatten(0, 1), _agents(latents)
     return q_values(networks.actor, latents.flatten(0, 1), agent, masks, draw).view(*latents.shape[:2], -1)
 
 
@@ -181,7 +149,13 @@ def _mix(
     """Compute Q_tot of joint actions (G, N) from (G, N, A) values and (G, N, d) features."""
     chosen = values.gather(2, actions.unsqueeze(2)).squeeze(2)
     choice = JointChoice(chosen, values.max(dim=2).values, actions, steps.active)
-    return networks.mixer(_state(policy, networks.state_encoder, steps, features), choice)
+    if networks.state_encoder is not None:
+        assert steps.states is not None
+        return networks.mixer(policy.encode_states(networks.state_encoder, steps.states), choice)
+    features = features.detach() if policy.parts.detach_state else features
+    if steps.active is not None:
+        features = features * steps.active.unsqueeze(2)
+    return networks.mixer(features.flatten(1), choice)
 
 
 def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tensor) -> th.Tensor:
@@ -198,15 +172,3 @@ def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tens
     features = policy.extract_features(obs).view(-1, n_agents, policy.features_dim)
     mixed = _mix(policy, policy.online, of_teams, policy.team_steps(obs), features, of_teams.argmax(dim=2))
     return mixed.q_tot.repeat_interleave(n_agents)
-
-
-def _state(policy: QPLEXPolicy, state_encoder: nn.Module | None, steps: TeamSteps, features: th.Tensor) -> th.Tensor:
-    """Return the mixer's input (G, S): the encoded state of the game, or the features of all agents."""
-    if state_encoder is not None:
-        assert steps.states is not None
-        return policy.encode_states(state_encoder, steps.states)
-    if policy.parts.detach_state:
-        features = features.detach()
-    if steps.active is not None:
-        features = features * steps.active.unsqueeze(2)
-    return features.flatten(1)

@@ -20,9 +20,8 @@ from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy
-from sb3_saf.qplex.heads import AgentMemory, q_values
 from sb3_saf.qplex.mixers import Mixer
-from sb3_saf.qplex.parts import QPLEXParts, QPLEXPoolParts
+from sb3_saf.qplex.parts import AgentMemory, QPLEXParts, QPLEXPoolParts, q_values
 from sb3_saf.teams.rows import STATE_KEY, Array
 
 #: What agents with memory remember: memory (B, M), last action (B,).
@@ -115,6 +114,8 @@ class QPLEXPolicy(TeamRowsPolicy):
         **kwargs: Any,
     ):
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
+        if optimizer_kwargs is None and optimizer_class is th.optim.RMSprop:
+            optimizer_kwargs = {"alpha": 0.99, "eps": 1e-5}
         names = {field.name for field in fields(self.parts_class)}
         if unknown := [name for name in kwargs if name not in names]:
             raise TypeError(f"{type(self).__name__} takes no argument {unknown[0]!r}")
@@ -126,7 +127,7 @@ class QPLEXPolicy(TeamRowsPolicy):
             dict(features_extractor_kwargs or {}),
             normalize_images=normalize_images,
             optimizer_class=optimizer_class,
-            optimizer_kwargs=_optimizer_kwargs(optimizer_class, optimizer_kwargs),
+            optimizer_kwargs=optimizer_kwargs,
         )
         self.net_arch = [128, 128] if net_arch is None else list(net_arch)
         self.activation_fn, self.ortho_init = activation_fn, ortho_init
@@ -264,14 +265,6 @@ class QPLEXPolicy(TeamRowsPolicy):
         own = self._own(obs).unflatten(0, (-1, n_agents))
         states = None if self.state_encoder is None else obs[STATE_KEY][::n_agents]
         return TeamSteps(own, None, None if active is None else active[::n_agents], states)
-
-
-def _optimizer_kwargs(
-    optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any] | None
-) -> dict[str, Any] | None:
-    if kwargs is None and optimizer_class is th.optim.RMSprop:
-        return {"alpha": 0.99, "eps": 1e-5}
-    return kwargs
 
 
 class QPLEXPoolPolicy(QPLEXPolicy):

@@ -26,9 +26,10 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.buffers.replay import TeamReplayBuffer
 from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
-from sb3_saf.qplex.learning import TeamError, team_errors
+from sb3_saf.policies.parts import AlgorithmSpec, Declaration, memory_variants
+from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import MixerName
 from sb3_saf.qplex.policies import QPLEXPolicy, QPLEXPoolPolicy, State
 from sb3_saf.teams.checks import check_count, check_whole_teams
@@ -169,7 +170,11 @@ class QPLEX(OffPolicyAlgorithm):
         spaces_ = TeamSpaces.from_observation_space(self.observation_space)
         self.n_agents = spaces_.n_agents
         self.n_games = check_whole_teams(self.n_envs, self.n_agents, "give an environment of whole teams")
-        self._check_action_space()
+        if not isinstance(self.action_space, spaces.Discrete) or self.action_space.start != 0:
+            raise ValueError(
+                f"QPLEX needs Discrete actions that count from 0, got {self.action_space}; for other actions use PPO "
+                'with "SAFPolicy", "MAPPOPolicy" or "IPPOPolicy"'
+            )
         super()._setup_model()
         if not isinstance(self.policy, QPLEXPolicy):
             raise ValueError(
@@ -201,13 +206,6 @@ class QPLEX(OffPolicyAlgorithm):
             )
         if self._vec_normalize_env is not None:
             raise ValueError("QPLEX does not train on VecNormalize; normalise below CentralizedValueWrapper")
-
-    def _check_action_space(self) -> None:
-        if not isinstance(self.action_space, spaces.Discrete) or self.action_space.start != 0:
-            raise ValueError(
-                f"QPLEX needs Discrete actions that count from 0, got {self.action_space}; for other actions use PPO "
-                'with "SAFPolicy", "MAPPOPolicy" or "IPPOPolicy"'
-            )
 
     def _convert_train_freq(self) -> None:
         """Set rollouts to one step of all games; :meth:`train` decides when updates are due."""
@@ -399,26 +397,20 @@ class QPLEX(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         n_steps = due * (self.update_interval if self.gradient_steps < 0 else self.gradient_steps)
+        parts, buffer = self.policy.parts, self._buffer()
         for _ in range(n_steps):
-            error = team_errors(self.policy, self._sample(batch_size), self.gamma)
+            if parts.memory is None:
+                samples = buffer.sample(batch_size)
+            else:
+                n_sequences = max(1, batch_size // parts.sequence_length)
+                samples = buffer.sample_sequences(n_sequences, parts.sequence_length, parts.burn_in)
+            error = team_errors(self.policy, samples, self.gamma)
             self.policy.optimizer.zero_grad()
             error.loss.backward()
             th.nn.utils.clip_grad_norm_(self.policy.parameter_pairs()[0], self.max_grad_norm)
             self.policy.optimizer.step()
         self._n_updates += n_steps
-        self._log(error)
-
-    def _sample(self, batch_size: int) -> TeamReplaySamples:
-        """Sample a batch; sequences for agents with memory."""
-        parts = self.policy.parts
-        if self.policy.actor_memory is None:
-            return self._buffer().sample(batch_size)
-        n_sequences = max(1, batch_size // parts.sequence_length)
-        return self._buffer().sample_sequences(n_sequences, parts.sequence_length, parts.burn_in)
-
-    def _log(self, error: TeamError) -> None:
-        """Log the last gradient step as means over the batch."""
-        record = self.logger.record
+        record = self.logger.record  # the last gradient step, as means over the batch
         record("train/n_updates", self._n_updates, exclude="tensorboard")
         record("train/loss", error.loss.item())
         record("train/td_error", error.td.abs().mean().item())
@@ -441,3 +433,22 @@ class QPLEX(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
+
+
+def _with_mixer(mixer: MixerName, policy: str = "QPLEXPolicy") -> AlgorithmSpec:
+    return AlgorithmSpec(QPLEX, policy, "qplex", {"mixer": mixer})
+
+
+DECLARATION: Final = Declaration(
+    "QPLEX",
+    {QPLEX: (QPLEXPolicy, QPLEXPoolPolicy)},
+    {
+        "qplex": _with_mixer("qplex"),
+        "qplex-pool": _with_mixer("qplex", "QPLEXPoolPolicy"),
+        "qmix": _with_mixer("qmix"),
+        "vdn": _with_mixer("vdn"),
+        **memory_variants(_with_mixer("vdn"), "vdn"),
+        **memory_variants(_with_mixer("qmix"), "qmix"),
+        **memory_variants(_with_mixer("qplex"), "qplex"),
+    },
+)
