@@ -25,20 +25,22 @@ class TeamCritic(nn.Module, ABC):
     """
     Base of critics that read the observations of the whole team: states of the agents, or one of the team, then values.
 
-    A memory is between the two: values depend on what it returns for the states of successive steps. Subclasses make
-    ``value_head``, whose inputs are the states, or the memory's outputs.
+    If the policy's critic has a memory, it is between the two: values depend on what it returns for the states of
+    successive steps. Subclasses make ``value_head``, with ``head_dim`` inputs.
 
+    :param spec: spec of the policy
     :param n_states: U, states of a team: N, or 1
-    :param memory: the memory of each state; None for none
+    :param state_dim: S, size of a state
     """
 
-    memory: Memory | None
     value_head: OwnValueHead | JointValueHead
 
-    def __init__(self, n_states: int, memory: Memory | None = None):
+    def __init__(self, spec: NetworkSpec, n_states: int, state_dim: int):
         super().__init__()
         self.n_states = n_states
-        self.memory = memory
+        self.memory = None if spec.memory is None else Memory(spec.memory, state_dim, spec.memory_size)
+        #: Size of a state, or of the memory's output.
+        self.head_dim = state_dim if self.memory is None else spec.memory_size
 
     @abstractmethod
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:

@@ -52,10 +52,6 @@ class NetworkSpec(NamedTuple):
     memory: MemoryName | None = None
     memory_size: int = 0
 
-    def critic_memory(self, inputs_dim: int) -> Memory | None:
-        """Make the critic's memory over states of size ``inputs_dim``, if it has one."""
-        return None if self.memory is None else Memory(self.memory, inputs_dim, self.memory_size)
-
 
 class InOrder(NamedTuple):
     """

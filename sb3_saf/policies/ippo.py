@@ -27,8 +27,8 @@ class OwnCritic(TeamCritic):
     """
 
     def __init__(self, spec: NetworkSpec, heads: Heads):
-        super().__init__(spec.n_agents, spec.critic_memory(spec.features_dim))
-        self.value_head = OwnValueHead(spec, spec.memory_size, heads)
+        super().__init__(spec, spec.n_agents, spec.features_dim)
+        self.value_head = OwnValueHead(spec, self.head_dim, heads)
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; (G, N, d)."""

@@ -37,10 +37,8 @@ class JointCritic(TeamCritic):
     """
 
     def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
-        joint_dim = spec.n_agents * spec.features_dim
-        super().__init__(1, spec.critic_memory(joint_dim))
-        head_dim = joint_dim if self.memory is None else spec.memory_size
-        self.value_head = JointValueHead(spec, head_dim, parts.heads, parts.agent_identity)
+        super().__init__(spec, 1, spec.n_agents * spec.features_dim)
+        self.value_head = JointValueHead(spec, self.head_dim, parts.heads, parts.agent_identity)
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; (G, 1, N d), features of inactive agents are read as zeros."""

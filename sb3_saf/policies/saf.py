@@ -52,7 +52,7 @@ class SAFCritic(TeamCritic):
     def __init__(self, spec: NetworkSpec, parts: SAFParts):
         n_states = spec.n_agents if parts.critic_input == "own" else 1
         state_dim = parts.latent_dim * spec.n_agents // n_states
-        super().__init__(n_states, spec.critic_memory(state_dim))
+        super().__init__(spec, n_states, state_dim)
 
         def projection(n_inputs: int) -> nn.Sequential:
             return mlp([n_inputs, *parts.projection_arch, parts.latent_dim], spec.activation_fn)
@@ -61,11 +61,10 @@ class SAFCritic(TeamCritic):
         self.state_net = projection(spec.features_dim)  # g_omega
         self.knowledge_source = KnowledgeSource(spec.n_agents, parts.latent_dim, parts.n_slots)
         self.combine_net = projection(2 * parts.latent_dim)  # g_phi
-        head_dim = state_dim if self.memory is None else spec.memory_size
         if parts.critic_input == "own":
-            self.value_head = OwnValueHead(spec, head_dim, parts.heads)
+            self.value_head = OwnValueHead(spec, self.head_dim, parts.heads)
         else:
-            self.value_head = JointValueHead(spec, head_dim, parts.heads, parts.agent_identity)
+            self.value_head = JointValueHead(spec, self.head_dim, parts.heads, parts.agent_identity)
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; (G, N, d), or (G, 1, N d) with those of inactive agents read as zeros."""
