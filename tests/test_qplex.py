@@ -18,6 +18,7 @@ from sb3_saf import (
     QPLEX,
     Actor,
     ExportError,
+    LightEncoder,
     QPLEXPoolPolicy,
     TeamEvalCallback,
     evaluate_team,

@@ -38,7 +38,7 @@ from sb3_saf.networks.distributions import (
 )
 from sb3_saf.networks.encoders import encoded
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
-from sb3_saf.qplex.heads import AgentMemory
+from sb3_saf.qplex.parts import AgentMemory
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.errors import ExportError
