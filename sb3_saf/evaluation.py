@@ -74,6 +74,12 @@ class EvaluationResult(NamedTuple):
         return float(np.mean(self.successes)) if self.successes else None
 
     @property
+    def scores(self) -> dict[str, float]:
+        """The result by unit: ``won``, the fraction of episodes won, if the games report it, and ``return``."""
+        won = {} if self.success_rate is None else {"won": self.success_rate}
+        return {**won, "return": self.mean}
+
+    @property
     def agent_means(self) -> tuple[float, ...]:
         """(N,) mean return of each agent."""
         return tuple(float(value) for value in np.mean(self.agent_returns, axis=0)) if self.agent_returns else ()

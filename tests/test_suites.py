@@ -36,6 +36,7 @@ from sb3_saf.envs.monitor import SharedReward
 from sb3_saf.networks.encoders import PaperCNN, PartsEncoder, PartsSpace
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam
+from sb3_saf.suites.references import references, standing
 from sb3_saf.suites.registry import find_environment, suites
 from sb3_saf.suites.suite import Suite
 from sb3_saf.training.settings import load_settings, saved_settings
@@ -497,3 +498,31 @@ def test_the_tasks_of_hecogrid_are_a_suite_and_have_short_names() -> None:
 def test_an_unknown_name_lists_the_nearest(name: str, nearest: str) -> None:
     with pytest.raises(ValueError, match=f"unknown .*{name}.*did you mean.* {nearest}"):
         make_team_env(name)
+
+
+def test_a_result_stands_beside_what_is_known_of_its_task() -> None:
+    spread = find_environment("mpe/simple_spread_v3")
+    assert {one.task for one in references(spread)} == {"mpe/simple_spread_v3"}
+    place = standing(spread, {}, {"return": -64.1}, 1_000_000)
+    assert place is not None and place.share == pytest.approx((78.8 - 64.1) / (78.8 - 59.5))
+    for words in ("sum over agents: -64.1", "random -78.8", "MAPPO (continuous actions) -59.5 after 1,000,000", "76%"):
+        assert words in place.text
+    early = standing(spread, {}, {"return": -80.0}, 90_000)
+    assert early is not None and "-73 after 100,000" in early.text and early.text.endswith("below random")
+    # Games of another length, or scores in another unit, are never compared.
+    assert standing(spread, {"max_cycles": 50}, {"return": -64.1}, 1_000_000) is None
+    assert standing(spread, {}, {"won": 0.5}, 1_000_000) is None
+    level = {"coordination": 2, "n_agents": 5, "grid_size": 15, "n_treasures": 25}
+    assert len(references(find_environment("TeamSupport"), level)) == 2
+    assert not references(find_environment("TeamSupport"), level | {"heterogeneity": 2})
+
+
+def test_known_results_of_a_task_are_printed_also_without_its_package(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, words in (
+        ("smax/2s3z", "JaxMARL's MAPPO with memory 100 % won after 10,000,000 game steps: its report"),
+        ("TeamSupport", "random 1.38, coordination 2, n_agents 5"),
+    ):
+        assert main([name]) == 0 and words in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["smax2/2s3z"])
+    assert "smax2/2s3z" in capsys.readouterr().err

@@ -9,7 +9,8 @@ from functools import partial
 from typing import Any, Final
 
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-from sb3_saf.suites.registry import find_environment, suites
+from sb3_saf.suites.references import references
+from sb3_saf.suites.registry import HOME, find_environment, suites
 from sb3_saf.suites.suite import Suite
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.teams.rows import TeamSpaces
@@ -25,13 +26,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :raises SystemExit: with 2 if the command was invalid
     """
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Suites of cooperative games, and the tasks of one.")
-    parser.add_argument("name", nargs="?", help=f"one of {', '.join(suites())}: list all of its tasks")
+    parser.add_argument(
+        "name", nargs="?", help=f"one of {', '.join(suites())}: list all of its tasks; or a task, such as smax/2s3z"
+    )
     name = parser.parse_args(arguments).name
     try:
         if name is None:
             for suite in suites().values():
                 print(summary(suite), end="\n\n")
-            print(f"{PROGRAM} NAME lists all tasks of one")
+            print(f"{PROGRAM} NAME lists all tasks of one, {PROGRAM} SUITE/TASK what is known of a task")
+        elif "/" in name or suites()[HOME].find_task(name):
+            print("\n".join(known(name)))
         elif name not in suites():
             raise unknown_name("suite", name, suites())
         else:
@@ -39,6 +44,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         parser.error(str(error))
     return 0
+
+
+def known(name: str) -> list[str]:
+    """Return agents and spaces of a task, and its references, which are known without the suite's package."""
+    lines = []
+    for one in references(name):
+        params = "".join(f", {key} {value}" for key, value in one.params.items())
+        lines.append(f"  {one}{params}: {one.source}")
+    try:
+        environment = find_environment(name)
+    except ValueError as error:
+        if not lines:
+            raise
+        return [str(error), *lines]
+    if environment.suite is None:
+        raise ValueError(f"{name} belongs to no suite; expected a task of {', '.join(suites())}")
+    return [example(environment.suite, environment.task), *(lines or ["  no result is known"])]
 
 
 def summary(suite: Suite) -> str:

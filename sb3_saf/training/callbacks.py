@@ -18,18 +18,28 @@ from tqdm.rich import tqdm
 
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
 from sb3_saf.callbacks.game_steps import team_steps
+from sb3_saf.evaluation import EvaluationResult
+from sb3_saf.suites.references import Standing, standing
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.vec_env import require_n_agents
+from sb3_saf.training.settings import Settings
 
 
 class SeededEvalCallback(TeamEvalCallback):
-    """Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy."""
+    """
+    Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy.
 
-    def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
+    :param seed: of the run
+    :param settings: of the games of evaluation, to log ``eval/share_of_published``, see ``sb3_saf.suites.references``
+    """
+
+    def __init__(self, *args: Any, seed: int, settings: Settings, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._seed = evaluation_seed(seed)
+        self._settings = settings
+        self.standing: Standing | None = None
         self._n_evaluations = 0
         self._evaluated_at = -1
         #: Seconds of all evaluations of this process.
@@ -43,6 +53,13 @@ class SeededEvalCallback(TeamEvalCallback):
             go_on = super()._evaluate()
         self.seconds += time.perf_counter() - began
         return go_on
+
+    def _log(self, result: EvaluationResult) -> None:
+        settings = self._settings
+        self.standing = standing(settings.environment, settings.env_kwargs, result.scores, self._game_steps())
+        if self.standing is not None and self.standing.share is not None:
+            self.logger.record("eval/share_of_published", self.standing.share)
+        super()._log(result)
 
     def checkpoint_state(self) -> dict[str, int]:
         """Return the counters, for exact resume."""

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.weights import load_weights
 from sb3_saf.inspection.figures import gif
+from sb3_saf.suites.references import standing
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.checks import check_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
@@ -97,6 +98,9 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
                 result = evaluate_team(policy, env, options.episodes, deterministic=options.deterministic)
         print(f"{options.algo} on {options.env}, weights of {path}")
         print(f"team return {result}")
+        known = standing(environment, settings.env_kwargs, result.scores, trained.game_steps)
+        if known is not None:
+            print(known.text)
     return result
 
 

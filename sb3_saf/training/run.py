@@ -237,6 +237,7 @@ class Training:
         return SeededEvalCallback(
             self._games(settings, evaluation=True, n_envs=n_envs),
             seed=self.seed,
+            settings=settings,
             best_model_save_path=folder,
             log_path=folder,
             n_eval_episodes=options.eval_episodes,

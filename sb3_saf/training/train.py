@@ -299,6 +299,8 @@ def _train(options: argparse.Namespace, command: str) -> None:
     if training.evaluation is not None:
         seconds, whole = training.evaluation.seconds, training.clock.cost()["wall_seconds"]
         print(f"Evaluation took {seconds / whole:.0%} of {whole:.0f} s (--eval-freq, --eval-episodes)")
+        if training.evaluation.standing is not None:
+            print(training.evaluation.standing.text)
     print(f"Saved to {folder}")
 
 
