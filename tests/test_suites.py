@@ -489,7 +489,7 @@ def test_the_tasks_of_hecogrid_are_a_suite_and_have_short_names() -> None:
 @pytest.mark.parametrize(
     ("name", "nearest"),
     [
-        ("TeemSupport", "'TeamSupport-v0'"),
+        ("TeemSupport", "'TeamSupport'"),
         ("lfb/Foraging-8x8-2p-3f-v3", "'lbf/Foraging-8x8-2p-3f-v3'"),
         ("simple_spread", "'mpe/simple_spread_v3'"),
         ("hecogrid/TeamSuport", "hecogrid/TeamSupport-v0"),
