@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
 from typing import Any, NamedTuple
 
@@ -57,6 +57,16 @@ class EvaluationResult(NamedTuple):
     lengths: list[int]
     successes: tuple[bool, ...] = ()
     agent_returns: tuple[tuple[float, ...], ...] = ()
+
+    @classmethod
+    def joined(cls, parts: Sequence[EvaluationResult]) -> EvaluationResult:
+        """Return the episodes of several results as one."""
+        return cls(
+            [value for part in parts for value in part.returns],
+            [value for part in parts for value in part.lengths],
+            tuple(value for part in parts for value in part.successes),
+            tuple(value for part in parts for value in part.agent_returns),
+        )
 
     @property
     def mean(self) -> float:

@@ -7,8 +7,9 @@ import shutil
 import tempfile
 import time
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,11 +17,23 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_saf import RandomPolicy, evaluate_team
+from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.experiments.definitions import Level
+from sb3_saf.experiments.definitions import Level, find_method
 from sb3_saf.experiments.grid import Cell, RunConfig
-from sb3_saf.experiments.results import MODEL, LevelResult, Results
+from sb3_saf.experiments.results import (
+    BEST,
+    BEST_MODEL,
+    DRAWN,
+    EVALUATIONS,
+    LAST,
+    MODEL,
+    MOST_LIKELY,
+    LevelResult,
+    Play,
+    Results,
+    write_evaluations,
+)
 from sb3_saf.export.weights import read_weights
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.errors import CheckpointError, NonFiniteError
@@ -39,7 +52,9 @@ from sb3_saf.training.folders import (
 from sb3_saf.training.run import RunOptions, load_parameters, train
 
 #: Checkpoints of a training, from which another worker continues if this one is killed.
-CHECKPOINTS_PER_CELL = 20
+CHECKPOINTS_PER_CELL: Final = 20
+#: Games of a test that are played at once.
+TEST_GAMES: Final = 32
 
 
 @dataclass(frozen=True)
@@ -83,86 +98,94 @@ def run_job(folder: Path) -> None:
     """
     job = Job.read(folder)
     th.set_num_threads(job.threads)
-    cell, result, model = job.cell, folder / "result", None
+    cell, result, models, model = job.cell, folder / "result", folder, None
     (result / "tests").mkdir(parents=True, exist_ok=True)
     if (folder / MODEL).exists():
-        model = _load(job, folder / MODEL)
+        model = _load(job)
     elif cell.is_trained:
-        model = _train(job, result)
+        models, model = result, _train(job, result)
     else:
         write_run(result, **job.config.describe(cell), command="")
         finish_run(result, wall_seconds=0.0, processor_seconds=0.0, threads=job.threads)
     for level in cell.tests:
         path = result / "tests" / f"{level.slug}.json"
         if not path.exists():
-            write_json(path, asdict(play(cell, job.config, level, model)))
+            write_json(path, asdict(play(job, level, model, models)))
     if (result / RUN_FILE).exists():
-        # Only the curve is kept: monitor.csv has hundreds of thousands of lines at the paper's size.
+        # Only the curves are kept: monitor.csv has hundreds of thousands of lines at the paper's size.
         (result / MONITOR).unlink(missing_ok=True)
         finish_run(result)
 
 
 def _train(job: Job, folder: Path) -> BaseAlgorithm:
-    """Train a model in the folder of its run, or load it if it was finished before."""
-    if (folder / FINISHED).exists():
-        shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
-        return _load(job, folder / MODEL)
+    """Train and evaluate a model in the folder of its run, unless that is finished."""
     cell, settings = job.cell, job.config.settings(job.cell)
-    try:
-        CheckpointFolder(folder / CHECKPOINTS).newest()
-    except CheckpointError as error:  # this version cannot read any of them
-        print(f"Beginning anew: {error}")
-        shutil.rmtree(folder / CHECKPOINTS)
-    words = ["python", "-m", "sb3_saf.train", "--algo", cell.method, "--env", cell.env]
-    command = shlex.join([*words, *job.config.words(cell.level), "--seed", str(cell.seed)])
-    write_run(folder, **job.config.describe(cell), command=command)
-    options = RunOptions(
-        checkpoint_freq=max(1, settings.game_steps // CHECKPOINTS_PER_CELL),
-        tensorboard_log=folder / "tb" if job.tensorboard else None,
-        device=job.device,
-    )
-    return train(settings, cell.seed, folder, options)
-
-
-def _load(job: Job, path: Path) -> BaseAlgorithm:
-    """Return the model that was trained before; only numbers are read from its file."""
-    settings = job.config.settings(job.cell)
-    env = settings.make_env(job.cell.seed)
-    model = settings.make_model(env, job.cell.seed, device=job.device)
-    load_parameters(model, path)
-    env.close()
+    if (folder / FINISHED).exists():
+        model = _load(job)
+    else:
+        try:
+            CheckpointFolder(folder / CHECKPOINTS).newest()
+        except CheckpointError as error:  # this version cannot read any of them
+            print(f"Beginning anew: {error}")
+            shutil.rmtree(folder / CHECKPOINTS)
+        words = ["python", "-m", "sb3_saf.train", "--algo", find_method(cell.method).algo, "--env", cell.env]
+        command = shlex.join([*words, *job.config.words(cell), "--seed", str(cell.seed)])
+        write_run(folder, **job.config.describe(cell), command=command)
+        options = RunOptions(
+            eval_freq=job.config.eval_freq,
+            eval_episodes=job.config.eval_episodes,
+            checkpoint_freq=max(1, settings.game_steps // CHECKPOINTS_PER_CELL),
+            tensorboard_log=folder / "tb" if job.tensorboard else None,
+            device=job.device,
+        )
+        model = train(settings, cell.seed, folder, options)
+    shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
+    write_evaluations(folder)
     return model
 
 
-def play(cell: Cell, config: RunConfig, level: Level, model: BaseAlgorithm | None) -> LevelResult:
-    """
-    Test at a level; the games depend on the cell's seed and the level only, so all methods play the same ones.
+def _load(job: Job) -> BaseAlgorithm:
+    """Make the model of a job; its parameters are loaded from files before it plays."""
+    settings = job.config.settings(job.cell)
+    games = settings.make_env(job.cell.seed)
+    model = settings.make_model(games, job.cell.seed, device=job.device)
+    games.close()
+    return model
 
-    :param model: None for a random team
+
+def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> LevelResult:
+    """
+    Test the best and the last policy at a level, with drawn and with most likely actions.
+
+    The games depend on the cell's seed and the level only, so all methods play the same ones; neither training nor its
+    evaluations have them.
+
+    :param model: model of the job, whose parameters are replaced; None for a random team
+    :param models: folder of the trained parameters
     :raises NonFiniteError: if a return is not finite
     """
-    settings = config.settings(cell, level)
-    clock = time.perf_counter()
-    env = settings.make_env(cell.seed, evaluation=True, n_envs=config.episodes)
-    # Sampled actions must not depend on the training or on other tests.
-    set_random_seed(cell.seed)
-    player: Any = RandomPolicy(env.action_space, seed=cell.seed) if model is None else model
-    deterministic = config.deterministic or not settings.spec.draws_actions
-    result = evaluate_team(player, env, config.episodes, deterministic)
+    cell, config, settings = job.cell, job.config, job.config.settings(job.cell, level)
+    env = settings.make_env(cell.seed, evaluation=True, n_envs=min(TEST_GAMES, config.episodes))
+    plays = []
+    player = RandomPolicy(env.action_space, seed=cell.seed) if model is None else model
+    draws = (DRAWN, MOST_LIKELY) if settings.spec.draws_actions else (MOST_LIKELY,)
+    for policy, actions in product((BEST, LAST), draws) if cell.is_trained else [(BEST, DRAWN)]:
+        if model is not None:
+            load_parameters(model, models / (BEST_MODEL if policy == BEST else MODEL))  # only numbers are read
+        clock = time.perf_counter()
+        # Drawn actions must not depend on the training or on other tests.
+        set_random_seed(cell.seed)
+        parts = []
+        for batch, first in enumerate(range(0, config.episodes, TEST_GAMES)):
+            env.seed(evaluation_seed(cell.seed, test=batch))
+            episodes = min(TEST_GAMES, config.episodes - first)
+            parts.append(evaluate_team(player, env, episodes, deterministic=actions == MOST_LIKELY))
+        result = EvaluationResult.joined(parts)
+        if not np.isfinite(result.returns).all():
+            raise NonFiniteError(f"team returns must be finite, got {result.returns} at {level}; repair the game")
+        plays.append(Play.of(policy, actions, result, time.perf_counter() - clock))
     env.close()
-    if not np.isfinite(result.returns).all():
-        raise NonFiniteError(f"team returns must be finite, got {result.returns} at {level}; repair the environment")
-    return LevelResult(
-        level.env_kwargs,
-        settings.n_agents,
-        settings.env_kwargs.get("n_treasures"),
-        evaluation_seed(cell.seed),
-        result.returns,
-        result.lengths,
-        list(result.successes),
-        [list(returns) for returns in result.agent_returns],
-        time.perf_counter() - clock,
-    )
+    return LevelResult(level.env_kwargs, settings.n_agents, settings.env_kwargs.get("n_treasures"), plays)
 
 
 # --- check ------------------------------------------------------------------------------------------------------------
@@ -188,7 +211,7 @@ def check_cell(folder: Path, device: str = "auto") -> Check:
         run, results = Run(folder), Results(folder.resolve().parents[3])
         settings, options, cost = run.description["settings"], run.description["options"], run.finished()
         levels = [Level.of(**read_json(path)["level"]) for path in sorted(folder.glob("tests/*.json"))]
-        cell = Cell(settings["algo"], settings["env"], Level.of(**options["level"]), run.seed, tuple(levels))
+        cell = Cell(options["method"], settings["env"], Level.of(**options["level"]), run.seed, tuple(levels))
         config = results.config()
         if config is None:
             raise ValueError(f"{results.folder} has no settings.json")
@@ -217,17 +240,20 @@ def _compare(cell: Cell, before: Path, after: Path) -> list[tuple[str, str]]:
     compared = []
     for level in cell.tests:
         old, new = (read_json(folder / "tests" / f"{level.slug}.json") for folder in (before, after))
-        new["wall_seconds"] = old.get("wall_seconds")
+        for play_of in (*old["plays"], *new["plays"]):
+            play_of.pop("wall_seconds")
         compared.append((f"returns at {level}", "" if repr(old) == repr(new) else differences(old, new)))
     if not cell.is_trained:
         return compared
-    curves = []
-    for folder in (before, after):
-        path = folder / CURVE
-        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        curves.append([[text for i, text in enumerate(line.split(",")) if i != 1] for line in lines])  # no times
-    compared.append(("learning curve", "" if curves[0] == curves[1] else "differs"))
-    return [*compared, ("weights", _difference_of_weights(before / MODEL, after / MODEL))]
+    for what, name, times in (("learning curve", CURVE, [1]), ("evaluations", EVALUATIONS, [])):
+        curves = []
+        for path in (before / name, after / name):
+            lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+            curves.append([[text for i, text in enumerate(line.split(",")) if i not in times] for line in lines])
+        compared.append((what, "" if curves[0] == curves[1] else "differs"))
+    for what, name in (("best weights", BEST_MODEL), ("weights", MODEL)):
+        compared.append((what, _difference_of_weights(before / name, after / name)))
+    return compared
 
 
 def _difference_of_weights(before: Path, after: Path) -> str:

@@ -33,6 +33,9 @@ from sb3_saf.training.yaml_files import SIZES, Size
 DEFAULT_SIZE: Final[Size] = "small"
 #: Returns of reference teams, which reports draw if the file exists.
 DEFAULT_SCALE: Final = Path("results", "scale.csv")
+#: Episodes of tests, game steps between evaluations, their episodes; the size smoke is for trying commands.
+_PROTOCOL: Final = (RunConfig.episodes, RunConfig.eval_freq, RunConfig.eval_episodes)
+_SMOKE: Final = (16, 200, 2)
 #: Exit code of a process ended by Ctrl-C.
 _INTERRUPTED: Final = 128 + signal.SIGINT
 
@@ -111,8 +114,13 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
     )
     add_key_values(group, "--env-kwargs", help="parameters of the environment, beside the levels")
     add_key_values(group, "-params", "--hyperparams", help="in the place of zoo_configs', for all methods")
-    group.add_argument("--episodes", type=at_least(1), default=32, help="team episodes of each test")
-    group.add_argument("--deterministic", action="store_true", help="test with the most likely actions")
+    group.add_argument("--episodes", type=at_least(1), help="team episodes of each test; by default 512, smoke: 16")
+    group.add_argument(
+        "--eval-freq", type=at_least(1), help="game steps between evaluations during training; by default 20 a run"
+    )
+    group.add_argument(
+        "--eval-episodes", type=at_least(1), help="team episodes of each evaluation; by default 32, smoke: 2"
+    )
 
 
 def _add_machine(parser: argparse.ArgumentParser) -> None:
@@ -219,7 +227,15 @@ def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
             raise ValueError(f"{name} is what the experiment varies; leave it out of --env-kwargs")
     if options.env_kwargs:
         overrides["env_kwargs"] = options.env_kwargs
-    return RunConfig(_size(options), overrides, options.episodes, options.deterministic)
+    size = _size(options)
+    episodes, eval_freq, eval_episodes = _SMOKE if size == "smoke" else _PROTOCOL
+    return RunConfig(
+        size,
+        overrides,
+        options.episodes or episodes,
+        options.eval_freq or eval_freq,
+        options.eval_episodes or eval_episodes,
+    )
 
 
 def _engine(options: argparse.Namespace) -> Engine:

@@ -17,6 +17,68 @@ DEFAULT_SEEDS: Final = (0, 1, 2)
 #: The untrained team that every experiment includes.
 RANDOM: Final = "random"
 
+
+class Method(NamedTuple):
+    """
+    A method of experiments.
+
+    :param algo: algorithm, as in ``sb3_saf.train --algo``
+    :param words: name in tables and figures
+    :param policy_kwargs: arguments of the policy that differ from those of ``zoo_configs``
+    """
+
+    algo: str
+    words: str
+    policy_kwargs: Mapping[str, Any] = {}
+
+
+#: SAF as in the paper: its pool and slots, and a critic for each agent on all agents' s^SAF.
+_PAPER_SAF: Final[dict[str, Any]] = {
+    **{"heads": "per_agent", "critic_input": "team"},
+    **{"n_policies": 4, "n_slots": 4, "latent_dim": 64, "projection_arch": [128, 128]},
+}
+_ACTORS: Final[dict[str, dict[str, Any]]] = {
+    "own": {"n_policies": 1, "heads": "per_agent", "critic_heads": "shared"},
+    "shared": {"n_policies": 1},
+    "pool": {"n_policies": 4},
+}
+_CRITICS: Final[dict[str, dict[str, Any]]] = {
+    "own": {"knowledge_source": False, "critic_input": "own"},
+    "team": {"knowledge_source": False, "critic_input": "team"},
+    "mean": {"knowledge_source": False, "critic_input": "mean"},
+    "source": {"n_slots": 4, "latent_dim": 64, "projection_arch": [128, 128]},
+}
+_ACTOR_WORDS: Final = {"own": "an actor each", "shared": "one actor", "pool": "pool of four"}
+_CRITIC_WORDS: Final = {"own": "own view", "team": "concatenation", "mean": "mean pool", "source": "knowledge source"}
+#: Methods that are more than an algorithm's name, or have another name in words.
+METHODS: Final[dict[str, Method]] = {
+    RANDOM: Method("", "random"),
+    "saf": Method("saf", "SAF"),
+    "saf-paper": Method("saf", "SAF, paper's form", _PAPER_SAF),
+    "saf-no-pool": Method("saf-no-pool", "SAF without pool"),
+    "saf-paper-no-pool": Method("saf", "SAF without pool, paper's form", {**_PAPER_SAF, "n_policies": 1}),
+    "saf-no-ks": Method("saf-no-ks", "SAF without knowledge source"),
+    "mappo": Method("mappo", "MAPPO, paper's text"),
+    "mappo-separate": Method("mappo-separate", "MAPPO, paper's table"),
+    "ippo": Method("ippo", "IPPO, shared"),
+    "ippo-separate": Method("ippo-separate", "IPPO, paper's"),
+    "qplex": Method("qplex", "QPLEX"),
+    "qplex-pool": Method("qplex-pool", "QPLEX with pool"),
+    **{
+        f"actor-{actor}-critic-{critic}": Method(
+            "saf", f"{_ACTOR_WORDS[actor]}, {_CRITIC_WORDS[critic]}", {**_ACTORS[actor], **_CRITICS[critic]}
+        )
+        for actor in _ACTORS
+        for critic in _CRITICS
+    },
+}
+
+
+def find_method(name: str) -> Method:
+    """Return a method by its name; any other name is an algorithm's."""
+    return METHODS.get(name, Method(name, name))
+
+
 #: Abbreviations of parameters in names of levels.
 _SHORT: Final = {"coordination": "c", "heterogeneity": "h", "n_agents": "n"}
 #: Values allowed in a folder's name.
@@ -185,7 +247,7 @@ _FIVE_AGENTS: Final = View(
     COORDINATION, tuple(Level.of(coordination=c, heterogeneity=1, n_agents=5) for c in (1, 2, 3))
 )
 #: SAF without pool: an actor for each agent, as in the paper's ablation, and one actor that all agents share.
-_WITHOUT_POOL: Final = ("saf-no-pool-separate", "saf-no-pool")
+_WITHOUT_POOL: Final = ("saf-paper-no-pool", "saf-no-pool")
 
 _ALL: Final = (
     Experiment("coordination", "how hard is coordination?", _THREE_TASKS, _METHODS, (_BY_COORDINATION,)),

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from sb3_saf.experiments.definitions import RANDOM, Experiment, Level
+from sb3_saf.experiments.definitions import METHODS, RANDOM, Experiment, Level, find_method
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.teams.files import plain
 from sb3_saf.training.commands import option_words
@@ -25,7 +25,7 @@ class Cell:
 
     The name of its folder identifies the training. Experiments in one folder share cells.
 
-    :param method: name of the algorithm, or ``"random"`` for the untrained team
+    :param method: name of the method (``definitions.METHODS``) or algorithm, or ``"random"`` for the untrained team
     :param env: the environment, as in ``sb3_saf.train --env``
     :param level: level of the training
     :param seed: seed of the run
@@ -64,23 +64,36 @@ class RunConfig:
 
     :param size: size of the settings in ``zoo_configs``
     :param overrides: replace settings of ``zoo_configs``, with the same keys: ``{"game_steps": 1000, "n_envs": 8}``
-    :param episodes: team episodes of each test
-    :param deterministic: whether tests take the most likely actions
+    :param episodes: team episodes of each test of a trained model
+    :param eval_freq: game steps between evaluations during training; None for 20 per run
+    :param eval_episodes: team episodes of each evaluation
     """
 
     size: Size
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    episodes: int = 32
-    deterministic: bool = False
+    episodes: int = 512
+    eval_freq: int | None = None
+    eval_episodes: int = 32
 
-    def words(self, level: Level = Level()) -> list[str]:  # noqa: B008 (immutable)
-        """Return the command line options for the settings of a level."""
-        overrides = dict(self.overrides)
+    def words(self, cell: Cell | None = None) -> list[str]:
+        """Return the command line options for the settings, without a cell those of all cells."""
+        overrides = dict(self.overrides) if cell is None else self._overrides(cell, cell.level)
         words = ["--size", self.size]
         if "game_steps" in overrides:
             words += ["--game-steps", str(overrides.pop("game_steps"))]
-        words += option_words("--env-kwargs", {**overrides.pop("env_kwargs", {}), **level.env_kwargs})
-        return words + option_words("--hyperparams", overrides)
+        words += option_words("--env-kwargs", overrides.pop("env_kwargs", {}))
+        words += option_words("--hyperparams", overrides)
+        if self.eval_freq is not None:
+            words += ["--eval-freq", str(self.eval_freq)]
+        return [*words, "--eval-episodes", str(self.eval_episodes)]
+
+    def _overrides(self, cell: Cell, level: Level) -> dict[str, Any]:
+        """Return what replaces settings of ``zoo_configs`` in a cell; a random team needs the environment only."""
+        overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key == "env_kwargs"}
+        overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
+        if of_method := find_method(cell.method).policy_kwargs:
+            overrides["policy_kwargs"] = {**overrides.get("policy_kwargs", {}), **of_method}
+        return overrides
 
     def settings(self, cell: Cell, level: Level | None = None) -> Settings:
         """
@@ -90,11 +103,8 @@ class RunConfig:
         :param level: level of a test; None for the level of the training
         :raises ValueError: for unknown names, levels that cannot be built, and ``normalize``
         """
-        algo = cell.method if cell.is_trained else _ANY_ALGORITHM
-        # A random team needs the environment only.
-        overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key == "env_kwargs"}
-        level = cell.level if level is None else level
-        overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
+        algo = find_method(cell.method).algo if cell.is_trained else _ANY_ALGORITHM
+        overrides = self._overrides(cell, cell.level if level is None else level)
         settings = load_settings(algo, cell.env, self.size, overrides=overrides)
         if settings.as_dict().get("normalize"):
             raise ValueError(
@@ -108,8 +118,8 @@ class RunConfig:
         settings = self.settings(cell).as_dict()
         if not cell.is_trained:
             settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
-        test = {"episodes": self.episodes, "deterministic": self.deterministic}
-        options = {"level": cell.level.env_kwargs, "test": test}
+        evaluation = {"eval_freq": self.eval_freq, "eval_episodes": self.eval_episodes} if cell.is_trained else {}
+        options = {"method": cell.method, "level": cell.level.env_kwargs, "episodes": self.episodes, **evaluation}
         return plain({"settings": settings, "seed": cell.seed, "options": options})
 
 
@@ -152,8 +162,8 @@ class Selection:
 
     def __post_init__(self) -> None:
         for method in self.methods:
-            if method not in ALGOS:
-                raise unknown_name("method", method, ALGOS)
+            if method not in (known := {**METHODS, **ALGOS}):
+                raise unknown_name("method", method, known)
 
     def has(self, cell: Cell, experiment: Experiment) -> bool:
         """Return whether a cell belongs to this part; empty fields select everything. The random team always does."""

@@ -15,7 +15,6 @@ from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.tables import FEWEST_SEEDS, Compared, comparisons, complete, of_view, strata
 from sb3_saf.training.commands import option_words
-from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
 
 #: Maximum number of missing cells to list.
@@ -72,9 +71,7 @@ def _head(content: Content) -> str:
     trained = table[table["method"] != RANDOM]
     methods = list(dict.fromkeys(trained["method"]))
     steps = " or ".join(f"{count:,}" for count in sorted(trained["game_steps"].unique()))
-    actions = "their most likely actions" if config.deterministic else "sampled actions"
-    if not config.deterministic and not all(ALGOS[method].draws_actions for method in methods):
-        actions += " (the best ones of methods that learn values)"
+    actions = " or ".join(f"{actions} actions" for actions in dict.fromkeys(trained["actions"]))
     of_treasures = table["max_return"].notna().all()
     treasures = f", {_numbers(table['max_return'])} treasures" if of_treasures else ""
     meaning = "a team return (treasures collected)" if of_treasures else "a team return (rewards of all agents)"
@@ -299,8 +296,7 @@ def experiment_words(experiment: Experiment) -> list[str]:
 
 def config_words(config: RunConfig) -> list[str]:
     """Return the command line options for a configuration."""
-    episodes = [] if config.episodes == RunConfig.episodes else ["--episodes", str(config.episodes)]
-    return [*config.words(), *episodes, *["--deterministic"] * config.deterministic]
+    return [*config.words(), "--episodes", str(config.episodes)]
 
 
 def _versions(content: Content) -> str:

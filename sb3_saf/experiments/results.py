@@ -4,8 +4,9 @@ Folder of results. A finished cell is one folder of a run (``training/folders.py
     settings.json                    configuration of all cells
     cells/TeamTogether-c2-h1/saf/seed-0/
         run.json                     everything that determines the result; command and software
-        curve.csv  model.zip         returns of the training episodes; the model
-        tests/c2-h1.json             returns of the test episodes
+        curve.csv  evaluations.csv   returns of the training episodes, and of the evaluations during training
+        model.zip  best_model.zip    the last policy, and the best one by the evaluations
+        tests/c2-h1.json             returns of the test episodes of both, with drawn and with most likely actions
         finished.json                cost, and the digests of these files
     unfinished/TeamTogether-c2-h1/saf/seed-1/
         job.json  result/            the job; the folder of its run
@@ -31,48 +32,92 @@ from typing import Any, Final, TypeVar
 
 import filelock
 import msgspec
+import numpy as np
 
 from sb3_saf.evaluation import EvaluationResult
 from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, Level, find_experiment, own_experiment
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection
-from sb3_saf.teams.files import differences, plain, read_json, write_json
+from sb3_saf.teams.files import differences, plain, read_json, write_json, write_text
 from sb3_saf.training.folders import CURVE, RUN_FILE, Run, finish_run
 
 MODEL: Final = "model.zip"
+BEST_MODEL: Final = "best_model.zip"
+EVALUATIONS: Final = "evaluations.csv"
+#: Tested policies, and how they act. Untrained teams have one, the best.
+BEST, LAST, DRAWN, MOST_LIKELY = "best", "last", "drawn", "most likely"
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Play:
+    """
+    Test of a policy: what was measured. Means, intervals and rates are computed from it.
+
+    :param policy: :data:`BEST` or :data:`LAST`
+    :param actions: :data:`DRAWN` or :data:`MOST_LIKELY`
+    :param returns: team return of each episode
+    :param lengths: game steps of each episode
+    :param successes: whether each episode was won; empty if the games do not report it
+    :param agent_means: mean own return of each agent
+    :param wall_seconds: cost
+    """
+
+    policy: str
+    actions: str
+    returns: list[float]
+    lengths: list[int]
+    successes: list[bool]
+    agent_means: list[float]
+    wall_seconds: float
+
+    @classmethod
+    def of(cls, policy: str, actions: str, result: EvaluationResult, wall_seconds: float) -> Play:
+        """Return the test with this result."""
+        measured = result.returns, result.lengths, list(result.successes), list(result.agent_means)
+        return cls(policy, actions, *measured, wall_seconds)
+
+    @property
+    def evaluation(self) -> EvaluationResult:
+        """Mean, interval and success rate."""
+        return EvaluationResult(self.returns, self.lengths, tuple(self.successes))
 
 
 @dataclass(frozen=True)
 class LevelResult:
     """
-    Result of a test: what was measured. Means, intervals and rates are computed from it.
+    Tests at a level.
 
     :param level: parameters of the level
     :param n_agents: N
     :param max_return: the largest possible team return, if known
-    :param evaluation_seed: seed of the games
-    :param returns: team return of each episode
-    :param lengths: game steps of each episode
-    :param successes: whether each episode was won; empty if the games do not report it
-    :param agent_returns: own return of each agent in each episode
-    :param wall_seconds: cost
+    :param plays: tests; the first is the primary one, of the best policy with actions as in training
     """
 
     level: dict[str, Any]
     n_agents: int
     max_return: int | None
-    evaluation_seed: int
-    returns: list[float]
-    lengths: list[int]
-    successes: list[bool]
-    agent_returns: list[list[float]]
-    wall_seconds: float
+    plays: list[Play]
 
     @property
     def evaluation(self) -> EvaluationResult:
-        """Mean, interval and success rate."""
-        own = tuple(tuple(returns) for returns in self.agent_returns)
-        return EvaluationResult(self.returns, self.lengths, tuple(self.successes), own)
+        """Absolute metric: the primary test."""
+        return self.plays[0].evaluation
+
+
+def write_evaluations(folder: Path) -> None:
+    """Replace ``evaluations.npz`` of a run by ``evaluations.csv``: a row for each evaluation, with exact floats."""
+    path = folder / "evaluations.npz"
+    if not path.exists():  # done before
+        return
+    lines = ["game_steps,return_mean,success_rate,length_mean,returns"]
+    with np.load(path, allow_pickle=False) as arrays:
+        steps, returns, lengths = arrays["game_steps"], arrays["results"], arrays["ep_lengths"]
+        won = arrays["successes"].mean(axis=1).tolist() if "successes" in arrays else [""] * len(steps)
+    for step, episodes, rate, length in zip(steps.tolist(), returns.tolist(), won, lengths.mean(axis=1), strict=True):
+        episode_returns = " ".join(f"{value:.12g}" for value in episodes)
+        lines.append(f"{step},{float(np.mean(episodes))!r},{rate},{float(length)!r},{episode_returns}")
+    write_text(folder / EVALUATIONS, "\n".join(lines) + "\n")
+    path.unlink()
 
 
 @dataclass(frozen=True)
@@ -148,7 +193,7 @@ class Results:
             kinds = {"wall_seconds": float, "processor_seconds": float}
             wrong = [name for name, kind in kinds.items() if not isinstance(run.finished().get(name), kind)]
             damage = [f"{run.folder} has no {name}" for name in wrong]
-            files = (RUN_FILE, MODEL, CURVE) if cell.is_trained else (RUN_FILE,)
+            files = (RUN_FILE, MODEL, BEST_MODEL, CURVE, EVALUATIONS) if cell.is_trained else (RUN_FILE,)
             damage += [text for name in files if (text := run.damage(name)) is not None]
             assert damage or run.description
         except ValueError as error:
@@ -170,10 +215,11 @@ class Results:
         result = self._read(path, LevelResult)
         if result is None:
             return None
-        n_episodes = run.description["options"]["test"]["episodes"]
-        if len(result.returns) != n_episodes or not all(map(math.isfinite, result.returns)):
-            self.damaged[path] = f"{path} must have {n_episodes} finite returns, got {result.returns}"
-            return None
+        n_episodes = run.description["options"]["episodes"]
+        for returns in [play.returns for play in result.plays] or [[]]:
+            if len(returns) != n_episodes or not all(map(math.isfinite, returns)):
+                self.damaged[path] = f"{path} must have {n_episodes} finite returns, got {returns}"
+                return None
         return result
 
     def missing_tests(self, cell: Cell) -> tuple[Level, ...]:

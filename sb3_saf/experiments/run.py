@@ -21,7 +21,7 @@ from sb3_saf.experiments.cell import Job
 from sb3_saf.experiments.definitions import Experiment
 from sb3_saf.experiments.engines import Engine
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
-from sb3_saf.experiments.results import MODEL, Results
+from sb3_saf.experiments.results import BEST_MODEL, MODEL, Results
 from sb3_saf.experiments.tables import write_table
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.folders import Run
@@ -222,10 +222,11 @@ class _Progress:
         if not (options.resume and begun) or trained is not None:
             shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("error.txt", MODEL):
+        for name in ("error.txt", MODEL, BEST_MODEL):
             (folder / name).unlink(missing_ok=True)
         if cell.is_trained and trained is not None:
-            shutil.copy(trained.folder / MODEL, folder)
+            for name in (BEST_MODEL, MODEL):
+                shutil.copy(trained.folder / name, folder)
         Job(cell, self._config, options.device, options.threads, options.tensorboard).write(folder)
         return self._engine.submit(folder)
 

@@ -3,26 +3,31 @@ Results as tidy pandas tables, for reports and custom figures.
 
 Tables of tests have one row per cell and test level, and are always computed from the cells:
 
-``method``, ``task``                 name of the algorithm, or ``"random"``; the environment
+``method``, ``task``                 name of the method, or ``"random"``; the environment
 ``train_level``, ``level``           levels of training and test, such as ``"c2-h1"``
 ``train_...``, one column each       parameters of these levels, such as ``train_coordination``, ``coordination``
-``seed``, ``evaluation_seed``        seed of the run; seed of the test games
+``seed``                             of the run
 ``n_agents``, ``max_return``         N; the largest possible team return, if known
-``game_steps``, ``episodes``         game steps of the training, 0 for a random team; episodes of the test
-``return_mean``, ``return_low``,     mean team return with its 95 % interval over episodes (Student's t)
-``return_high``
-``success_rate``                     fraction of episodes won; empty if the games do not report it
+``game_steps``, ``best_game_steps``  of the training, 0 for a random team; until the best policy of the evaluations
+``episodes``, ``actions``            of the test, and whether they are drawn, as in training, or the most likely ones
+``return_mean``, ``return_low``,     absolute metric: mean team return of the best policy, with its 95 % interval over
+``return_high``, ``return_sd``       episodes (Student's t) and their standard deviation
+``return_last``                      the same of the last policy
+``return_most_likely``,              the same of best and last policy with the most likely actions
+``return_last_most_likely``
+``success_rate``, ``length``         fraction of episodes won; empty if the games do not report it; mean game steps
 ``score``                            fraction of the largest return; if that is unknown, of the range of all returns
                                      in the table on this task and level
 ``agent_returns``                    mean own return of every agent, separated by spaces
-``returns``                          team return of every episode, separated by spaces
-``processor_seconds``,               cost of training and test
+``processor_seconds``,               cost of training with its evaluations, and of the tests
 ``wall_seconds_training``, ``wall_seconds_test``
+``commit``, ``processor``            version of this package, and kind of processor
 ``cell``                             folder below ``cells``
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -32,7 +37,7 @@ import pandas as pd
 
 from sb3_saf.experiments.definitions import MODULE, RANDOM, Experiment, Level, View
 from sb3_saf.experiments.grid import Cell, Grid, expand, merge
-from sb3_saf.experiments.results import Results
+from sb3_saf.experiments.results import BEST, EVALUATIONS, LAST, MOST_LIKELY, Results
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.folders import python_command, read_curve
 from sb3_saf.training.statistics import Estimate, mean_over_seeds
@@ -70,7 +75,7 @@ def read_results(folder: str | Path, name: str) -> Frames:
         raise ValueError(
             f"{folder} has no finished cell of {name!r}; run it first: {python_command(MODULE)} run {name} -f {folder}"
         )
-    return Frames(tests.drop(columns=["returns", "cell"]), frame_of_curves(results, cells))
+    return Frames(tests.drop(columns=["cell"]), frame_of_curves(results, cells))
 
 
 def requested(experiment: Experiment, results: Results) -> Grid:
@@ -99,28 +104,43 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
             continue
         evaluation, cost = test.evaluation, run.finished()
         low, high = evaluation.interval()
+        means = {(play.policy, play.actions): play.evaluation.mean for play in test.plays}
+        actions, versions = test.plays[0].actions, run.description["versions"]
         yield {
             **{"method": cell.method, "task": cell.task, "train_level": cell.level.slug, "level": level.slug},
             **{f"train_{name}": value for name, value in cell.level.parameters},
             **level.env_kwargs,
             "n_agents": test.n_agents,
             "max_return": test.max_return,
-            "evaluation_seed": test.evaluation_seed,
             "seed": cell.seed,
             "game_steps": int(run.description["settings"].get("game_steps", 0)),
-            "episodes": len(test.returns),
+            "best_game_steps": best_game_steps(run.folder) if cell.is_trained else 0,
+            "episodes": len(evaluation.returns),
+            "actions": actions,
             "return_mean": evaluation.mean,
             "return_low": low,
             "return_high": high,
-            "success_rate": float("nan") if evaluation.success_rate is None else evaluation.success_rate,
-            "score": float("nan"),
-            "agent_returns": " ".join(f"{value:.12g}" for value in evaluation.agent_means),
-            "returns": " ".join(f"{value:.12g}" for value in test.returns),
+            "return_sd": float(np.std(evaluation.returns, ddof=1)) if len(evaluation.returns) > 1 else math.nan,
+            "return_last": means.get((LAST, actions), evaluation.mean),
+            "return_most_likely": means.get((BEST, MOST_LIKELY), math.nan),
+            "return_last_most_likely": means.get((LAST, MOST_LIKELY), math.nan),
+            "success_rate": math.nan if evaluation.success_rate is None else evaluation.success_rate,
+            "length": float(np.mean(evaluation.lengths)),
+            "score": math.nan,
+            "agent_returns": " ".join(f"{value:.12g}" for value in test.plays[0].agent_means),
             "processor_seconds": cost["processor_seconds"],
             "wall_seconds_training": cost["wall_seconds"],
-            "wall_seconds_test": test.wall_seconds,
+            "wall_seconds_test": sum(play.wall_seconds for play in test.plays),
+            "commit": versions["commit"],
+            "processor": versions.get("processor", ""),
             "cell": cell.id,
         }
+
+
+def best_game_steps(folder: Path) -> int:
+    """Return the game steps of a run's best evaluation, the first of equal ones."""
+    curve = pd.read_csv(folder / EVALUATIONS)
+    return int(curve["game_steps"][curve["return_mean"].idxmax()])
 
 
 def _scores(table: pd.DataFrame) -> pd.Series:

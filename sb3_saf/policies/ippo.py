@@ -35,6 +35,11 @@ class OwnCritic(TeamCritic):
         return gather(features, teams)
 
 
+def own_critic(spec: NetworkSpec, heads: Heads) -> OwnValueHead | TeamCritic:
+    """Make the critic that reads z_i, or its memory."""
+    return OwnValueHead(spec, spec.features_dim, heads) if spec.memory is None else OwnCritic(spec, heads)
+
+
 @dataclass(frozen=True)
 class IPPOParts(TeamParts):
     """
@@ -46,7 +51,7 @@ class IPPOParts(TeamParts):
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic:
         """Make the critic: V_i from z_i."""
-        return OwnValueHead(spec, spec.features_dim, self.heads) if spec.memory is None else OwnCritic(spec, self.heads)
+        return own_critic(spec, self.value_heads)
 
 
 class IPPOPolicy(TeamActorCriticPolicy):

@@ -13,7 +13,7 @@ from typing import ClassVar, Final
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, TeamCritic
+from sb3_saf.networks.critic import Heads, JointValueHead, OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import NetworkSpec, Rows, gather
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
 from sb3_saf.policies.parts import (
@@ -38,7 +38,7 @@ class JointCritic(TeamCritic):
 
     def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
         super().__init__(spec, 1, spec.n_agents * spec.features_dim)
-        self.value_head = JointValueHead(spec, self.head_dim, parts.heads, parts.agent_identity)
+        self.value_head = JointValueHead(spec, self.head_dim, parts.value_heads, parts.agent_identity)
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; (G, 1, N d), features of inactive agents are read as zeros."""
@@ -46,6 +46,27 @@ class JointCritic(TeamCritic):
         if active is not None:
             members = members * active.unsqueeze(2)
         return members.flatten(1).unsqueeze(1)
+
+
+class MeanCritic(TeamCritic):
+    """
+    V_i from an agent's own features and the mean of those of its team, [z_i, 1/N sum_j z_j], for any number of agents.
+
+    :param spec: of the policy
+    :param heads: one head for all agents, or one for each
+    """
+
+    def __init__(self, spec: NetworkSpec, heads: Heads):
+        super().__init__(spec, spec.n_agents, 2 * spec.features_dim)
+        self.value_head = OwnValueHead(spec, self.head_dim, heads)
+
+    def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
+        """See :class:`TeamCritic`; (G, N, 2 d), the mean over active agents only."""
+        members = gather(features, teams)
+        weights = th.ones(members.shape[:2], device=members.device) if active is None else active.to(members.dtype)
+        sums = (members * weights.unsqueeze(2)).sum(dim=1)
+        means = sums / weights.sum(dim=1, keepdim=True).clamp(min=1)
+        return th.cat([members, means.unsqueeze(1).expand_as(members)], dim=2)
 
 
 @dataclass(frozen=True)
@@ -57,25 +78,32 @@ class MAPPOParts(TeamParts):
     :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector
     :param agent_identity: whether a shared critic on joint features reads the agent's index as a one-hot vector;
         without it all agents of a team get the same value
-    :param critic_input: whether the critic reads the observations of the whole ``"team"``, or the ``"state"`` of the
-        game (``make_team_env(..., state=True)``)
+    :param critic_input: whether the critic reads the observations of the whole ``"team"`` (None), the agent's own and
+        their ``"mean"``, or the ``"state"`` of the game (``make_team_env(..., state=True)``)
     """
 
     agent_identity: bool = True
-    critic_input: CriticInput = "team"
-
-    #: Possible inputs of the critic.
-    critic_inputs: ClassVar[tuple[CriticInput, ...]] = ("team", "state")
+    critic_input: CriticInput | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("critic_input", self.critic_input, self.critic_inputs)
+        check_choice("critic_input", self.value_input, self.value_inputs)
+
+    @property
+    def value_input(self) -> CriticInput:
+        """Input of the critic."""
+        return self.critic_input or "team"
+
+    @property
+    def value_inputs(self) -> tuple[CriticInput, ...]:
+        """Possible inputs of the critic."""
+        return "team", "mean", "state"
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
-        """Make the critic: V_i from [z_1, ..., z_N], or from the state."""
-        if self.critic_input == "state":
-            return StateCritic(spec, self.heads, self.agent_identity)
-        return JointCritic(spec, self)
+        """Make the critic: V_i from [z_1, ..., z_N], from z_i and their mean, or from the state."""
+        if self.value_input == "state":
+            return StateCritic(spec, self.value_heads, self.agent_identity)
+        return MeanCritic(spec, self.value_heads) if self.value_input == "mean" else JointCritic(spec, self)
 
 
 class MAPPOPolicy(TeamActorCriticPolicy):

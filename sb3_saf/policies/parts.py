@@ -27,8 +27,8 @@ from sb3_saf.networks.layers import NetworkSpec
 from sb3_saf.networks.memory import MEMORY_NAMES
 from sb3_saf.teams.checks import check_choice, check_flag
 
-#: Input of a critic: the agent's own features, the whole team's, or the state of the game.
-CriticInput = Literal["own", "team", "state"]
+#: Input of a critic: the agent's own features, the whole team's, its own and their mean, or the state of the game.
+CriticInput = Literal["own", "team", "mean", "state"]
 
 #: Policy classes by the algorithms that train them.
 Policies = Mapping[type[BaseAlgorithm], tuple[type[BasePolicy], ...]]
@@ -40,18 +40,26 @@ class TeamParts(ABC):
     Base of all parts: the actor that MAPPO and IPPO share.
 
     :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
+    :param critic_heads: the same for the critic alone; None for ``heads``
     :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector: for teams with roles that
         observations do not show. Off by default, because such a model needs the agent's index to act, and was not
         reliably better if observations distinguish agents (measured in docs/reference/own_environment.md)
     """
 
     heads: Heads = "shared"
+    critic_heads: Heads | None = None
     actor_identity: bool = False
 
     def __post_init__(self) -> None:
         check_choice("heads", self.heads, get_args(Heads))
+        check_choice("critic_heads", self.critic_heads, (*get_args(Heads), None))
         for flag in [one.name for one in fields(self) if isinstance(one.default, bool)]:
             check_flag(flag, getattr(self, flag))
+
+    @property
+    def value_heads(self) -> Heads:
+        """Heads of the critic."""
+        return self.critic_heads or self.heads
 
     def n_identities(self, spec: NetworkSpec) -> int:
         """Return N if a shared actor reads the agent's index, else 0."""

@@ -14,6 +14,7 @@ from sb3_saf.networks.critic import JointValueHead, OwnValueHead, StateCritic, T
 from sb3_saf.networks.knowledge_source import Exchanged, KnowledgeSource
 from sb3_saf.networks.layers import NetworkSpec, Rows, gather, mlp, side_by_side
 from sb3_saf.policies.base import TeamActorCriticPolicy, TeamMaskablePolicy
+from sb3_saf.policies.ippo import own_critic
 from sb3_saf.policies.mappo import MAPPOParts
 from sb3_saf.policies.parts import (
     AlgorithmSpec,
@@ -50,7 +51,7 @@ class SAFCritic(TeamCritic):
     """
 
     def __init__(self, spec: NetworkSpec, parts: SAFParts):
-        n_states = spec.n_agents if parts.critic_input == "own" else 1
+        n_states = spec.n_agents if parts.value_input == "own" else 1
         state_dim = parts.latent_dim * spec.n_agents // n_states
         super().__init__(spec, n_states, state_dim)
 
@@ -61,10 +62,10 @@ class SAFCritic(TeamCritic):
         self.state_net = projection(spec.features_dim)  # g_omega
         self.knowledge_source = KnowledgeSource(spec.n_agents, parts.latent_dim, parts.n_slots)
         self.combine_net = projection(2 * parts.latent_dim)  # g_phi
-        if parts.critic_input == "own":
-            self.value_head = OwnValueHead(spec, self.head_dim, parts.heads)
+        if parts.value_input == "own":
+            self.value_head = OwnValueHead(spec, self.head_dim, parts.value_heads)
         else:
-            self.value_head = JointValueHead(spec, self.head_dim, parts.heads, parts.agent_identity)
+            self.value_head = JointValueHead(spec, self.head_dim, parts.value_heads, parts.agent_identity)
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; (G, N, d), or (G, 1, N d) with those of inactive agents read as zeros."""
@@ -102,8 +103,9 @@ class SAFParts(MAPPOParts):
     :param n_policies: U, size of the pool; 1 is the ablation without pool
     :param selection: ``"mixture"`` (exact likelihood) or ``"gumbel"`` (one policy, drawn at every evaluation)
     :param knowledge_source: False is the ablation without knowledge source: MAPPO's critic
-    :param critic_input: whether the critic reads the agent's ``"own"`` s^SAF or those of the whole ``"team"``; without
-        knowledge source it is MAPPO's, on the team. SAF's critic does not support the ``"state"`` of the game: all its
+    :param critic_input: whether the critic reads the agent's ``"own"`` s^SAF (None) or those of the whole ``"team"``.
+        Without knowledge source it reads observations: the ``"team"``'s (None), the agent's own and their ``"mean"``,
+        as MAPPO's, or its ``"own"``, as IPPO's. SAF's critic does not support the ``"state"`` of the game: all its
         information comes through the knowledge source
     :param n_slots: L, slots of the knowledge source
     :param latent_dim: d, size of messages, states, slots, queries and signature keys
@@ -113,12 +115,9 @@ class SAFParts(MAPPOParts):
     n_policies: int = 4
     selection: Selection = "mixture"
     knowledge_source: bool = True
-    critic_input: CriticInput = "own"
     n_slots: int = 4
     latent_dim: int = 64
     projection_arch: tuple[int, ...] = (128, 128)
-
-    critic_inputs: ClassVar[tuple[CriticInput, ...]] = ("own", "team")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,6 +126,16 @@ class SAFParts(MAPPOParts):
             check_count(name, getattr(self, name))
         # Saved models may have a list.
         object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
+
+    @property
+    def value_input(self) -> CriticInput:
+        """See :class:`MAPPOParts`."""
+        return self.critic_input or ("own" if self.knowledge_source else "team")
+
+    @property
+    def value_inputs(self) -> tuple[CriticInput, ...]:
+        """See :class:`MAPPOParts`."""
+        return ("own", "team") if self.knowledge_source else ("own", "team", "mean")
 
     def actor(self, spec: NetworkSpec) -> ActorNetwork:
         """Make the policy pool, or MAPPO's actor for a single policy."""
@@ -146,8 +155,10 @@ class SAFParts(MAPPOParts):
         )
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
-        """Make the critic: V_i from s_i^SAF."""
-        return SAFCritic(spec, self) if self.knowledge_source else super().critic(spec)
+        """Make the critic: V_i from s_i^SAF, or without knowledge source MAPPO's or IPPO's."""
+        if self.knowledge_source:
+            return SAFCritic(spec, self)
+        return own_critic(spec, self.value_heads) if self.value_input == "own" else super().critic(spec)
 
 
 class SAFPolicy(TeamActorCriticPolicy):

@@ -13,7 +13,8 @@ import numpy as np
 #: Largest seed of a run: the limit of NumPy's global generator, which SB3 seeds.
 MAX_SEED: Final = 2**32 - 1
 
-_EVALUATION: Final = 1
+#: Branches in the tree of a run's seeds: games of evaluations during training, and of the tests after it.
+_EVALUATION, _TEST = 1, 2
 
 
 def check_seed(seed: object) -> int:
@@ -23,13 +24,17 @@ def check_seed(seed: object) -> int:
     return int(seed)
 
 
-def evaluation_seed(seed: int) -> int:
+def evaluation_seed(seed: int, test: int | None = None) -> int:
     """
     Return the seed from which the seeds of a run's evaluation games are derived, from 2**62 to 2**63 - 1.
 
     It is a separate branch in the run's tree of seeds, with the top bit of 63 set, which no run can have as its seed.
+
+    :param seed: the run's seed
+    :param test: number of a batch of test games, which no evaluation during training has; None for the latter
     """
-    word = np.random.SeedSequence(check_seed(seed), spawn_key=(_EVALUATION,)).generate_state(1, np.uint64)[0]
+    branch = (_EVALUATION,) if test is None else (_TEST, test)
+    word = np.random.SeedSequence(check_seed(seed), spawn_key=branch).generate_state(1, np.uint64)[0]
     return (int(word) >> 2) | (1 << 62)
 
 

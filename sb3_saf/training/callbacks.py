@@ -29,7 +29,9 @@ from sb3_saf.training.settings import Settings
 
 class SeededEvalCallback(TeamEvalCallback):
     """
-    Evaluate with a separate seed, so that training is unchanged; also evaluates the final policy.
+    Evaluate with a separate seed, so that training is unchanged.
+
+    The last evaluation is of the final policy: at the last game step it waits for the update that follows.
 
     :param seed: of the run
     :param settings: of the games of evaluation, to log ``eval/share_of_published``, see ``sb3_saf.suites.references``
@@ -44,6 +46,9 @@ class SeededEvalCallback(TeamEvalCallback):
         self._evaluated_at = -1
         #: Seconds of all evaluations of this process.
         self.seconds = 0.0
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps >= self.locals["total_timesteps"] or super()._on_step()
 
     def _evaluate(self) -> bool:
         began = time.perf_counter()

@@ -108,8 +108,12 @@ def _files(folder: Path) -> Iterator[str]:
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of Python, the system, installed packages that can change a result, commit, and host."""
+    """Return the versions of Python, the system, installed packages that can change a result, commit, and computer."""
     versions = {"python": platform.python_version(), "system": platform.platform()}
+    versions["processor"] = platform.processor() or platform.machine()
+    with suppress(OSError):
+        names = re.findall(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), flags=re.MULTILINE)
+        versions["processor"] = next(iter(names), versions["processor"])
     for package in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
