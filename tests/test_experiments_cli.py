@@ -44,7 +44,7 @@ def test_plan_lists_cells_and_totals(capsys: pytest.CaptureFixture[str], tmp_pat
         f"            TeamTogether, c=2, h=1, {tested}: saf mappo ippo, seeds 0 1 2",
         f"            TeamSupport, c=2, h=1, {tested}: saf mappo ippo, seeds 0 1 2",
         "cells       18 to train (3 methods x 2 settings x 3 seeds), 0 of them finished",
-        "tests       72 to play, of 32 team episodes each, random teams included",
+        "tests       72 to play, of 512 team episodes each, random teams included",
         "game steps  180,000,000 left of 180,000,000 (10,000,000 a cell)",
     ]
     assert not (tmp_path / "new").exists()
@@ -56,7 +56,7 @@ def test_plan_lists_cells_and_totals(capsys: pytest.CaptureFixture[str], tmp_pat
 def test_plan_counts_what_is_finished_and_names_what_is_left_out(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    config = RunConfig("smoke", {"env_kwargs": {"n_agents": 3}})
+    config = RunConfig("smoke", {"env_kwargs": {"n_agents": 3}}, 16, 200, 2)
     run(find_experiment("joint"), Selection((0,), ("ippo",)), config, Results(tmp_path), InlineEngine())
     capsys.readouterr()
     words = ["plan", "joint", "-f", str(tmp_path), "--env-kwargs", "n_agents:3", "--methods", "ippo", "--seeds", "0"]

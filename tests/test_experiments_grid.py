@@ -68,7 +68,7 @@ def test_levels_of_the_paper() -> None:
 def test_ablations_have_the_papers_form_beside_the_shared_one(name: str) -> None:
     """The paper's SAF without pool has an actor for each agent."""
     methods = {cell.method for cell in trained(grid_of(name))}
-    assert {"saf", "saf-no-pool", "saf-no-pool-separate"} <= methods
+    assert {"saf", "saf-no-pool", "saf-paper-no-pool"} <= methods
 
 
 def test_paper_size_is_the_papers() -> None:
@@ -77,7 +77,7 @@ def test_paper_size_is_the_papers() -> None:
         assert settings.game_steps == 10_000_000
         assert settings.n_agents == 10
         assert {name: settings.env_kwargs[name] for name in cell.level.env_kwargs} == cell.level.env_kwargs
-    assert PAPER.episodes == 32
+    assert (PAPER.episodes, PAPER.eval_freq, PAPER.eval_episodes) == (512, None, 32)
     (cell, *_) = grid_of("qplex").cells
     assert PAPER.settings(cell).n_agents == 5
     assert cell.id == "TeamTogether-c1-h1-n5/qplex/seed-0"

@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Create a finished run of two tasks and two methods."""
     path = tmp_path_factory.mktemp("coordination")
     selection = Selection((0, 1), ("saf", "ippo"), tuple(f"{task}-v0" for task in TASKS))
-    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80})
+    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80}, 16, 40, 2)
     assert run(find_experiment("coordination"), selection, config, Results(path), InlineEngine()).finished == N_CELLS
     return path
 
@@ -70,9 +70,10 @@ def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> N
     assert all(f"({name})" in page for name in names)
     assert "Size `smoke`: 4 agents, 6 treasures, 80 game steps of training. saf, ippo and a random team" in page
     again = (
-        "run coordination --size smoke --game-steps 80 --hyperparams n_epochs:1 --seeds 0 1 --methods saf ippo --tasks"
+        "run coordination --size smoke --game-steps 80 --hyperparams n_epochs:1 --eval-freq 40 --eval-episodes 2 "
+        "--episodes 16 --seeds 0 1 --methods saf ippo --tasks TeamTogether TeamSupport"
     )
-    assert f"python -m sb3_saf.experiments {again} TeamTogether TeamSupport -f {folder}" in page
+    assert f"python -m sb3_saf.experiments {again} -f {folder}" in page
     assert page.count("python -m sb3_saf.train --algo ") == 2 * len(LEVELS) * 2
 
 
@@ -275,7 +276,7 @@ def test_another_experiment_runs_and_reports(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     name, results = "ood-ablation", Path("runs", "experiments", "smoke")
     selection = Selection((0,), ("ippo",), ("TeamSupport-v0",))
-    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80})
+    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80}, 16, 40, 2)
     run(find_experiment(name), selection, config, Results(results), InlineEngine())
     assert cli.main(["report", name, "--size", "smoke"]) == 0
     page = (results / name / "report.md").read_text(encoding="utf-8")
@@ -294,7 +295,7 @@ def test_an_environment_of_ones_own(
     monkeypatch.chdir(tmp_path)
     env, name = "tests.toy_envs:CounterEnv", "tests.toy_envs-CounterEnv"
     folder = Path("runs", "experiments", name)
-    config = RunConfig("smoke", {"game_steps": 24, "n_envs": 2, "n_steps": 3, "n_minibatches": 1}, 2)
+    config = RunConfig("smoke", {"game_steps": 24, "n_envs": 2, "n_steps": 3, "n_minibatches": 1}, 2, 12, 2)
     experiment = own_experiment(name, [env], {"max_cycles": [3, 5]})
     run(experiment, Selection((0,), ("mappo", "ippo")), config, Results(folder), InlineEngine())
     assert cli.main(["report", env]) == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import subprocess
 import sys
@@ -27,17 +26,18 @@ from sb3_saf.experiments.definitions import Level, find_experiment
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
-from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import differences, read_json, write_json
+from sb3_saf.teams.vec_env import game_seeds_of
 from sb3_saf.training.folders import finish_run
 from sb3_saf.training.train import main as train_main
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 
-SMOKE = RunConfig("smoke")
+SMOKE = RunConfig("smoke", episodes=32, eval_freq=200, eval_episodes=2)
 #: Two methods that train fast, and a random team, at two levels of ``joint``.
 TWO = Selection((0, 1), ("ippo", "mappo"), (), ("2", "3"))
 N_CELLS = 2 * 2 * 2 + 2 * 2
 ONE = Selection((0,), ("ippo",), (), ("2",))
+CELL = "TeamSupport-c2-h2/mappo/seed-1"
 
 
 def run_inline(
@@ -74,27 +74,37 @@ def test_the_table_has_a_row_for_each_cell_and_level(undisturbed: Path) -> None:
     keys = {(row["method"], row["coordination"], row["heterogeneity"], row["seed"]) for row in table}
     assert keys == {(m, c, c, s) for m in ("ippo", "mappo", "random") for c in "23" for s in "01"}
     for row in table:
-        returns = [float(value) for value in row["returns"].split(" ")]
-        assert len(returns) == int(row["episodes"]) == 32
-        assert float(row["return_mean"]) == pytest.approx(sum(returns) / 32)
+        test = read_json(undisturbed / "cells" / row["cell"] / "tests" / f"{row['level']}.json")
+        plays = {(play["policy"], play["actions"]): play["returns"] for play in test["plays"]}
+        assert {len(returns) for returns in plays.values()} == {int(row["episodes"])} == {32}
+        assert float(row["return_mean"]) == pytest.approx(np.mean(plays["best", "drawn"]))
+        assert float(row["return_sd"]) == pytest.approx(np.std(plays["best", "drawn"], ddof=1))
+        if row["method"] != "random":
+            assert float(row["return_last"]) == pytest.approx(np.mean(plays["last", "drawn"]))
+            assert float(row["return_most_likely"]) == pytest.approx(np.mean(plays["best", "most likely"]))
+            assert float(row["return_last_most_likely"]) == pytest.approx(np.mean(plays["last", "most likely"]))
         own = [float(value) for value in row["agent_returns"].split(" ")]
         assert len(own) == 4 and sum(own) == pytest.approx(float(row["return_mean"]))
         assert float(row["return_low"]) <= float(row["return_mean"]) <= float(row["return_high"])
         assert float(row["score"]) == pytest.approx(float(row["return_mean"]) / 6)
         assert row["game_steps"] == ("0" if row["method"] == "random" else "400")
-        assert int(row["evaluation_seed"]) == evaluation_seed(int(row["seed"]))
-    at_two = {(row["method"], row["seed"]): row["returns"] for row in table if row["coordination"] == "2"}
+    at_two = {
+        (row["method"], row["seed"]): (row["return_mean"], row["return_sd"]) for row in table if row["level"] == "c2-h2"
+    }
     assert len(set(at_two.values())) == len(at_two)  # seeds and methods differ
 
 
 def test_a_cell_has_everything_to_be_understood_and_trained_again(undisturbed: Path) -> None:
     folder = cell_of(undisturbed)
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    assert names == {"run.json", "curve.csv", "model.zip", "tests/c2-h2.json", "finished.json"}
+    models = {"model.zip", "best_model.zip"}
+    assert names == {"run.json", "curve.csv", "evaluations.csv", *models, "tests/c2-h2.json", "finished.json"}
     description, finished = read_json(folder / "run.json"), read_json(folder / "finished.json")
     settings = description["settings"]
     assert (settings["algo"], settings["game_steps"], settings["env_kwargs"]["coordination"]) == ("mappo", 400, 2)
-    assert (description["seed"], description["options"]["test"]) == (1, {"episodes": 32, "deterministic": False})
+    protocol = {"episodes": 32, "eval_freq": 200, "eval_episodes": 2}
+    assert description["seed"] == 1
+    assert description["options"] == {"method": "mappo", "level": {"coordination": 2, "heterogeneity": 2}, **protocol}
     assert description["versions"]["torch"] == th.__version__ and description["versions"]["commit"]
     assert finished["processor_seconds"] > 0 and finished["wall_seconds"] > 0
     assert set(finished["files"]) == names - {"finished.json"}
@@ -118,6 +128,38 @@ def assert_same_weights(first: Path, second: Path) -> None:
     theirs, ours = (PPO.load(path).policy.state_dict() for path in (first, second))
     assert list(theirs) == list(ours)
     assert all(th.equal(theirs[name], ours[name]) for name in ours)
+
+
+def test_evaluations_do_not_change_the_training(undisturbed: Path, tmp_path: Path) -> None:
+    """With others, or fewer: the same last policy, bit for bit, and the same learning curve."""
+    run_inline(tmp_path, replace(TWO, seeds=(1,), methods=("mappo",)), config=replace(SMOKE, eval_freq=40))
+    for folder, steps in ((undisturbed, [200, 400]), (tmp_path, [40 * n for n in range(1, 11)])):
+        evaluations = read_table(cell_of(folder) / "evaluations.csv")
+        assert [int(row["game_steps"]) for row in evaluations] == steps
+        best = max(evaluations, key=lambda row: float(row["return_mean"]))
+        (table_row,) = (row for row in read_table(folder / "joint" / "table.csv") if row["cell"] == CELL)
+        assert table_row["best_game_steps"] == best["game_steps"]
+    assert_same_weights(cell_of(undisturbed) / "model.zip", cell_of(tmp_path) / "model.zip")
+
+
+def test_training_evaluations_and_tests_have_games_of_their_own(tmp_path: Path, monkeypatch: Any) -> None:
+    """No game of a run has the seed of another kind; every method is tested on the same games."""
+    seeds: dict[str, list[set[Any]]] = {"reset": []}
+    reset = TeamMonitor.reset
+
+    def noted(self: TeamMonitor) -> Any:
+        seeds["reset"].append(set(game_seeds_of(self) or ()))
+        return reset(self)
+
+    monkeypatch.setattr(TeamMonitor, "reset", noted)
+    config = replace(SMOKE, episodes=40)
+    run_job(job_in(tmp_path / "cell", config=config))
+    training, evaluation, *tests = seeds["reset"][0], seeds["reset"][1], *seeds["reset"][3:]
+    assert not training & evaluation and not (training | evaluation) & set().union(*tests)
+    assert [len(games) for games in tests] == [32, 32] * 4 and tests[0] != tests[1] and tests[:2] == tests[2:4]
+    seeds["reset"].clear()
+    run_job(job_in(tmp_path / "other", "mappo", config=config))
+    assert seeds["reset"][3:] == tests
 
 
 def test_finished_cells_are_never_run_again(undisturbed: Path) -> None:
@@ -310,9 +352,15 @@ def write(content: str) -> Callable[[Path], object]:
 
 
 def relisted(path: Path) -> None:
-    """Replace returns by NaN, also in the list of files: as if the games had paid it."""
-    edited(returns=[float("nan")] * 32)(path)
+    """Replace a return by NaN, also in the list of files: as if the games had paid it."""
+    edited(plays=with_last_return(path, float("nan")))(path)
     finish_run(path.parents[1])
+
+
+def with_last_return(path: Path, value: float) -> list[dict[str, Any]]:
+    """Return the tests of a file with another last return."""
+    *others, last = read_json(path)["plays"]
+    return [*others, {**last, "returns": [*last["returns"][:-1], value]}]
 
 
 DAMAGE: dict[str, Any] = {
@@ -320,6 +368,8 @@ DAMAGE: dict[str, Any] = {
     "model.zip missing": ("model.zip", Path.unlink),
     "curve.csv cut": ("curve.csv", cut),
     "curve.csv missing": ("curve.csv", Path.unlink),
+    "best_model.zip missing": ("best_model.zip", Path.unlink),
+    "evaluations.csv cut": ("evaluations.csv", cut),
     "run.json edited": ("run.json", edited(seed=5)),
     "run.json missing": ("run.json", Path.unlink),
     "finished.json empty": ("finished.json", write("")),
@@ -327,8 +377,7 @@ DAMAGE: dict[str, Any] = {
     "finished.json nested": ("finished.json", write("[" * 100_000)),
     "finished.json missing": ("finished.json", Path.unlink),
     "mean edited": ("tests/c2-h2.json", edited(return_mean=99.0)),
-    "return edited": ("tests/c2-h2.json", edited(returns=[99.0] * 32)),
-    "returns missing": ("tests/c2-h2.json", edited(returns=[1.0] * 3)),
+    "returns missing": ("tests/c2-h2.json", edited(plays=[])),
     "returns not finite": ("tests/c2-h2.json", relisted),
     "no JSON": ("tests/c2-h2.json", write("\x00")),
     "test missing": ("tests/c2-h2.json", Path.unlink),
@@ -423,26 +472,33 @@ def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(method: str, tmp_pat
     short = replace(SMOKE, overrides={"game_steps": 200})
     whole, killed = (job_in(tmp_path / name, method, tests=2, config=short) for name in ("whole", "killed"))
     n_steps = attempt(whole)
-    n_tested = 2 * 10  # two tests, episodes of 10 steps
+    n_tests = 2 if method == "qplex" else 4  # best and last policy, drawn and most likely actions
+    n_tested = 2 * n_tests * 10  # at two levels, episodes of 10 steps
     first = attempt(killed, (n_steps - n_tested) * 2 // 3)
-    second = attempt(killed, (n_steps - n_tested) // 3 + 15)  # in a test: the trained model is kept
+    second = attempt(killed, (n_steps - n_tested) // 3 + 10 * n_tests + 5)  # at the second level: the first is kept
     rest = attempt(killed)
-    assert rest == n_tested // 2  # the first test is kept
+    assert rest == n_tested // 2
     assert first + second < n_steps + (n_steps - n_tested) / 2
     assert what_counts(whole / "result") == what_counts(killed / "result")
 
 
 def what_counts(cell_folder: Path) -> dict[str, Any]:
     """Return everything in a cell's folder except times."""
-    tests = {path.name: json.loads(path.read_text())["returns"] for path in (cell_folder / "tests").iterdir()}
+    tests = {path.name: untimed(path) for path in (cell_folder / "tests").iterdir()}
     files = sorted(str(path.relative_to(cell_folder)) for path in cell_folder.rglob("*") if path.is_file())
-    with zipfile.ZipFile(cell_folder / "model.zip") as model:
-        weights = model.read("policy.pth")
+    weights = [zipfile.ZipFile(cell_folder / name).read("policy.pth") for name in ("model.zip", "best_model.zip")]
     points = np.genfromtxt(cell_folder / "curve.csv", delimiter=",", names=True)
     assert (np.diff(points["processor_seconds"]) >= 0).all()
     curve = [points[name].tolist() for name in ("game_steps", "score", "episodes")]
     description = (cell_folder / "run.json").read_text()
-    return {"tests": tests, "files": files, "weights": weights, "run": description, "curve": curve}
+    evaluations = (cell_folder / "evaluations.csv").read_text()
+    return {**{"tests": tests, "files": files, "weights": weights}, "run": description, "curve": [curve, evaluations]}
+
+
+def untimed(path: Path) -> Any:
+    """Return the content of a test's file without its times."""
+    content = read_json(path)
+    return {**content, "plays": [{**play, "wall_seconds": 0} for play in content["plays"]]}
 
 
 def test_a_cell_killed_after_its_model_was_saved_does_not_train_anew(tmp_path: Path) -> None:
@@ -508,7 +564,8 @@ def test_a_cell_can_be_checked(
     with_weights(cell / "model.zip", change)
     assert cli.main(["check", str(cell)]) == bool(words)
     printed = capsys.readouterr().out
-    assert f"equal, bit for bit: returns at c=2, h=2, learning curve{'' if words else ', weights'}\n" in printed
+    equal = "returns at c=2, h=2, learning curve, evaluations, best weights"
+    assert f"equal, bit for bit: {equal}{'' if words else ', weights'}\n" in printed
     assert words in printed.partition("different: weights: ")[2]
 
 
@@ -516,11 +573,11 @@ def test_a_check_sees_edited_numbers(undisturbed: Path, tmp_path: Path, capsys: 
     folder = shutil.copytree(undisturbed, tmp_path / "copy")
     cell = cell_of(folder)
     test = cell / "tests" / "c2-h2.json"
-    edited(returns=[*read_json(test)["returns"][:-1], 99.0], return_mean=99.0)(test)
+    edited(plays=with_last_return(test, 99.0), return_mean=99.0)(test)
     with pytest.raises(SystemExit, match="2"):
         cli.main(["check", str(folder)])
     assert "expected RESULTS/cells/TASK-LEVEL/METHOD/seed-N" in capsys.readouterr().err
     assert cli.main(["check", str(cell)]) == 1
     printed = capsys.readouterr().out
-    assert "equal, bit for bit: learning curve, weights\n" in printed
+    assert "equal, bit for bit: learning curve, evaluations, best weights, weights\n" in printed
     assert "c2-h2.json has changed" in printed and "return_mean was 99.0, now None" in printed
