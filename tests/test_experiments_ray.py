@@ -30,7 +30,7 @@ from tests.test_experiments_run import assert_same_weights
 from tests.test_training_commands import failed
 
 CHOICE = Selection((0,), ("ippo",))
-SMOKE = RunConfig("smoke")
+SMOKE = RunConfig("smoke", episodes=32, eval_freq=200, eval_episodes=2)
 #: By default, Ray waits about 15 s before it considers a silent node dead.
 IMPATIENT = {
     "health_check_initial_delay_ms": 0,
@@ -175,7 +175,9 @@ def test_a_job_fails_on_ray(cluster: Any, tmp_path: Path) -> None:
 def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any, tmp_path: Path) -> None:
     experiment = find_experiment("joint")
     (level, *_) = experiment.tests()
-    job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 2_000}))
+    job = Job(
+        Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 2_000}, 32, 1_000, 2)
+    )
     whole, killed = (tmp_path / name for name in ("whole", "killed"))
     for folder in (whole, killed):
         folder.mkdir()
@@ -202,7 +204,7 @@ def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, tmp_path: Path
     """On such a node, killed cells resume; from other nodes, results are sent."""
     experiment = find_experiment("joint")
     (level, *_) = experiment.tests()
-    job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}))
+    job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}, 32, 40, 2))
     for name in ("here", "there"):
         (tmp_path / name).mkdir()
         job.write(tmp_path / name)
