@@ -12,7 +12,6 @@ from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.curriculum import Curriculum, Stage
-from sb3_saf.envs.equal_spaces import make_team_game, team_game
 from sb3_saf.envs.game_reader import AnyParallelEnv, AskMasks
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.envs.monitor import SharedReward, TeamMonitor, TeamReward
@@ -246,13 +245,13 @@ def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParal
         )
     is_factory = callable(env) and not isinstance(env, (ParallelEnv, AECEnv, gym.Env))
     if not params:
-        return partial(make_team_game, env) if is_factory else team_game(env)
+        return env
     if not is_factory:
         raise ValueError(
             f"parameters {sorted(params)} go to a factory, got them with {_name(env)}; give them to the environment "
             "when you make it, or pass its factory (such as simple_spread_v3.parallel_env) instead"
         )
-    return partial(make_team_game, partial(env, **params))
+    return partial(env, **params)
 
 
 def _name(env: object) -> str:

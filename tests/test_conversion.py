@@ -181,13 +181,9 @@ def test_masks_are_passed_by_agent() -> None:
 @pytest.mark.parametrize(
     ("kind", "observation", "message"),
     [
-        (
-            "vectors",
-            {"b": np.zeros(5, np.float32)},
-            r"observation of b: .* of shape \(3,\) and dtype float32, got \(5,\)",
-        ),
+        ("vectors", {"b": np.zeros(5, np.float32)}, r"observation of b: .* of shape \(3,\), got .* \(5,\)"),
         ("vectors", {"d": np.zeros(3, np.float32)}, r"'agent', 'b', 'c', .* got 'd'"),
-        ("equal, start", {"b": 2}, r"observation of b: expected observation from \[3\] with \[4\] choices, got 2"),
+        ("equal, start", {"b": 2}, "observation of b: expected values from 3 to 6 .* got 2"),
         ("nested", {"agent": {"z": 4}}, r"observation of agent: .* the parts \['z', 'a'\], got \['z'\]"),
     ],
 )
@@ -200,7 +196,7 @@ def test_observations_of_another_form(kind: str, observation: Any, message: str)
 def test_masks_that_the_game_gives_are_required() -> None:
     model = make(PPO, "IPPOPolicy", make_team_env(partial(Kinds, "equal", "info"), seed=0))
     observations, infos = Kinds("equal", "info").reset(seed=0)
-    with pytest.raises(ValueError, match="observation of agent: expected the 'action_mask' of the game"):
+    with pytest.raises(ValueError, match=r"observation of agent: expected an action mask .* got None"):
         model.predict(observations)
-    with pytest.raises(ValueError, match="observation of b: expected 'action_mask' with 3 zeros and ones"):
+    with pytest.raises(ValueError, match="observation of b: expected an action mask of 3 zeros and ones"):
         model.predict((observations, {**infos, "b": {"action_mask": np.ones(4)}}))

@@ -266,14 +266,8 @@ def test_observations_that_rows_convert_are_refused_with_the_way_to_act() -> Non
     model: Any = PPO("IPPOPolicy", make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
     seen = CounterEnv().reset(seed=0)[0]["agent_0"]
     for observations, message in (
-        (
-            {"agent_0": {"pos": seen}, "agent_1": {"pos": seen}},
-            r"observation of agent_0: expected observation of shape \(3,\)",
-        ),
-        (
-            {"agent_0": seen, "agent_1": seen[:-1]},
-            r"observation of agent_1: .* of shape \(3,\) and dtype float32, got \(2,\)",
-        ),
+        ({"agent_0": {"pos": seen}, "agent_1": {"pos": seen}}, r"observation of agent_0: .* of shape \(3,\)"),
+        ({"agent_0": seen, "agent_1": seen[:-1]}, r"observation of agent_1: .* of shape \(3,\), got .* \(2,\)"),
     ):
         with pytest.raises(ValueError, match=message):
             model.predict(observations)

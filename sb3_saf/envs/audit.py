@@ -6,7 +6,8 @@ import inspect
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from math import isfinite, isnan
 from typing import Any, Final
@@ -16,8 +17,8 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
-from sb3_saf.envs.gymnasium_team import ALL, INFO_MASKS, GymnasiumTeam, is_gymnasium_team
-from sb3_saf.envs.space_reader import SpaceReader, leaves_of
+from sb3_saf.envs.gymnasium_team import ALL, INFO_MASKS, as_parallel
+from sb3_saf.teams.conversion import checked_mask, leaves_of, read_leaves
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, n_mask_entries
 
@@ -47,7 +48,7 @@ def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None
     :param seconds: time limit in seconds
     :raises ValueError: naming the agent, the step, what was expected, and what the game gave
     """
-    game = GymnasiumTeam(env) if is_gymnasium_team(env) else env
+    game = as_parallel(env)
     check_is_parallel(game, is_factory=False)
     trial = Trial(game)
     trial.play(n_steps, seconds)
@@ -74,15 +75,43 @@ class Trial:
         self.notes: list[str] = []
         #: Error raised by the game itself.
         self.error: BaseException | None = None
-        #: Times at which an agent could act, and how often it was given a mask, by key of the infos.
-        self.n_turns = 0
-        self.n_masks: dict[str, int] = {}
-        self._actions = {agent: deepcopy(space_of(self.env, "action", agent)) for agent in self.agents}
-        observed = {agent: space_of(self.env, "observation", agent) for agent in self.agents}
-        self.mask_keys = {agent: mask_key_of(observed[agent], self._actions[agent])[0] for agent in self.agents}
-        self._readers = {agent: SpaceReader(space, self.notes) for agent, space in observed.items()}
-        for space in self._actions.values():
+        #: By agent: times at which it could act, and how often its info had a mask then.
+        self.n_turns, self.n_masks = Counter[Any](), Counter[Any]()
+        self.observed = {agent: space_of(env, "observation", agent) for agent in self.agents}
+        self.actions = {agent: deepcopy(space_of(env, "action", agent)) for agent in self.agents}
+        #: By agent: key of the masks in its observations, None if they have none.
+        self.mask_keys = {agent: self._mask_key(agent) for agent in self.agents}
+        self._leaves = {agent: list(leaves_of(space)) for agent, space in self.observed.items()}
+        for space in self.actions.values():
             space.seed(0)
+
+    def _mask_key(self, agent: Any) -> Any:
+        """Find the masks among the entries of observations; note what looks like masks and is none."""
+        observed, n_entries = self.observed[agent], n_mask_entries(self.actions[agent])
+        if not isinstance(observed, spaces.Dict) or len(observed.spaces) < 2:
+            return None
+        masks = {key: space for key, space in observed.spaces.items() if looks_like_mask(key)}
+        keys = [key for key, space in masks.items() if space.shape == (n_entries,) and isinstance(space, FIXED_SHAPE)]
+        chosen = ACTION_MASK_KEY if ACTION_MASK_KEY in keys else next(iter(keys), None)
+        for key, space in masks.items():
+            if key == chosen:
+                continue
+            if key == ACTION_MASK_KEY:
+                raise ValueError(
+                    f"expected {ACTION_MASK_KEY!r} in observations to have one entry per choice of "
+                    f"{self.actions[agent]}, {'none can be masked' if n_entries is None else n_entries}, got {space}"
+                )
+            why = (
+                f"beside the action masks in {chosen!r}"
+                if key in keys
+                else (f"which looks like action masks, but {space} does not fit the actions {self.actions[agent]}")
+            )
+            self._note(f"observations have {key!r}, {why}: it is an ordinary part of the observation")
+        return chosen
+
+    def _note(self, note: str) -> None:
+        if note not in self.notes:
+            self.notes.append(note)
 
     def play(self, n_steps: int = TRIAL_STEPS, seconds: float = TRIAL_SECONDS) -> None:
         """Play one episode, at most ``n_steps`` steps and ``seconds``; the global random generators are restored."""
@@ -140,47 +169,61 @@ class Trial:
 
     def _check_seen(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], playing: Sequence[Any]) -> None:
         for agent in playing:
-            self._readers[agent].read(observation_of(observations, agent, self._place), f"{agent} {self._place}")
-            self._check_mask(observations, agent)
+            observation = observation_of(observations, agent, self._place)
+            try:
+                self._check_observation(agent, observation)
+            except ValueError as error:
+                raise ValueError(f"observation of {agent} {self._place}: {error}") from None
+            key = self.mask_keys[agent]
+            if key is not None:
+                self._check_mask(agent, key, observation[key], "observation")
         for agent in self.agents:
             info = info_of(infos, agent, self._place)
-            if agent in playing:
-                self.n_turns += 1
-                self._count_masks(info, agent)
+            for key in info if agent in playing else ():
+                if key not in INFO_MASKS and looks_like_mask(key):
+                    self._note(
+                        f"infos have {key!r}, which looks like action masks, but is not used; name it "
+                        f"{ACTION_MASK_KEY!r}"
+                    )
+            self.n_turns[agent] += agent in playing
+            key = next((name for name in INFO_MASKS if info.get(name) is not None), None)
+            if agent in playing and key is not None and n_mask_entries(self.actions[agent]) is not None:
+                self._check_mask(agent, key, info[key], "info")
+                self.n_masks[agent] += 1
 
-    def _check_mask(self, observations: Mapping[Any, Any], agent: Any) -> None:
-        key = self.mask_keys[agent]
-        if key is not None:
-            mask_of(observations[agent][key], self._actions[agent], f"the observation of {agent} {self._place}")
+    def _check_observation(self, agent: Any, observation: Any) -> None:
+        """Check shapes, types and bounds of integers; refuse NaN and infinity, note floats that are out of bounds."""
+        for leaf, array in zip(self._leaves[agent], read_leaves(self._leaves[agent], observation), strict=True):
+            if array.dtype.kind != "f":
+                continue
+            if not np.isfinite(array).all():
+                raise ValueError(f"expected finite values, got {array[~np.isfinite(array)].reshape(-1)[0]}")
+            low, high = (np.reshape(bound, leaf.shape if len(bound) > 1 else ()) for bound in (leaf.low, leaf.high))
+            wrong = (array < low) | (array > high)
+            if wrong.any() and not any(note.startswith("observation of") for note in self.notes):
+                self._note(f"observation of {agent} {self._place}: {leaf.outside(array, wrong)}")
 
-    def _count_masks(self, info: Mapping[str, Any], agent: Any) -> None:
-        for key, value in info.items():
-            if key in INFO_MASKS:
-                if value is not None and n_mask_entries(self._actions[agent]) is not None:
-                    mask_of(value, self._actions[agent], f"the info of {agent} {self._place}", key)
-                    self.n_masks[key] = self.n_masks.get(key, 0) + 1
-            elif looks_like_mask(key):
-                note = (
-                    f"infos have {key!r}, which looks like action masks, but is not used; name it {ACTION_MASK_KEY!r}"
-                )
-                if note not in self.notes:
-                    self.notes.append(note)
+    def _check_mask(self, agent: Any, key: Any, mask: Any, where: str) -> None:
+        try:
+            checked_mask(mask, n_mask_entries(self.actions[agent]) or 0)
+        except ValueError as error:
+            raise mask_error(error, key, f"the {where} of {agent} {self._place}") from None
 
     def _legal_actions(
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], playing: Sequence[Any]
     ) -> dict[Any, Any]:
         masks: dict[Any, Any] = {}
         for agent in playing:
-            key = self.mask_keys[agent]
-            given = [(infos.get(agent) or {}).get(name) for name in INFO_MASKS]
-            masks[agent] = observations[agent][key] if key is not None else next(filter(_is_given, given), None)
+            key, info = self.mask_keys[agent], infos.get(agent) or {}
+            given = next((info[name] for name in INFO_MASKS if info.get(name) is not None), None)
+            masks[agent] = given if key is None else observations[agent][key]
         if all(mask is None for mask in masks.values()):
             shown = game_attribute(self.env, "action_masks")() if has_game_attribute(self.env, "action_masks") else {}
             masks = {agent: shown.get(agent) if isinstance(shown, Mapping) else shown for agent in playing}
         return {agent: self._sample(agent, mask) for agent, mask in masks.items()}
 
     def _sample(self, agent: Any, mask: Any) -> Any:
-        space = self._actions[agent]
+        space = self.actions[agent]
         flags = np.asarray(mask)
         if flags.shape != (n_mask_entries(space),):
             return space.sample()
@@ -191,10 +234,6 @@ class Trial:
             off, on = flags.reshape(-1, 2).astype(bool).T
             return np.where(off & on, space.sample(), on).astype(space.dtype)
         return space.sample(mask=flags)
-
-
-def _is_given(value: Any) -> bool:
-    return value is not None
 
 
 class FormError(ValueError):
@@ -329,7 +368,7 @@ def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
             f"write it as: def {kind}_space(self, agent): return self.{kind}_spaces[agent]"
         )
     space = method(agent)
-    parts = leaves_of(space) if kind == "observation" else [space]
+    parts = list(innermost(space)) if kind == "observation" else [space]
     if not all(isinstance(part, FIXED_SHAPE) for part in parts):
         names = ", ".join(part.__name__ for part in FIXED_SHAPE)
         containers = ", or a Dict or Tuple of those" if kind == "observation" else ""
@@ -340,6 +379,15 @@ def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
             f"{'anything to see' if kind == 'observation' else 'a choice'} one constant entry"
         )
     return space
+
+
+def innermost(space: spaces.Space[Any]) -> Iterator[spaces.Space[Any]]:
+    """Yield the innermost spaces of nested Dicts and Tuples."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for part in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
+            yield from innermost(part)
+    else:
+        yield space
 
 
 def present_agents(env: Any, possible_agents: Sequence[Any], place: str) -> set[Any]:
@@ -482,77 +530,16 @@ def looks_like_mask(key: Any) -> bool:
     return "mask" in name or (of_actions and any(word in name for word in ("legal", "avail", "valid")))
 
 
-def mask_key_of(observed: spaces.Space[Any], actions: spaces.Space[Any]) -> tuple[Any, list[str]]:
-    """
-    Find the action masks in a Dict of observations.
-
-    :param observed: the agent's observation space
-    :param actions: its action space
-    :return: key of the masks, None if there are none; notes about entries that look like masks but do not fit
-    :raises ValueError: if ``"action_mask"`` does not fit the actions
-    """
-    if not isinstance(observed, spaces.Dict) or len(observed.spaces) < 2:
-        return None, []
-    n_entries = n_mask_entries(actions)
-    notes: list[str] = []
-    keys: list[Any] = []
-    for key, space in observed.spaces.items():
-        if not looks_like_mask(key):
-            continue
-        fits = n_entries is not None and isinstance(space, FIXED_SHAPE) and space.shape == (n_entries,)
-        if fits:
-            keys.append(key)
-        elif key == ACTION_MASK_KEY:
-            raise ValueError(
-                f"expected {ACTION_MASK_KEY!r} in observations to have one entry per choice of {actions}, "
-                f"{'none can be masked' if n_entries is None else n_entries}, got {space}"
-            )
-        else:
-            notes.append(
-                f"observations have {key!r}, which looks like action masks, but {space} does not fit the actions "
-                f"{actions}: it is an ordinary part of the observation"
-            )
-    chosen = ACTION_MASK_KEY if ACTION_MASK_KEY in keys else next(iter(keys), None)
-    notes += [
-        f"observations have {key!r} beside the action masks in {chosen!r}: it is an ordinary part of the observation"
-        for key in keys
-        if key != chosen
-    ]
-    return chosen, notes
-
-
 def without_mask(observed: spaces.Space[Any], key: Any) -> spaces.Space[Any]:
-    """Return the space of observations without their masks; that of the other entry if there is one only."""
-    assert isinstance(observed, spaces.Dict)
+    """Return the space of observations without their masks, if they have any; of a single entry its own."""
+    if key is None or not isinstance(observed, spaces.Dict):
+        return observed
     others = [(name, space) for name, space in observed.spaces.items() if name != key]
     return others[0][1] if len(others) == 1 else spaces.Dict(others)
 
 
-def own_part(observation: Mapping[str, Any], observed: spaces.Space[Any], key: Any) -> Any:
-    """Return an observation without its mask (see :func:`without_mask`)."""
-    assert isinstance(observed, spaces.Dict)
-    names = [name for name in observed.spaces if name != key]
-    return observation[names[0]] if len(names) == 1 else {name: observation[name] for name in names}
-
-
-def mask_of(value: Any, actions: spaces.Space[Any], owner: str, key: str = ACTION_MASK_KEY) -> np.ndarray:
-    """
-    Return a mask of legal actions as int8, (A,).
-
-    :param value: what the game gave
-    :param actions: the agent's action space
-    :param owner: for the message
-    :param key: its name
-    :raises ValueError: unless it is A zeros and ones
-    """
-    n_entries = n_mask_entries(actions)
-    try:
-        mask = np.asarray(value)
-    except ValueError:
-        mask = np.asarray(None)
-    if mask.shape == (n_entries,) and mask.dtype.kind in "biuf" and ((mask == 0) | (mask == 1)).all():
-        return mask.astype(np.int8)
-    raise ValueError(
-        f"expected {key!r} in {owner} to be {n_entries} zeros and ones (one per action), got {value!r}; give it at "
-        "every step to every agent that acts, or pass action_masks=False"
+def mask_error(error: ValueError, key: Any, owner: str) -> ValueError:
+    """Return the error of a mask with its name and its owner."""
+    return ValueError(
+        f"{key!r} in {owner}: {error}; give it at every step to every agent that acts, or pass action_masks=False"
     )

@@ -1,30 +1,33 @@
-"""How a PettingZoo game is read: its observations, action masks and state as the parts of rows."""
+"""How a PettingZoo game is read: its observations, action masks and state as rows of one form."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
+from itertools import accumulate
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_saf.envs.audit import (
-    Trial,
-    agents_of,
-    mask_key_of,
-    mask_of,
-    observation_of,
-    own_part,
-    space_of,
-    without_mask,
-)
+from sb3_saf.envs.audit import Trial, innermost, mask_error, observation_of, reset, step_results, without_mask
 from sb3_saf.envs.gymnasium_team import INFO_MASKS
-from sb3_saf.envs.space_reader import FlatReader, SpaceReader, can_be_flattened, counted_from_zero
-from sb3_saf.teams.conversion import conversions_of
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, FIXED_SHAPE, STATE_KEY, TeamSpaces, n_mask_entries
+from sb3_saf.networks.encoders import Part, PartsSpace
+from sb3_saf.teams.conversion import AgentConversion, Leaf
+from sb3_saf.teams.rows import (
+    ACTION_MASK_KEY,
+    ACTIVE_KEY,
+    FIXED_SHAPE,
+    OBS_KEY,
+    STATE_KEY,
+    Array,
+    TeamSpaces,
+    fill_idle_rows,
+    n_mask_entries,
+)
 
 AnyParallelEnv: TypeAlias = "ParallelEnv[Any, Any, Any]"
 MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
@@ -32,161 +35,307 @@ MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
 #: Whether to use action masks: if there are any, always (required), never.
 AskMasks: TypeAlias = Literal["auto"] | bool
 
-#: Places of masks in a game.
-_MaskSource = Literal["observation", "info"]
-
 
 class GameReader:
     """
-    Reader of a game whose agents have equal spaces.
+    Reader of a game: what its agents observe and what masks their actions becomes rows of one form.
 
-    :param env: the game
-    :param trial: its trial episode
+    :param trial: trial episode of the game
     :param active: whether rows have ``"active"``
-    :param action_masks: ``"auto"`` for masks if any, True to require them, False for none; None keeps observations
-        unchanged
+    :param action_masks: ``"auto"`` for masks if any, True to require them, False for none
     :param state: whether rows have the game's state
     :param float64: whether observations of float64 stay so
-    :raises ValueError: if agents differ in their spaces, or a requested signal is missing
+    :raises ValueError: if actions of different agents cannot be those of one policy, or a requested signal is missing
     """
 
     def __init__(
         self,
-        env: Any,
         trial: Trial,
         active: bool = False,
-        action_masks: AskMasks | None = None,
+        action_masks: AskMasks = "auto",
         state: bool = False,
-        float64: bool = True,
+        float64: bool = False,
     ) -> None:
-        self.agents = tuple(agents_of(env))
+        self.agents = trial.agents
         #: Warnings about the game.
         self.notes = list(trial.notes)
-        self._observed = common_space(env, "observation", self.agents)
-        #: The game's action space of each agent.
-        self.action_space = common_space(env, "action", self.agents)
-        self._mask_key: Any = None
-        own = self._observed
-        if action_masks is not None:
-            self._mask_key, notes = mask_key_of(self._observed, self.action_space)
-            self.notes += notes
-            own = own if self._mask_key is None else without_mask(own, self._mask_key)
-        self._masks_are_optional = False
-        self._masks = self._mask_source(action_masks, trial) if action_masks else None
-        self.watches_masks = action_masks == "auto" and self._masks is None
-        keep = float64 or action_masks is None
-        is_flat = action_masks is not None and can_be_flattened(own)
-        self._own = (FlatReader if is_flat else SpaceReader)(own, float64=keep)
-        self._state = SpaceReader(_state_space(env), float64=keep) if state else None
+        observed, acted, keys = trial.observed.values(), trial.actions, trial.mask_keys
+        own_spaces = [without_mask(*entry) for entry in zip(observed, keys.values(), strict=True)]
+        own = own_space(own_spaces, float64)
+        #: Action space of a row.
+        self.action_space = common_actions(acted)
+        has_masks, needs_mask = self._find_masks(trial, action_masks)
+        #: By agent: how its observations, masks and actions become those of rows, and back.
+        self.conversions = {
+            agent: AgentConversion.of(space, acted[agent], own, self.action_space, keys[agent], agent in needs_mask)
+            for agent, space in zip(self.agents, own_spaces, strict=True)
+        }
+        #: Whether to warn of masks that come after the trial.
+        self.watches_masks = action_masks == "auto" and not has_masks
+        self._state: tuple[Leaf, spaces.Space[Any]] | None = None
+        if state:
+            space = _state_space(trial.env)
+            self._state = Leaf.of(space), own_space([space], float64)
         #: The form of the rows.
         self.rows = TeamSpaces(
-            self._own.rows,
+            own,
             len(self.agents),
             active,
-            n_mask_entries(self.action_space) if self._masks else None,
-            None if self._state is None else self._state.rows,
+            n_mask_entries(self.action_space) if has_masks else None,
+            None if self._state is None else self._state[1],
             self.agents,
-            is_dict=active or self._masks is not None or state,
-        )
-        self.blank = self._own.blank()
-        #: How each agent's observations and actions become those of rows, for models that act on the game's own.
-        self.conversions = conversions_of(
-            trial.env,
-            self._own.rows,
-            counted_from_zero(self.action_space),
-            self._masks == "info" and trial.env is env and not self._masks_are_optional,
-            {} if action_masks is None else trial.mask_keys,
+            is_dict=active or has_masks or state,
         )
 
-    def _mask_source(self, action_masks: AskMasks, trial: Trial) -> _MaskSource | None:
-        if self._mask_key is not None:
-            return "observation"
+    def _find_masks(self, trial: Trial, action_masks: AskMasks) -> tuple[bool, set[Any]]:
+        """Return whether rows have masks, and the agents to which the game always gives one."""
+        if not action_masks:
+            return False, set()
         if n_mask_entries(self.action_space) is None:
             if action_masks is True:
                 raise ValueError(
                     f"action masks are for Discrete, MultiDiscrete and MultiBinary actions, got {self.action_space}; "
                     "pass action_masks=False, or make the actions Discrete in a wrapper of the environment"
                 )
-            return None
-        self._info_key = next((key for key in INFO_MASKS if key in trial.n_masks), ACTION_MASK_KEY)
-        n_given = trial.n_masks.get(self._info_key, 0)
-        self._masks_are_optional = 0 < n_given < trial.n_turns and action_masks == "auto"
-        if self._masks_are_optional:
+            return False, set()
+        inside = {agent for agent in self.agents if trial.mask_keys[agent] is not None}
+        differ = len({str(_counted_from_zero(space)) for space in trial.actions.values()}) > 1
+        if action_masks is True and not differ:
+            return True, set(self.agents)
+        some = {agent for agent, n in trial.n_masks.items() if n < trial.n_turns[agent]}
+        if some:
             self.notes.append(
-                f"{self._info_key!r} is in some infos and not in others ({n_given} of {trial.n_turns} in a trial "
-                "episode): where it is missing, all actions are taken to be legal"
+                f"{ACTION_MASK_KEY!r} is in some infos and not in others ({trial.n_masks.total()} of "
+                f"{trial.n_turns.total()} in a trial episode): where it is missing, all actions are taken to be legal"
             )
-        return "info" if n_given or action_masks is True else None
+        return bool(inside or trial.n_masks or differ), inside | (trial.n_masks.keys() - some)
 
-    def own(self, observations: Mapping[Any, Any], agent: Any, place: str, required: bool) -> Any:
-        """
-        Return an agent's own observation, zeros if there is none and none is required.
-
-        :param observations: by agent
-        :param place: game and step, for the message
-        :param required: whether the agent takes part
-        """
-        if not required and observations.get(agent) is None:
-            return self.blank
-        observation = observation_of(observations, agent, place)
-        if self._mask_key is not None:
-            if not isinstance(observation, Mapping) or not set(self._observed.spaces) <= set(observation):  # type: ignore[attr-defined]
-                got = list(observation) if isinstance(observation, Mapping) else type(observation).__name__
-                keys = list(self._observed.spaces)  # type: ignore[attr-defined]
-                raise ValueError(f"observation of {agent} {place}: expected a dict with {keys}, got {got}")
-            observation = own_part(observation, self._observed, self._mask_key)
-        return self._own.read(observation, f"{agent} {place}")
-
-    def signals(
+    def read(
         self,
+        env: Any,
         observations: Mapping[Any, Any],
         infos: Mapping[Any, Any],
-        agent: Any,
+        shown: Container[Any],
+        active: Container[Any],
         place: str,
-        active: bool,
         over: bool = False,
-    ) -> dict[str, Any]:
+    ) -> Any:
         """
-        Return what an agent's row has beside its own observation and the state.
+        Return the N rows of a game: own observations, or a dict of the parts of rows.
 
-        :param active: whether the agent takes part
-        :param over: whether these are the last observations of the episode, on which no agent acts
+        :param env: the game
+        :param observations: by agent
+        :param infos: by agent
+        :param shown: agents whose observations are shown; rows of others are zeros, or with ``"active"`` copies
+        :param active: agents that take part, and must have an observation
+        :param place: game and step, for messages
+        :param over: whether these are last observations, on which no agent acts
         """
-        signals: dict[str, Any] = {ACTIVE_KEY: int(active)} if self.rows.has_active else {}
+        own = np.zeros((len(self.agents), *self.rows.own_shape), dtype=self.rows.own.dtype)
+        for row, agent in enumerate(self.agents):
+            if agent in active or (agent in shown and observations.get(agent) is not None):
+                own[row] = self.own(observations, agent, place)
+        if not self.rows.is_dict:
+            return own
+        rows = {OBS_KEY: own}
+        flags = np.array([agent in active for agent in self.agents], dtype=np.int64)
         if self.rows.n_masked_actions is not None:
-            mask = self._mask(observations, infos, agent, place, over) if active else None
-            signals[ACTION_MASK_KEY] = np.zeros(self.rows.n_masked_actions, np.int8) if mask is None else mask
-        return signals
+            rows[ACTION_MASK_KEY] = np.zeros((len(self.agents), self.rows.n_masked_actions), np.int8)
+            for row in np.flatnonzero(flags).tolist():
+                mask = self.mask(observations, infos, self.agents[row], place, is_needed=not over)
+                if mask is not None:
+                    rows[ACTION_MASK_KEY][row] = mask
+        if self._state is not None:
+            leaf, space = self._state
+            try:
+                state = leaf.read(env.state())
+            except ValueError as error:
+                raise ValueError(f"the state {place}: {error}") from None
+            rows[STATE_KEY] = np.repeat(state.astype(space.dtype)[np.newaxis], len(self.agents), axis=0)
+        if self.rows.has_active:
+            rows[ACTIVE_KEY] = flags
+            if not over:
+                fill_idle_rows(own, flags)
+        return rows
 
-    def _mask(
-        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], agent: Any, place: str, over: bool
-    ) -> npt.NDArray[np.int8] | None:
-        inside = self._masks == "observation"
-        source, key = (observations, self._mask_key) if inside else (infos, self._info_key)
-        value = (source.get(agent) or {}).get(key)
-        if value is None and over:
+    def own(self, observations: Mapping[Any, Any], agent: Any, place: str) -> Array:
+        """Return an agent's own observation, as in rows."""
+        conversion = self.conversions[agent]
+        observation = observation_of(observations, agent, place)
+        try:
+            return conversion.own(conversion.split(observation)[0])
+        except ValueError as error:
+            raise ValueError(f"observation of {agent} {place}: {error}") from None
+
+    def mask(
+        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], agent: Any, place: str, is_needed: bool = True
+    ) -> Array | None:
+        """Return an agent's action mask, as in rows; None if it lacks one that is not needed."""
+        conversion = self.conversions[agent]
+        if conversion.mask_key is not None:
+            key, where, given = conversion.mask_key, "observation", observations.get(agent) or {}
+        else:
+            where, given = "info", infos.get(agent) or {}
+            key = next((name for name in INFO_MASKS if name in given), ACTION_MASK_KEY)
+        if given.get(key) is None and conversion.needs_mask and not is_needed:
             return None
-        if value is None and self._masks_are_optional:
-            assert self.rows.n_masked_actions is not None
-            return np.ones(self.rows.n_masked_actions, np.int8)
-        return mask_of(value, self.action_space, f"the {self._masks} of {agent} {place}", key)
-
-    def state(self, env: Any, place: str) -> dict[str, Any]:
-        """Return the game's state as an entry of rows, nothing if they have none."""
-        return {} if self._state is None else {STATE_KEY: self._state.read(env.state(), f"the state {place}")}
+        try:
+            return conversion.mask(given.get(key))
+        except ValueError as error:
+            raise mask_error(error, key, f"the {where} of {agent} {place}") from None
 
 
-def common_space(env: Any, kind: str, agents: tuple[Any, ...]) -> spaces.Space[Any]:
-    """Return the space of all agents; raise ValueError if they differ."""
-    by_agent = {agent: space_of(env, kind, agent) for agent in agents}
-    first = by_agent[agents[0]]
-    others = [f"{agent} has {space}" for agent, space in by_agent.items() if space != first]
-    if others:
-        raise ValueError(
-            f"expected one {kind} space for all agents, got: {agents[0]} has {first}, {', '.join(others)}; make them "
-            "equal with sb3_saf.EqualSpaces(env)"
-        )
-    return first
+class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
+    """
+    Wrapper that gives agents with different spaces equal ones, as ``make_team_env`` does for rows.
+
+    Observations: Boxes with equal numbers of axes are padded with zeros at the end of each axis; other spaces are
+    flattened to vectors by ``gymnasium.spaces.flatten`` and then padded.
+
+    Actions: Discrete spaces are extended to the largest one; MultiDiscrete spaces, also beside Discrete ones, to the
+    largest number of choices of each dimension. What an agent lacks is masked (``infos[agent]["action_mask"]``,
+    combined with the game's own masks) and refused. Boxes are padded; only the agent's own entries reach the game,
+    clipped to its bounds.
+
+    :param env: the game
+    :raises ValueError: if actions are neither all discrete nor all vectors
+    """
+
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        self._reader = GameReader(Trial(env), float64=True)
+        self.possible_agents = list(self._reader.agents)
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        """Return the space of all agents' observations."""
+        return self._reader.rows.own
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        """Return the space of all agents' actions."""
+        return self._reader.action_space
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Begin an episode (see PettingZoo)."""
+        return self._converted(*reset(self.env, seed, options))
+
+    def step(self, actions: Mapping[Any, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        """Play one step (see PettingZoo)."""
+        conversions = self._reader.conversions
+        own = {agent: conversions[agent].game_action(action) for agent, action in actions.items()}
+        observations, rewards, terminations, truncations, infos = step_results(self.env, self.env.step(own))
+        own, infos = self._converted(observations, infos)
+        return own, rewards, terminations, truncations, infos
+
+    def _converted(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> tuple[Any, Any]:
+        """Return the observations and infos of observed agents, with masks, if there are any."""
+        seen = [agent for agent in self._reader.agents if observations.get(agent) is not None]
+        own = {agent: self._reader.own(observations, agent, "of EqualSpaces") for agent in seen}
+        shown = {agent: dict(info or {}) for agent, info in infos.items()}
+        for agent in seen if self._reader.rows.n_masked_actions is not None else ():
+            mask = self._reader.mask(observations, infos, agent, "of EqualSpaces", agent in self.env.agents)
+            if mask is not None:
+                shown.setdefault(agent, {})[ACTION_MASK_KEY] = mask
+        return own, shown
+
+
+# ---- spaces of rows
+
+
+def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Space[Any]:
+    """
+    Return the space of rows' own observations.
+
+    Equal spaces of fixed shape stay, counted from 0, as Stable-Baselines3 encodes and samples them whatever their
+    start. Boxes with equal numbers of axes are padded to the largest; all others become vectors, as
+    ``gymnasium.spaces.flatten_space`` makes them.
+
+    :param observed: of each agent
+    :param float64: whether Boxes of float64 stay so
+    """
+    first = observed[0]
+    are_equal = all(space == first for space in observed)
+    if isinstance(first, FIXED_SHAPE) and are_equal:
+        own = _counted_from_zero(first)
+    elif (
+        all(isinstance(space, spaces.Box) for space in observed)
+        and len({len(space.shape or ()) for space in observed}) == 1
+    ):
+        own = _common_box(observed)
+    else:
+        vectors = [_flat_space(space) for space in observed]
+        own = vectors[0] if are_equal else _common_box(vectors)
+    if isinstance(own, spaces.Box) and own.dtype == np.float64 and not float64:
+        with np.errstate(over="ignore"):
+            return spaces.Box(own.low.astype(np.float32), own.high.astype(np.float32), dtype=np.float32)
+    return own
+
+
+def _counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    if isinstance(space, spaces.Discrete) and space.start != 0:
+        return spaces.Discrete(int(space.n))
+    if isinstance(space, spaces.MultiDiscrete) and np.any(space.start != 0):
+        return spaces.MultiDiscrete(space.nvec, dtype=space.dtype.type)
+    return space
+
+
+def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
+    """Return the space of the vector of a Dict or a Tuple; pictures in it stay known to encoders."""
+    flat = spaces.flatten_space(space)
+    assert isinstance(flat, spaces.Box)
+    leaves = list(innermost(space))
+    pictures = [leaf.shape if isinstance(leaf, spaces.Box) and is_image_space(leaf) else None for leaf in leaves]
+    if any(pictures):
+        ends = list(accumulate(map(spaces.flatdim, leaves)))
+        return PartsSpace(flat, tuple(map(Part, [0, *ends], ends, pictures)))
+    if flat.dtype == np.float64 and not any(leaf.dtype == np.float64 for leaf in leaves):
+        # Mixed integers and float32 would give float64, which takes twice the memory.
+        return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+    return flat
+
+
+def _common_box(boxes: Sequence[Any]) -> spaces.Box:
+    shape = tuple(int(size) for size in np.max([box.shape for box in boxes], axis=0))
+    dtype = np.result_type(*(box.dtype for box in boxes))
+    low = np.min([_padded(box.low, shape, dtype) for box in boxes], axis=0)
+    high = np.max([_padded(box.high, shape, dtype) for box in boxes], axis=0)
+    return spaces.Box(low, high, dtype=dtype.type)
+
+
+def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
+    """
+    Return the action space of rows.
+
+    :param acted: by agent
+    :raises ValueError: if actions are neither all discrete nor all vectors
+    """
+    first, *others = every = [_counted_from_zero(space) for space in acted.values()]
+    if all(space == first for space in others):
+        return first
+    if all(isinstance(space, spaces.Discrete) for space in every):
+        return spaces.Discrete(max(Leaf.of(space).choices[0] for space in every))
+    if all(isinstance(x, spaces.Discrete) or (isinstance(x, spaces.MultiDiscrete) and x.nvec.ndim == 1) for x in every):
+        choices = [Leaf.of(space).choices for space in every]
+        length = max(map(len, choices))
+        return spaces.MultiDiscrete(np.max([_padded(one, (length,), np.int64) for one in choices], axis=0))
+    if all(isinstance(space, spaces.Box) and len(space.shape) == 1 for space in every):
+        boxes: Any = every
+        shape = (max(box.shape[0] for box in boxes),)
+        # The padding of an agent that lacks an entry does not widen the bounds of that entry.
+        low = np.min([_padded(box.low, shape, np.float32, np.inf) for box in boxes], axis=0)
+        high = np.max([_padded(box.high, shape, np.float32, -np.inf) for box in boxes], axis=0)
+        return spaces.Box(low, high, dtype=np.float32)
+    raise ValueError(
+        "expected actions that are discrete for all agents (Discrete or MultiDiscrete), or vectors for all (Box of one "
+        f"axis), where agents differ; got {', '.join(f'{agent}: {space}' for agent, space in acted.items())}. A policy "
+        "has one kind of actions: in a wrapper of the environment, give the agents with Box actions a table of vectors "
+        "to choose from (Discrete), or take the largest entry of a Box for the agents with Discrete actions"
+    )
+
+
+def _padded(array: Any, shape: tuple[int, ...], dtype: Any, fill: float = 0) -> Any:
+    result = np.full(shape, fill, dtype=dtype)
+    result[tuple(slice(size) for size in np.shape(array))] = array
+    return result
 
 
 def _state_space(env: Any) -> spaces.Space[Any]:

@@ -148,9 +148,10 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         return infos
 
 
-def is_gymnasium_team(env: object) -> bool:
-    """Return whether an object is a Gymnasium environment with one action per agent."""
-    return isinstance(env, gym.Env) and isinstance(getattr(env, "action_space", None), spaces.Tuple)
+def as_parallel(env: Any) -> Any:
+    """Return a Gymnasium environment with one action per agent as a ParallelEnv; any other object as it is."""
+    is_team = isinstance(env, gym.Env) and isinstance(getattr(env, "action_space", None), spaces.Tuple)
+    return GymnasiumTeam(env) if is_team else env
 
 
 def check_is_team(env: gym.Env[Any, Any]) -> None:

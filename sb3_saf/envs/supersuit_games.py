@@ -16,15 +16,15 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import cloudpickle
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import iterate
 from supersuit.vector import ConcatVecEnv, MarkovVectorEnv
 
 from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.game_copies import Way, find_way, pickled, unpickled
 from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
-from sb3_saf.envs.gymnasium_team import INFO_MASKS
-from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED, fill_idle_rows
+from sb3_saf.envs.gymnasium_team import INFO_MASKS, as_parallel
+from sb3_saf.teams.rows import ACTIVE_KEY, TERMINAL_OBSERVATION, TRUNCATED
 
 Info: TypeAlias = "dict[str, Any]"
 Infos: TypeAlias = "list[Info]"
@@ -60,13 +60,14 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     par_env: AnyParallelEnv
 
     def __init__(self, env: AnyParallelEnv, reader: GameReader, index: int, notes: list[str]) -> None:
-        if not hasattr(env, "metadata"):
-            env.metadata = {}
+        check_is_parallel(env, is_factory=True)
+        # Not the base class's constructor, which wants a game whose own spaces are those of rows.
+        self.par_env, self.num_envs = env, len(reader.agents)
+        self.metadata = getattr(env, "metadata", {})
         if not hasattr(env.unwrapped, "render_mode"):
             env.unwrapped.render_mode = None
-        check_is_parallel(env, is_factory=True)
-        super().__init__(env, black_death=True)
-        self.observation_space = reader.rows.to_row_space()
+        self.render_mode = env.unwrapped.render_mode
+        self.observation_space, self.action_space = reader.rows.to_row_space(), reader.action_space
         self.agents = reader.agents
         #: Infos of the last reset, one per row.
         self.reset_infos: Infos = []
@@ -104,9 +105,10 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     def step(self, actions: npt.NDArray[Any]) -> tuple[Any, Any, Any, Any, Infos]:
         """Step the game with the actions of the N rows (see PettingZoo); the next episode begins automatically."""
         acted = self._playing
-        chosen = dict(zip(self.agents, iterate(self.action_space, actions), strict=True))
         self._count_step(self._n_steps + 1)
-        result = self.par_env.step({agent: chosen[agent] for agent in acted})
+        result = self.par_env.step(
+            {agent: self._action(agent, actions[i]) for i, agent in enumerate(self.agents) if agent in acted}
+        )
         observations, rewards, terminations, truncations, infos = audit.step_results(self.par_env, result)
         paid = [audit.reward_of(rewards, agent, self._place, agent in acted) for agent in self.agents]
         terminated = {agent for agent in acted if audit.end_of("terminations", terminations, agent, self._place)}
@@ -127,6 +129,20 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         rows = self.reset()[0] if over else self._rows(observations, infos, self._playing, self._playing)
         ends_by_limit = np.array([over and agent in truncated for agent in self.agents])
         return rows, np.array(paid, dtype=np.float32), over & ~ends_by_limit, ends_by_limit, row_infos
+
+    def _rows(
+        self, observations: Any, infos: Any, shown: Container[Any], active: Container[Any], over: bool = False
+    ) -> Any:
+        return self._reader.read(self.par_env, observations, infos, shown, active, self._place, over)
+
+    def _action(self, agent: Any, action: Any) -> Any:
+        conversion = self._reader.conversions[agent]
+        if conversion.keeps_actions:
+            return action
+        try:
+            return conversion.game_action(action)
+        except ValueError as error:
+            raise ValueError(f"action of {agent} {self._place}: {error}") from None
 
     def close(self) -> None:
         """Close the game, once."""
@@ -167,42 +183,6 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
                 )
             rows.append(info)
         return rows
-
-    def _rows(
-        self,
-        observations: Mapping[Any, Any],
-        infos: Mapping[Any, Any],
-        shown: Container[Any],
-        active: Container[Any],
-        over: bool = False,
-    ) -> Any:
-        """
-        Stack the observations of the N rows.
-
-        :param shown: agents whose observations are shown
-        :param active: agents that take part, and must have an observation
-        :param over: whether these are last observations, on which no agent acts
-        """
-        reader, place = self._reader, self._place
-        rows = {
-            agent: reader.own(observations, agent, place, agent in active) if agent in shown else reader.blank
-            for agent in self.agents
-        }
-        if reader.rows.is_dict:
-            state = reader.state(self.par_env, place)
-            rows = {
-                agent: {
-                    OBS_KEY: own,
-                    **reader.signals(observations, infos, agent, place, agent in active, over),
-                    **state,
-                }
-                for agent, own in rows.items()
-            }
-        empty: Any = create_empty_array(self.observation_space, self.num_envs)
-        stacked: Any = concatenate(self.observation_space, list(rows.values()), empty)
-        if reader.rows.has_active and not over and isinstance(stacked[OBS_KEY], np.ndarray):
-            fill_idle_rows(stacked[OBS_KEY], stacked[ACTIVE_KEY])
-        return stacked
 
     def snapshot(self, way: Way) -> dict[str, Any]:
         """Return the complete state of the game, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
@@ -275,8 +255,8 @@ class GameSource:
         """Make a game."""
         if self._pickled is not None:
             content = cloudpickle.loads(self._pickled)
-            return content() if self._is_factory else content
-        return self._original() if self._is_factory else self._copy()
+            return as_parallel(content() if self._is_factory else content)
+        return as_parallel(self._original() if self._is_factory else self._copy())
 
     def _copy(self) -> Any:
         try:

@@ -13,14 +13,14 @@ from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs import audit
-from sb3_saf.envs.audit import check_is_parallel
-from sb3_saf.envs.equal_spaces import EqualSpaces, trial_of
+from sb3_saf.envs.audit import Trial, check_is_parallel
 from sb3_saf.envs.game_copies import check_signatures, common_settings, signature
-from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv, common_space
-from sb3_saf.envs.space_reader import checked_actions, counted_from_zero, first_value
+from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv
+from sb3_saf.envs.gymnasium_team import as_parallel
 from sb3_saf.envs.supersuit_games import GameSource, TeamConcatVecEnv
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import Array
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
@@ -40,7 +40,8 @@ class SuperSuitVecEnv(TeamVecEnv):
     infos named ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which
     Stable-Baselines3 or this package uses, are renamed: ``"game_episode"``, ...
 
-    Observations and actions of Discrete and MultiDiscrete spaces are counted from 0 in rows, whatever the ``start``
+    Dicts and Tuples of observations become one vector, as by ``gymnasium.spaces.flatten``; agents with different spaces
+    get equal ones (:class:`EqualSpaces`). Discrete and MultiDiscrete are counted from 0 in rows, whatever the ``start``
     of the game's space. Actions of a Box of integers may be given as floats, which are rounded.
 
     ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` and ``get_images`` take and return rows, as SB3's
@@ -65,14 +66,13 @@ class SuperSuitVecEnv(TeamVecEnv):
     :param seed: seed of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
     :param active: whether rows have ``"active"``
-    :param action_masks: None leaves observations unchanged. ``"auto"`` adds masks to rows if the game gives any, in
-        Dicts of observations or in ``infos[agent]["action_mask"]``, True requires them, False adds none; all three take
-        masks out of the observations, and flatten Dicts and Tuples of scalars and vectors to one vector, as
-        ``gymnasium.spaces.flatten`` does
+    :param action_masks: ``"auto"`` adds masks to rows if the game gives any, in Dicts of observations or in
+        ``infos[agent]["action_mask"]``, or if agents differ in their actions; True requires them, False adds none. They
+        are taken out of the observations
     :param state: whether rows have the game's ``state()``
     :param float64: whether observations of float64 stay so; False makes them float32
-    :raises ValueError: if the environment is no ParallelEnv or breaks its rules, cannot be copied, its agents differ in
-        their spaces, or a requested signal is missing
+    :raises ValueError: if the environment is no ParallelEnv or breaks its rules, cannot be copied, its agents have
+        actions that one policy cannot take, or a requested signal is missing
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         seed: int | None = None,
         n_cpus: int = 1,
         active: bool = False,
-        action_masks: AskMasks | None = None,
+        action_masks: AskMasks = "auto",
         state: bool = False,
         float64: bool = False,
     ) -> None:
@@ -93,8 +93,8 @@ class SuperSuitVecEnv(TeamVecEnv):
             warnings.warn(note, UserWarning, stacklevel=2)
         self._source = source
         self.possible_agents = list(reader.agents)
-        self.conversions = reader.conversions
-        self._game_action_space = reader.action_space
+        #: How each agent's observations and actions become those of rows, for models that act on the game's own.
+        self.conversions = tuple(reader.conversions.values())
         self._closed = self._begun = self._has_warned = False
         self._actions: Array | None = None
         #: Hashes of the first rows of each game's first episodes, to find games that ignore their seeds.
@@ -109,7 +109,7 @@ class SuperSuitVecEnv(TeamVecEnv):
                 n_games,
                 len(reader.agents),
                 reader.rows.to_row_space(),
-                counted_from_zero(reader.action_space),
+                reader.action_space,
                 seed,
             )
         except BaseException:
@@ -141,15 +141,13 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._check_open()
         if not self._begun:
             raise RuntimeError("no episode has begun (or one was stopped by an error): call reset() before step()")
-        self._actions = checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
+        self._actions = self.checked_actions(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all games; return observations, rewards (float32), dones (bool) and infos of the B rows."""
         if self._actions is None:
             raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
-        actions, start = self._actions, first_value(self._game_action_space)
-        if np.any(start != 0):
-            actions = (actions + start).astype(actions.dtype, copy=False)
+        actions = self._actions
         self._begun, self._actions = False, None
         step = self._games.play(actions)
         self._begun = True
@@ -253,7 +251,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Call a method of the rows' games, once for every row; ``action_masks`` once per game (see the class)."""
         rows = chosen_indices(indices, self.num_envs)
         if method_name == "action_masks" and not method_args and not method_kwargs:
-            masks = self._ask(self._games_of(rows), _action_masks, self.possible_agents)
+            masks = self._ask(self._games_of(rows), _action_masks, self.possible_agents, self.conversions)
             return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
         return [self._call(game, method_name, method_args, method_kwargs) for game in self._games_of(rows)]
 
@@ -272,9 +270,10 @@ class SuperSuitVecEnv(TeamVecEnv):
 
 
 def _source_and_reader(
-    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks | None, state: bool, float64: bool
+    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks, state: bool, float64: bool
 ) -> tuple[GameSource, GameReader]:
     """Audit a copy of the game, and return the source of the games with their reader."""
+    make_env = as_parallel(make_env)
     is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
     if not is_factory:
         check_is_parallel(make_env, is_factory)
@@ -282,9 +281,9 @@ def _source_and_reader(
     example = source.build()
     try:
         check_is_parallel(example, is_factory)
-        for kind in ("observation", "action"):
-            common_space(example, kind, tuple(example.possible_agents))
-        return source, GameReader(example, trial_of(example), active, action_masks, state, float64)
+        trial = Trial(example)
+        trial.play()
+        return source, GameReader(trial, active, action_masks, state, float64)
     finally:
         with suppress(Exception):  # of games that must be reset before they are closed
             example.close()
@@ -298,15 +297,15 @@ def _is_wrapped(env: Any, wrapper_class: type[Any]) -> bool:
     return any(isinstance(layer, wrapper_class) for layer in audit.layers_of(env))
 
 
-def _action_masks(env: Any, agents: Sequence[Any]) -> list[Any]:
+def _action_masks(env: Any, agents: Sequence[Any], conversions: Sequence[AgentConversion]) -> list[Any]:
     """Return the masks of a game's method ``action_masks``; any action of agents that it leaves out is legal."""
     masks = audit.game_attribute(env, "action_masks")()
     if not isinstance(masks, Mapping):
         masks = dict.fromkeys(agents, masks)
-    if isinstance(env, EqualSpaces):
-        return [env.padded_mask(agent, masks.get(agent)).astype(bool) for agent in agents]
-    anything = np.ones_like(next(iter(masks.values())), dtype=bool) if masks else None
-    return [masks.get(agent, anything) for agent in agents]
+    return [
+        conversion.mask(masks.get(agent, np.ones(sum(conversion.action.choices)))).astype(bool)
+        for agent, conversion in zip(agents, conversions, strict=True)
+    ]
 
 
 def _bytes_of(observations: Any, game: int, n_agents: int) -> bytes:

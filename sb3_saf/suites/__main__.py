@@ -79,7 +79,7 @@ def example(suite: Suite, task: str) -> str:
     if suite.vec_env is not None:
         venv = suite.vec_env(task, 1, None, **suite.defaults)
     else:
-        venv = SuperSuitVecEnv(partial(find_environment(env_id).make_game, {}), 1, action_masks="auto")
+        venv = SuperSuitVecEnv(partial(find_environment(env_id).make_game, {}), 1)
     row = TeamSpaces.of_rows(venv.observation_space, venv.action_space, venv.n_agents)
     venv.close()
     masked = ", masked" if row.action_mask is not None else ""

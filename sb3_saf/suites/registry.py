@@ -15,7 +15,7 @@ from typing import Any, Final
 import pettingzoo
 
 import sb3_saf.suites
-from sb3_saf.envs.equal_spaces import team_game
+from sb3_saf.envs.gymnasium_team import as_parallel
 from sb3_saf.envs.vec_game import VecGame
 from sb3_saf.suites.suite import N_NEAREST, Suite
 from sb3_saf.teams.checks import import_by_name
@@ -79,7 +79,7 @@ class TeamEnvironment:
 
     def make_game(self, params: Mapping[str, Any], render_mode: str | None = None, **changes: Any) -> Any:
         """
-        Make one game of agents with equal spaces.
+        Make one game.
 
         :param params: parameters of the game
         :param render_mode: of the game; None to leave the argument out
@@ -88,7 +88,7 @@ class TeamEnvironment:
         """
         kwargs = {**params, **changes} if render_mode is None else {**params, **changes, "render_mode": render_mode}
         try:
-            game = team_game(self.make(**kwargs))
+            game = as_parallel(self.make(**kwargs))
         except TypeError as error:  # most often an argument that it does not have
             hint = "" if render_mode is None else "; to show its games, give it the argument render_mode (PettingZoo's)"
             raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}{hint}") from error

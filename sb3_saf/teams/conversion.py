@@ -1,17 +1,18 @@
 """
 One agent's observations, action masks and actions: from the form of the game to that of rows, and back.
 
-A conversion is plain data, known when the environment is made. It travels in the observation space
-(:class:`~sb3_saf.teams.rows.AgentSpace`), hence with every saved model, so that a model acts on what the game itself
-gives, and with every exported actor. To use one needs NumPy only.
+A conversion is plain data, known when the environment is made. Games are read by it in training, and it travels in the
+observation space (:class:`~sb3_saf.teams.rows.AgentSpace`), hence with every saved model and every exported actor, so
+that models act on what the game itself gives. To use one needs NumPy only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import prod
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -30,74 +31,157 @@ class Leaf:
     """
     One array of a game's observation, or its action.
 
-    :param kind: kind of space
+    :param space: description of its space, for messages
     :param shape: shape in the game
     :param dtype: NumPy's name of the type in the game
+    :param low: lowest values of all entries, or one value for all
+    :param high: highest values
     :param path: keys and indices that lead to it through Dicts and Tuples
     :param choices: numbers of choices of all entries of Discrete and MultiDiscrete, 2 for MultiBinary; else empty
-    :param start: lowest values of all entries of Discrete and MultiDiscrete, else empty
+    :param is_one_hot: whether it is Discrete or MultiDiscrete, which vectors hold one-hot and rows count from 0
     """
 
-    kind: Literal["box", "discrete", "multi_discrete", "multi_binary"]
+    space: str
     shape: tuple[int, ...]
     dtype: str
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     path: tuple[Key, ...] = ()
     choices: tuple[int, ...] = ()
-    start: tuple[int, ...] = ()
+    is_one_hot: bool = False
 
     @classmethod
     def of(cls, space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Leaf:
         """Describe a space of fixed shape."""
         from gymnasium import spaces
 
-        shape, dtype = tuple(space.shape or ()), str(space.dtype)
-        if isinstance(space, spaces.Discrete):
-            return cls("discrete", shape, dtype, path, (int(space.n),), (int(space.start),))
-        if isinstance(space, spaces.MultiDiscrete):
-            choices, start = (tuple(values.reshape(-1).tolist()) for values in (space.nvec, space.start))
-            return cls("multi_discrete", shape, dtype, path, choices, start)
+        form = str(space), tuple(space.shape or ()), str(space.dtype)
+        if isinstance(space, spaces.Box):
+            return cls(*form, _compact(space.low), _compact(space.high), path)
         if isinstance(space, spaces.MultiBinary):
-            return cls("multi_binary", shape, dtype, path, (2,) * prod(shape))
-        assert isinstance(space, spaces.Box), space
-        return cls("box", shape, dtype, path)
+            return cls(*form, (0,), (1,), path, (2,) * prod(space.shape))
+        assert isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)), space
+        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        low, choices = (tuple(np.reshape(values, -1).tolist()) for values in (space.start, count))
+        high = tuple(first + n - 1 for first, n in zip(low, choices, strict=True))
+        return cls(*form, low, high, path, choices, True)
+
+    @cached_property
+    def _dtype(self) -> np.dtype[Any]:
+        return np.dtype(self.dtype)
+
+    @cached_property
+    def start(self) -> Array | None:
+        """Lowest values if rows count from 0 what the game does not."""
+        is_shifted = self.is_one_hot and any(self.low)
+        return np.array(self.low, dtype=self._dtype).reshape(self.shape) if is_shifted else None
+
+    @cached_property
+    def _bounds(self) -> tuple[Any, Any]:
+        """Lowest and highest values of integers, in one number if all entries have the same; None for the type's."""
+        if self._dtype.kind not in "iu":
+            return None, None if self._dtype.kind == "f" else 1
+        limits = np.iinfo(self._dtype)
+        low, high = (
+            None if bound == (limit,) else bound[0] if len(bound) == 1 else np.reshape(bound, self.shape)
+            for bound, limit in ((self.low, limits.min), (self.high, limits.max))
+        )
+        return low, high
 
     def read(self, observation: Any) -> Array:
         """
         Return the array, counted from 0, from an observation.
 
+        Integers outside the bounds, which index tables, are refused.
+
         :param observation: as the game gives it
-        :raises ValueError: if it is missing, or of another shape or type
+        :raises ValueError: if it is missing, of another shape or type, or out of bounds
         """
-        where = "".join(f"[{key!r}]" for key in self.path)
-        for key in self.path:
+        for depth, key in enumerate(self.path):
             try:
                 observation = observation[key]
             except (KeyError, IndexError, TypeError):
                 got = list(observation) if isinstance(observation, Mapping) else type(observation).__name__
-                raise ValueError(f"expected observation{where}, got {got}") from None
-        array = np.asarray(observation)
-        if array.shape != self.shape or not np.can_cast(array.dtype, self.dtype, "same_kind"):
-            raise ValueError(
-                f"expected observation{where} of shape {self.shape} and dtype {self.dtype}, got {array.shape} and "
-                f"{array.dtype}"
-            )
-        array = array.astype(self.dtype, copy=False)
-        if not self.start:
-            return array
-        array = array - np.array(self.start, dtype=array.dtype).reshape(self.shape)
-        if ((array < 0) | (array >= np.array(self.choices).reshape(self.shape))).any():
-            raise ValueError(
-                f"expected observation{where} from {list(self.start)} with {list(self.choices)} choices, got "
-                f"{np.asarray(observation).tolist()}"
-            )
-        return array
+                raise ValueError(f"{_where(self.path[:depth])}expected a part {key!r}, got {got}") from None
+        array = observation if type(observation) is np.ndarray else _as_array(observation)
+        is_castable = array.dtype == self._dtype or np.can_cast(array.dtype, self._dtype, "same_kind")
+        if array.shape != self.shape or not is_castable:
+            got = f"{array.dtype} of shape {array.shape}"
+            raise ValueError(f"{_where(self.path)}expected {self.dtype} of shape {self.shape}, got {got}")
+        low, high = self._bounds
+        if high is not None and (array > high).any():
+            raise ValueError(self.outside(array, array > high))
+        if low is not None and (array < low).any():
+            raise ValueError(self.outside(array, array < low))
+        if self.start is not None:
+            array = array - self.start
+        return array.astype(self._dtype, copy=False)
+
+    def outside(self, array: Array, wrong: Array) -> str:
+        """Describe values outside the bounds."""
+        return (
+            f"{_where(self.path)}expected values from {min(self.low)} to {max(self.high)} as in {self.space}, got "
+            f"{array[wrong].reshape(-1)[0]}; make the space as wide as what the game gives"
+        )
 
     def flat(self, array: Array) -> Array:
         """Return an array of :meth:`read` as a vector, as ``gymnasium.spaces.flatten``: choices are one-hot."""
-        if not self.start:
+        if not self.is_one_hot:
             return array.reshape(-1)
         codes = [np.eye(n)[int(choice)] for n, choice in zip(self.choices, array.reshape(-1), strict=True)]
         return np.concatenate(codes)
+
+
+def _compact(bound: Array) -> tuple[float, ...]:
+    """Return the bounds of all entries, one value if all are equal."""
+    values = bound.reshape(-1).tolist()
+    return (values[0],) if (bound == bound.flat[0]).all() else tuple(values)
+
+
+def _where(path: tuple[Key, ...]) -> str:
+    return "".join(f"[{key!r}]" for key in path) + (": " if path else "")
+
+
+def _as_array(value: Any) -> Array:
+    try:
+        return np.asarray(value)
+    except ValueError:  # lists of unequal lengths
+        return np.asarray(None)
+
+
+def leaves_of(space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Iterator[Leaf]:
+    """Yield the innermost spaces of nested Dicts and Tuples, in the order of ``gymnasium.spaces.flatten``."""
+    from gymnasium import spaces
+
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        for key, part in parts:
+            yield from leaves_of(part, (*path, key))
+    else:
+        yield Leaf.of(space, path)
+
+
+def read_leaves(leaves: Sequence[Leaf], observation: Any) -> list[Array]:
+    """
+    Return all arrays of an observation, see :meth:`Leaf.read`.
+
+    :raises ValueError: also for entries that the space lacks
+    """
+    keys = list(dict.fromkeys(leaf.path[0] for leaf in leaves if leaf.path))
+    if keys:
+        known = isinstance(observation, (Mapping, tuple, list))
+        got = list(observation) if isinstance(observation, Mapping) else list(range(len(observation))) if known else []
+        if not known or set(got) != set(keys):
+            raise ValueError(f"expected the parts {keys}, got {got if known else type(observation).__name__}")
+    return [leaf.read(observation) for leaf in leaves]
+
+
+def checked_mask(mask: Any, n_entries: int) -> npt.NDArray[np.int8]:
+    """Return an action mask as int8, (n_entries,); the ValueError for any other form says what was expected."""
+    array = _as_array(mask)
+    if array.shape != (n_entries,) or array.dtype.kind not in "biuf" or not ((array == 0) | (array == 1)).all():
+        raise ValueError(f"expected an action mask of {n_entries} zeros and ones (one per action), got {mask!r}")
+    return array.astype(np.int8)
 
 
 @dataclass(frozen=True)
@@ -109,11 +193,9 @@ class AgentConversion:
     :param is_flat: whether rows have them as one vector
     :param shape: shape of a row's own observation; smaller ones are padded with zeros at the end of each axis
     :param dtype: its type
-    :param channels_last: whether the game's pictures have channels last, and rows have them first
     :param action: the agent's action in the game
-    :param row_choices: numbers of choices of all entries of a row's action; empty for Boxes
-    :param low: lowest values of all entries of a Box action in the game, else empty
-    :param high: highest values
+    :param row_action: the action of a row
+    :param channels_last: whether the game's pictures have channels last, and rows have them first
     :param mask_key: key of the mask in observations of the game that have one
     :param needs_mask: whether the game itself gives the agent action masks
     """
@@ -123,9 +205,7 @@ class AgentConversion:
     shape: tuple[int, ...]
     dtype: str
     action: Leaf
-    row_choices: tuple[int, ...] = ()
-    low: tuple[float, ...] = ()
-    high: tuple[float, ...] = ()
+    row_action: Leaf
     channels_last: bool = False
     mask_key: str | None = None
     needs_mask: bool = False
@@ -152,20 +232,15 @@ class AgentConversion:
         """
         from gymnasium import spaces
 
-        shape, action = tuple(own.shape or ()), Leaf.of(action_space)
+        shape = tuple(own.shape or ())
         is_own_form = isinstance(observation_space, type(own)) and len(observation_space.shape or ()) == len(shape)
-        low, high = (), ()
-        if isinstance(action_space, spaces.Box):
-            low, high = (tuple(bound.reshape(-1).tolist()) for bound in (action_space.low, action_space.high))
         return cls(
-            tuple(_leaves(observation_space)),
+            tuple(leaves_of(observation_space)),
             isinstance(own, spaces.Box) and not is_own_form,
             shape,
             str(own.dtype),
-            action,
-            Leaf.of(row_actions).choices,
-            low,
-            high,
+            Leaf.of(action_space),
+            Leaf.of(row_actions),
             mask_key=mask_key,
             needs_mask=needs_mask,
         )
@@ -174,8 +249,8 @@ class AgentConversion:
     def from_plain(cls, plain: Mapping[str, Any]) -> AgentConversion:
         """Return a conversion from what JSON gives back of ``dataclasses.asdict``."""
         entries = _with_tuples(plain)
-        leaves = tuple(Leaf(**leaf) for leaf in entries["leaves"])
-        return cls(**{**entries, "leaves": leaves, "action": Leaf(**entries["action"])})
+        leaves = {key: Leaf(**entries[key]) for key in ("action", "row_action")}
+        return cls(**{**entries, **leaves, "leaves": tuple(Leaf(**leaf) for leaf in entries["leaves"])})
 
     def with_channels_first(self) -> AgentConversion:
         """Return the conversion for rows whose pictures have channels first, (H, W, C) -> (C, H, W)."""
@@ -201,40 +276,37 @@ class AgentConversion:
 
         :raises ValueError: if it does not have the form of the game's space
         """
-        keys = list(dict.fromkeys(leaf.path[0] for leaf in self.leaves if leaf.path))
-        if keys and isinstance(observation, Mapping) and set(observation) != set(keys):
-            raise ValueError(f"expected an observation with the parts {keys}, got {list(observation)}")
-        arrays = [leaf.read(observation) for leaf in self.leaves]
+        arrays = read_leaves(self.leaves, observation)
         if self.is_flat:
             array = np.concatenate([leaf.flat(one) for leaf, one in zip(self.leaves, arrays, strict=True)])
         else:
             array = np.moveaxis(arrays[0], -1, 0) if self.channels_last else arrays[0]
-        if array.shape == self.shape:
+        if array.shape != self.shape:
+            array = _padded(array, self.shape)
+        with np.errstate(over="ignore"):
             return array.astype(self.dtype, copy=False)
-        row = np.zeros(self.shape, dtype=self.dtype)
-        row[tuple(slice(size) for size in array.shape)] = array
-        return row
 
     def mask(self, mask: Any) -> Array:
         """
         Convert an action mask of the game to that of a row: choices and entries that the agent lacks are illegal.
 
         :param mask: (A of the agent,); None where the game gives none: all its actions are legal
+        :return: (A of a row,) int8
         :raises ValueError: for a mask of another form, and for none where the game gives one
         """
-        own = self.action.choices
-        if mask is None and self.needs_mask:
-            raise ValueError(f"expected the {_ACTION_MASK!r} of the game, which masks {sum(own)} choices, got none")
-        array = np.ones(sum(own), dtype=np.int8) if mask is None else np.asarray(mask)
-        if array.shape == (sum(self.row_choices),) and own != self.row_choices:
-            return array.astype(np.int8)  # that of a row already
-        if array.shape != (sum(own),) or not ((array == 0) | (array == 1)).all():
-            raise ValueError(f"expected {_ACTION_MASK!r} with {sum(own)} zeros and ones, got {mask!r}")
-        row = np.zeros((len(self.row_choices), max(self.row_choices)), dtype=np.int8)
-        row[len(own) :, 0] = 1  # entries that the agent lacks
-        for entry, part in enumerate(np.split(array, np.cumsum(own)[:-1])):
-            row[entry, : len(part)] = part
-        return np.concatenate([entry[:n] for entry, n in zip(row, self.row_choices, strict=True)])
+        own, row_choices = self.action.choices, self.row_action.choices
+        if mask is not None and own != row_choices and np.shape(mask) == (sum(row_choices),):
+            return np.asarray(mask, dtype=np.int8)  # that of a row already
+        array = np.ones(sum(own), np.int8) if mask is None and not self.needs_mask else checked_mask(mask, sum(own))
+        if own == row_choices:
+            return array
+        parts = [*np.split(array, np.cumsum(own)[:-1]), *[np.ones(1, np.int8)] * (len(row_choices) - len(own))]
+        return np.concatenate([_padded(part, (n,)) for part, n in zip(parts, row_choices, strict=True)])
+
+    @cached_property
+    def keeps_actions(self) -> bool:
+        """Whether actions of rows are those of the game."""
+        return self.action.start is None and replace(self.action, space="") == replace(self.row_action, space="")
 
     def game_action(self, action: Any) -> Any:
         """
@@ -244,17 +316,15 @@ class AgentConversion:
         :raises ValueError: for choices that the agent lacks
         """
         leaf, array = self.action, np.asarray(action).reshape(-1)[: prod(self.action.shape)]
-        if leaf.kind == "box":
-            array = np.clip(array, self.low, self.high)
-        elif (array >= np.array(leaf.choices)).any():
+        if not leaf.choices:
+            array = np.clip(array, leaf.low, leaf.high)
+        elif ((array < 0) | (array >= np.array(leaf.choices))).any():
             raise ValueError(
-                f"expected an action with {list(leaf.choices)} choices, got {array.tolist()}, which is masked; use a "
-                "policy that takes legal actions only (those of sb3_saf do, with action_masks='auto' of make_team_env)"
+                f"expected an action of {leaf.space}, got {array.tolist()}, which is masked; use a policy that takes "
+                "legal actions only (those of sb3_saf do, with action_masks='auto' of make_team_env)"
             )
-        if leaf.start:
-            array = array + np.array(leaf.start)
-        array = array.astype(leaf.dtype).reshape(leaf.shape)
-        return array if leaf.shape else array[()]
+        array = array.reshape(leaf.shape) if leaf.start is None else array.reshape(leaf.shape) + leaf.start
+        return array.astype(leaf.dtype)[()]
 
     def fits(self, observation: Any) -> bool:
         """Return whether an observation has the form of the agent's in the game, with or without mask."""
@@ -265,31 +335,11 @@ class AgentConversion:
         return True
 
 
-def conversions_of(
-    env: Any,
-    own: spaces.Space[Any],
-    row_actions: spaces.Space[Any],
-    needs_mask: bool,
-    mask_keys: Mapping[Any, str | None],
-) -> tuple[AgentConversion, ...]:
-    """
-    Return the conversions of a game's agents, in the order of ``possible_agents``.
-
-    :param env: the game, a ParallelEnv
-    :param own: space of a row's own observation
-    :param row_actions: action space of rows
-    :param needs_mask: whether the game gives action masks in its infos
-    :param mask_keys: key of the masks in an agent's observations, if they have masks
-    """
-    conversions = []
-    for agent in env.possible_agents:
-        observed, key = env.observation_space(agent), mask_keys.get(agent)
-        if key is not None:
-            others = {name: space for name, space in observed.spaces.items() if name != key}
-            observed = next(iter(others.values())) if len(others) == 1 else type(observed)(list(others.items()))
-        action_space = env.action_space(agent)
-        conversions.append(AgentConversion.of(observed, action_space, own, row_actions, key, needs_mask or bool(key)))
-    return tuple(conversions)
+def _padded(array: Array, shape: tuple[int, ...]) -> Array:
+    """Add zeros at the end of each axis."""
+    row = np.zeros(shape, dtype=array.dtype)
+    row[tuple(slice(size) for size in array.shape)] = array
+    return row
 
 
 def _with_tuples(value: Any) -> Any:
@@ -297,18 +347,6 @@ def _with_tuples(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _with_tuples(item) for key, item in value.items()}
     return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value
-
-
-def _leaves(space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Iterator[Leaf]:
-    """Yield the innermost spaces of nested Dicts and Tuples, in the order of ``gymnasium.spaces.flatten``."""
-    from gymnasium import spaces
-
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        for key, part in parts:
-            yield from _leaves(part, (*path, key))
-    else:
-        yield Leaf.of(space, path)
 
 
 def pixels_to_codes(pictures: Array, atlas: Array) -> Array:

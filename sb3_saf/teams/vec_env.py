@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from sb3_saf.teams.checks import check_count, check_whole_teams
 from sb3_saf.teams.errors import NonFiniteError
 from sb3_saf.teams.randomness import game_seeds
-from sb3_saf.teams.rows import IS_SUCCESS, Array
+from sb3_saf.teams.rows import IS_SUCCESS, Array, bounds_of
 
 #: Attributes with the shape of a vector environment of flattened teams.
 _TEAM_ATTRIBUTES: Final = ("n_agents", "n_games")
@@ -54,6 +54,9 @@ class TeamVecEnv(VecEnv):
     :param seed: see :meth:`seed`
     """
 
+    #: N names of the agents.
+    possible_agents: list[Any]
+
     def __init__(
         self,
         n_games: int,
@@ -88,6 +91,39 @@ class TeamVecEnv(VecEnv):
         #: Seeds for the next reset; None continues the games' random streams.
         self._next_seeds: list[int] | None = chosen
         return self.per_row(chosen)
+
+    def checked_actions(self, actions: npt.ArrayLike) -> Array:
+        """
+        Check the actions of all rows and convert them to the dtype of their space.
+
+        :param actions: (B, ...)
+        :return: a copy
+        :raises ValueError: naming the first row with actions that are not in the space
+        """
+        space, array = self.action_space, np.asarray(actions)
+        shape, dtype = (self.num_envs, *(space.shape or ())), np.dtype(space.dtype)
+        # SB3's policies give floats for MultiBinary and for every Box.
+        kinds = {spaces.MultiBinary: "biuf", spaces.Box: "fiu"}.get(type(space), "iu")
+        if array.shape != shape or array.dtype.kind not in kinds:
+            raise ValueError(
+                f"expected actions from {space} for {shape[0]} rows, {dtype} of shape {shape}, "
+                f"got {array.dtype} of shape {array.shape}"
+            )
+        if dtype.kind == "f":  # bounds are rounded to the dtype, so actions must be before they are compared
+            with np.errstate(over="ignore"):
+                array = array.astype(dtype, copy=False)
+        elif array.dtype.kind == "f" and isinstance(space, spaces.Box):
+            array = np.rint(array)
+        low, high = bounds_of(space)
+        inside = (array >= low) & (array <= high)
+        if isinstance(space, spaces.MultiBinary):
+            inside &= (array == 0) | (array == 1)
+        if not inside.all():
+            row = int(np.argwhere(~inside)[0, 0])
+            game, agent = divmod(row, self.n_agents)
+            name = self.possible_agents[agent]
+            raise ValueError(f"expected actions from {space}, got {array[row]} in row {row} (game {game}, {name})")
+        return np.array(array, dtype=dtype)  # a copy: the caller may reuse its array
 
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
         """

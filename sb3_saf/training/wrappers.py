@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.checkpoints.states import load_normalization_statistics, normalization_statistics
 from sb3_saf.envs.curriculum import Stage
-from sb3_saf.envs.equal_spaces import EqualSpaces, masks_are_inside
+from sb3_saf.envs.game_reader import EqualSpaces
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import SharedReward, TeamMonitor, TeamReward
 from sb3_saf.teams.checks import import_by_name
@@ -70,8 +70,8 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
     if "frame_stack" in wrapping:
         import supersuit
 
-        if masks_are_inside(game):
-            game = EqualSpaces(game)  # gives masks in infos, beside observations that can be stacked
+        if not all(isinstance(game.observation_space(agent), spaces.Box) for agent in game.possible_agents):
+            game = EqualSpaces(game)  # gives masks in infos, beside vectors that can be stacked
         game = supersuit.frame_stack_v1(game, wrapping["frame_stack"])
     return game
 

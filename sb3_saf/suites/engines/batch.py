@@ -13,7 +13,6 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs.audit import settings_of
-from sb3_saf.envs.space_reader import checked_actions
 from sb3_saf.teams.checks import check_count, check_form
 from sb3_saf.teams.rows import (
     ACTIVE_KEY,
@@ -204,7 +203,7 @@ class BatchVecEnv(TeamVecEnv):
         """
         if not self._running:
             raise ValueError("the games have not begun: call reset() before step()")
-        self._actions = checked_actions(self.action_space, self.possible_agents, self.num_envs, actions)
+        self._actions = self.checked_actions(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
