@@ -37,7 +37,7 @@ from sb3_saf.networks.encoders import PaperCNN, PartsEncoder, PartsSpace
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam
 from sb3_saf.suites.references import references, standing
-from sb3_saf.suites.registry import find_environment, suites
+from sb3_saf.suites.registry import TeamEnvironment, find_environment, suites
 from sb3_saf.suites.suite import Suite
 from sb3_saf.training.settings import load_settings, saved_settings
 from tests.toy_envs import CounterEnv
@@ -248,35 +248,9 @@ def test_groups_with_other_spaces_are_one_team() -> None:
     assert rows["action_mask"].sum(axis=1).tolist() == n_legal
 
 
-def _engines() -> list[Any]:
-    return [
-        pytest.param(f"{suite.name}/{suite.examples[0]}", marks=[_needs(suite.name)])
-        for suite in suites().values()
-        if suite.vec_env is not None
-    ]
-
-
-@pytest.mark.parametrize("env_id", _engines())
-def test_one_game_of_an_engine_is_played_like_any_other(env_id: str) -> None:
-    """As ``enjoy`` and films do: until the end of an episode, only legal actions, without ended agents."""
-    game, rng = find_environment(env_id).make_game({}), np.random.default_rng(0)
-    observations, infos = game.reset(seed=3)
-    again, _ = game.reset(seed=3)
-    for agent in game.possible_agents:
-        np.testing.assert_array_equal(observations[agent], again[agent])
-        assert game.observation_space(agent).contains(observations[agent])
-    n_steps = 0
-    while game.agents:
-        acting, n_steps = list(game.agents), n_steps + 1
-        actions = {}
-        for agent in acting:
-            mask = infos[agent].get("action_mask")
-            actions[agent] = game.action_space(agent).sample() if mask is None else rng.choice(np.flatnonzero(mask))
-        *parts, infos = game.step(actions)
-        assert all(list(part) == acting for part in (*parts, infos))
-    _, _, terminations, truncations = parts
-    assert n_steps > 1 and all(terminations[agent] != truncations[agent] for agent in acting)
-    game.close()
+def test_an_engine_makes_no_single_games_to_wrap() -> None:
+    with pytest.raises(ValueError, match=r"engine/task .* vec_env_wrapper"):
+        TeamEnvironment("engine/task", None).make_game({})
 
 
 # --- custom suites ----------------------------------------------------------------------------------------------------

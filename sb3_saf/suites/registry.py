@@ -16,7 +16,6 @@ import pettingzoo
 
 import sb3_saf.suites
 from sb3_saf.envs.gymnasium_team import as_parallel
-from sb3_saf.envs.vec_game import VecGame
 from sb3_saf.suites.suite import N_NEAREST, Suite
 from sb3_saf.teams.checks import import_by_name
 
@@ -35,13 +34,13 @@ class TeamEnvironment:
     Environment with a name.
 
     :param id: its name in files: ``"TeamSupport-v0"``, ``"lbf/Foraging-8x8-2p-3f-v3"``, ``"package.module:function"``
-    :param make: makes one game from ``render_mode`` and parameters
+    :param make: makes one game from ``render_mode`` and parameters; None if its suite has an engine only
     :param suite: its suite, None for modules, functions and ids registered with PettingZoo
     :param task: name of the task in its suite
     """
 
     id: str
-    make: Callable[..., Any]
+    make: Callable[..., Any] | None
     suite: Suite | None = None
     task: str = ""
 
@@ -70,7 +69,11 @@ class TeamEnvironment:
         """
         if self.suite is not None and self.suite.complete is not None:
             return int(params["n_agents"])
-        game = self.make_game(params)
+        game: Any = None
+        if self.make is not None:
+            game = self.make_game(params)
+        elif self.suite is not None and self.suite.vec_env is not None:
+            game = self.suite.vec_env(self.task, 1, None, **params)
         agents = getattr(game, "possible_agents", None)
         game.close()
         if not agents:
@@ -86,6 +89,8 @@ class TeamEnvironment:
         :param changes: parameters that replace others
         :raises ValueError: for invalid parameters, or if it is no ParallelEnv
         """
+        if self.make is None:
+            raise ValueError(f"{self.id} has an engine only, which makes no single games to wrap: use vec_env_wrapper")
         kwargs = {**params, **changes} if render_mode is None else {**params, **changes, "render_mode": render_mode}
         try:
             game = as_parallel(self.make(**kwargs))
@@ -136,16 +141,8 @@ def _of_suite(suite: Suite, name: str) -> TeamEnvironment:
     task = suite.find_task(name)
     if task is None:
         raise suite.unknown_task(name)
-    if suite.game is not None:
-        make: Callable[..., Any] = partial(suite.game, task)
-    else:
-        assert suite.vec_env is not None
-        make = partial(_vec_game, suite.vec_env, task)
+    make = None if suite.game is None else partial(suite.game, task)
     return TeamEnvironment(task if suite.name == HOME else f"{suite.name}/{task}", make, suite, task)
-
-
-def _vec_game(make: Callable[..., Any], task: str, **params: Any) -> VecGame:
-    return VecGame(make(task, 1, None, **params))
 
 
 def _is_module(name: str) -> bool:
