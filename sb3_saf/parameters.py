@@ -54,7 +54,7 @@ def paper_policy(declaration: Declaration) -> TeamPolicy:
     :param declaration: declaration of an algorithm in the table
     """
     assert declaration.paper_table is not None
-    rows = TeamSpaces.of(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
+    rows = TeamSpaces(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
     policy_class: Any = declaration.policies[PPO][0]
     kwargs = declaration.paper_table.policy_kwargs
     return policy_class(rows, spaces.Discrete(7), lambda _: 0.0, ortho_init=False, **kwargs)

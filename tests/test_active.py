@@ -55,7 +55,7 @@ def test_rows_tell_who_is_active_what_is_legal_and_the_state(masks: str, n_cpus:
     env = telling_env(masks=masks, n_cpus=n_cpus, time_limit="bootstrap")
     assert (
         env.observation_space
-        == TeamSpaces.of(
+        == TeamSpaces(
             spaces.Box(0, np.inf, (3,)), N_AGENTS, True, N_ACTIONS, spaces.Box(0, 100, (2,)), has_starts=True
         ).to_dict_space()
     )
@@ -181,7 +181,7 @@ def test_random_teams_take_legal_actions_each_as_often() -> None:
 
 
 def telling_spaces(n_agents: int = N_AGENTS, state: Any = spaces.Box(0, 100, (2,))) -> spaces.Dict:  # noqa: B008
-    return TeamSpaces.of(spaces.Box(-1, 1, (3,)), n_agents, True, N_ACTIONS, state).to_dict_space()
+    return TeamSpaces(spaces.Box(-1, 1, (3,)), n_agents, True, N_ACTIONS, state).to_dict_space()
 
 
 def fill(buffers: list[Any], env: CentralizedValueWrapper, n_steps: int, zero_values: bool) -> tuple[Array, Array]:

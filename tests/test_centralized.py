@@ -137,7 +137,7 @@ def test_spaces_are_passed_on_as_the_same_objects() -> None:
     ids=lambda value: None if callable(value) else str(value),
 )
 def test_bounds_of_a_team_are_those_of_its_agents(own: spaces.Space[Any], low: Any, high: Any) -> None:
-    team = TeamSpaces.of(own, 3).team
+    team = TeamSpaces(own, 3).team
     assert team.low.tolist() == [low] * 3
     assert team.high.tolist() == [high] * 3
 
@@ -319,7 +319,7 @@ def test_team_size_that_only_the_wrapper_knows() -> None:
             r"CentralizedValueWrapper; wrap it once \(sb3_saf.make_team_env has done so\)",
         ),
         (
-            lambda: TeamSpaces.of(spaces.Dict({"a": VECTOR}), 2),
+            lambda: TeamSpaces(spaces.Dict({"a": VECTOR}), 2),
             r"an agent's own observation space must be Box, Discrete, MultiDiscrete or MultiBinary, got Dict.*; "
             r"flatten it in a wrapper of the environment, for instance with gymnasium.spaces.flatten",
         ),

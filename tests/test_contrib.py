@@ -72,7 +72,7 @@ def make_policy(
     """Create a small policy for three agents; noise on the actor's small first weights makes every part matter."""
     th.manual_seed(0)
     policy_class: type[TeamPolicy] = CLASSES[name]
-    space = TeamSpaces.of(VECTOR, 3, has_starts=True).to_dict_space()
+    space = TeamSpaces(VECTOR, 3, has_starts=True).to_dict_space()
     policy = policy_class(space, action_space, lambda _: 1e-3, **(sizes_of(name) | kwargs))
     with th.no_grad():
         for parameter in policy.actor.parameters():

@@ -73,7 +73,7 @@ class OwnEncoder(BaseFeaturesExtractor):
 def masked(policy_class: type[TeamActorCriticPolicy], **kwargs: Any) -> TeamActorCriticPolicy:
     """Create a policy for rows with masks of three actions."""
     th.manual_seed(0)
-    space = TeamSpaces.of(VECTOR, 3, n_masked_actions=3).to_dict_space()
+    space = TeamSpaces(VECTOR, 3, n_masked_actions=3).to_dict_space()
     policy = policy_class(space, ACTIONS["discrete"], constant, **cast(Any, SMALL | kwargs))
     with th.no_grad():
         for parameter in policy.actor.parameters():

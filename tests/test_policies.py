@@ -82,7 +82,7 @@ def make_policy(
     """Create a small policy for three agents; noise on the actor's small first weights makes every part matter."""
     th.manual_seed(seed)
     sizes: dict[str, Any] = SMALL | (SMALL_SAF if policy_class is SAFPolicy else {})
-    space = TeamSpaces.of(own, 3).to_dict_space()
+    space = TeamSpaces(own, 3).to_dict_space()
     policy = policy_class(space, action_space, constant, **(sizes | kwargs))
     with th.no_grad():
         for parameter in policy.actor.parameters():
@@ -441,7 +441,7 @@ def test_net_arch_for_actor_and_critic() -> None:
 
 def test_orthogonal_initialisation_and_gains() -> None:
     th.manual_seed(0)
-    policy = SAFPolicy(TeamSpaces.of(PICTURE, 3).to_dict_space(), spaces.Discrete(4), constant)
+    policy = SAFPolicy(TeamSpaces(PICTURE, 3).to_dict_space(), spaces.Discrete(4), constant)
     gains = {
         "features_extractor.encoder.net.0": 2**0.5,
         "features_extractor.encoder.net.5": 2**0.5,
@@ -458,7 +458,7 @@ def test_orthogonal_initialisation_and_gains() -> None:
     assert all(
         (layer.bias == 0).all() for layer in policy.modules() if isinstance(layer, Linear) and layer.bias is not None
     )
-    plain = SAFPolicy(TeamSpaces.of(VECTOR, 3).to_dict_space(), spaces.Discrete(4), constant, ortho_init=False)
+    plain = SAFPolicy(TeamSpaces(VECTOR, 3).to_dict_space(), spaces.Discrete(4), constant, ortho_init=False)
     assert (plain.get_parameter("actor.policies.0.net.0.bias") != 0).any()
 
 

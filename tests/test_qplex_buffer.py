@@ -21,7 +21,7 @@ OWN = spaces.Box(0, 255, (3,), np.uint8)
 
 
 def make_buffer(game_steps: int = 30, **kwargs: Any) -> TeamReplayBuffer:
-    space = TeamSpaces.of(OWN, N_AGENTS, **kwargs).to_dict_space()
+    space = TeamSpaces(OWN, N_AGENTS, **kwargs).to_dict_space()
     return TeamReplayBuffer(
         game_steps,
         space,
@@ -108,7 +108,7 @@ def check(story: Story, samples: TeamReplaySamples, oldest: int, terminal: bool 
     return found
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"active": True, "n_masked_actions": 4, "state": spaces.Box(0, 255, (1,))}])
+@pytest.mark.parametrize("kwargs", [{}, {"has_active": True, "n_masked_actions": 4, "state": spaces.Box(0, 255, (1,))}])
 def test_samples_are_what_happened(kwargs: dict[str, Any]) -> None:
     """Also after the ring was overwritten, with time limits and resets in between."""
     buffer, story = make_buffer(30, **kwargs), Story()
@@ -181,18 +181,18 @@ def test_rows_that_are_no_teams_are_refused() -> None:
     with pytest.raises(ValueError, match="of shape"):
         buffer.add({**rows, "obs": rows["obs"][:, :2]}, rows, *rest)
     with pytest.raises(ValueError, match="whole teams"):
-        TeamReplayBuffer(10, TeamSpaces.of(OWN, 2).to_dict_space(), spaces.Discrete(2), n_envs=3)
+        TeamReplayBuffer(10, TeamSpaces(OWN, 2).to_dict_space(), spaces.Discrete(2), n_envs=3)
 
 
 def test_teams_that_never_take_part_are_refused() -> None:
-    buffer, story = make_buffer(active=True), Story()
+    buffer, story = make_buffer(has_active=True), Story()
     rest: Any = (np.zeros(6, dtype=int), np.zeros(6), np.zeros(6), [{}] * 6)
     rows = story.rows(story.now)
     dead = {**rows, "active": np.zeros((6, N_AGENTS), dtype=np.int8)}
     buffer.add(dead, dead, *rest)
     with pytest.raises(ValueError, match=r"expected agents that take part, got none in 1 steps of 3 games"):
         buffer.sample(3)
-    copy = make_buffer(active=True)
+    copy = make_buffer(has_active=True)
     copy.load_checkpoint_state(buffer.checkpoint_state())
     with pytest.raises(ValueError, match="expected agents that take part"):
         copy.sample(3)
@@ -201,7 +201,7 @@ def test_teams_that_never_take_part_are_refused() -> None:
 
 
 def test_a_checkpoint_is_written_without_a_second_buffer_in_memory(tmp_path: Path) -> None:
-    space = TeamSpaces.of(spaces.Box(0, 255, (3_000,), np.uint8), N_AGENTS).to_dict_space()
+    space = TeamSpaces(spaces.Box(0, 255, (3_000,), np.uint8), N_AGENTS).to_dict_space()
     buffer = TeamReplayBuffer(6_000, space, spaces.Discrete(4), n_envs=N_AGENTS * N_GAMES)
     buffer._n_steps, buffer.pos, buffer._has_played, buffer.full = buffer.buffer_size, 0, True, True
     assert buffer.nbytes > 30e6

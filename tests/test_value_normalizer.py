@@ -238,7 +238,7 @@ def test_statistics_are_saved_and_loaded(tmp_path: Path) -> None:
 
 
 def test_statistics_are_no_parameters() -> None:
-    space = TeamSpaces.of(VECTOR, 3).to_dict_space()
+    space = TeamSpaces(VECTOR, 3).to_dict_space()
     policies = [
         POLICIES[1](space, ToyTeams().action_space, lambda _: 1e-3, normalize_values=on) for on in (True, False)
     ]

@@ -84,7 +84,7 @@ class ToyTeams(VecEnv):
         self._rng = np.random.default_rng(0)
         self._time = 0
         action_space = spaces.Discrete(3) if action_space is None else action_space
-        super().__init__(n_agents * n_games, TeamSpaces.of(own, n_agents).to_dict_space(), action_space)
+        super().__init__(n_agents * n_games, TeamSpaces(own, n_agents).to_dict_space(), action_space)
 
     def _observe(self) -> dict[str, np.ndarray]:
         drawn = self._rng.integers(len(self._views), size=(self.n_games, self.n_agents))

@@ -84,7 +84,6 @@ class GameReader:
             n_mask_entries(self.action_space) if has_masks else None,
             None if self._state is None else self._state[1],
             self.agents,
-            is_dict=active or has_masks or state,
         )
 
     def _find_masks(self, trial: Trial, action_masks: AskMasks) -> tuple[bool, set[Any]]:

@@ -84,14 +84,14 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         check_choice("time_limit", time_limit, get_args(TimeLimit))
         n_agents = require_n_agents(venv, n_agents)
         names = getattr(venv, "possible_agents", None)
-        names = names if names is not None and len(names) == n_agents else None
+        names = tuple(names) if names is not None and len(names) == n_agents else None
         raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
         state = None if raw.state is None else channels_first(raw.state)
         own = channels_first(raw.own)
         conversions: tuple[AgentConversion, ...] | None = getattr(venv, "conversions", None)
         if conversions is not None and own is not raw.own:
             conversions = tuple(one.with_channels_first() for one in conversions)
-        team = TeamSpaces.of(own, n_agents, raw.has_active, raw.n_masked_actions, state, names, conversions, True)
+        team = TeamSpaces(own, n_agents, raw.has_active, raw.n_masked_actions, state, names, conversions, True)
         if _sb3_would_transpose(team):
             venv = _protected_from_transposition(venv, n_agents)
             raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)

@@ -186,35 +186,40 @@ class TeamMonitor(TeamVecEnvWrapper):
             "file_size": 0 if self._writer is None else _synced_size(self._writer.file_handler),
         }
 
-    def _check_file(self, size: int, episode_count: int) -> None:
-        """Check that the first ``size`` bytes of the file hold the run's episodes."""
-        path = self._path()
-        if not size or path is None or not os.path.isfile(path) or os.path.getsize(path) < size:
-            return
-        with open(path, "rb") as file:
-            kept = file.read(size)
-        if kept.count(b"\n") != episode_count + 2 or not kept.endswith(b"\n"):
-            raise ValueError(
-                f"expected the first {size} bytes of {path} to be two lines and {episode_count} episodes, got "
-                f"{kept.count(bytes([10]))} lines; the file is that of another run"
-            )
-
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state; lines written to the file after it are cut off, since their episodes are played again."""
-        self._check_file(state["file_size"], state["episode_count"])
+        path, size = self._path(), state["file_size"]
+        kept = b""
+        if size and path is not None and os.path.isfile(path):
+            with open(path, "rb") as file:
+                kept = file.read(size)
+        n_lines = state["episode_count"] + 2
+        if len(kept) == size and size and (kept.count(b"\n") != n_lines or not kept.endswith(b"\n")):
+            raise ValueError(
+                f"expected the first {size} bytes of {path} to be two lines and {n_lines - 2} episodes, got "
+                f"{kept.count(bytes([10]))} lines; the file is that of another run"
+            )
         self._returns[:] = state["returns"]
         self._lengths[:] = state["lengths"]
         self._notes = [dict(notes) for notes in state["notes"]]
         self.episode_count = state["episode_count"]
         self.t_start = state["t_start"]
         self._n_steps = state["n_steps"]
-        if self._filename is None or not state["file_size"]:
+        if self._filename is None or not size:
             return  # the file is created at the next step
         if self._writer is not None:
             self._writer.close()
         self._writer = self._open(override_existing=False)
         assert self._writer is not None
-        _cut(self._writer.file_handler, state["file_size"])
+        if len(kept) == size:
+            os.truncate(self._writer.file_handler.fileno(), size)
+            return
+        warnings.warn(
+            f"expected {path} with the {size} bytes that it had at the checkpoint, got {len(kept)}: episodes before "
+            "the checkpoint are missing in it",
+            UserWarning,
+            stacklevel=2,
+        )
 
     def close(self) -> None:
         """Close the file and the environment."""
@@ -236,19 +241,6 @@ def _synced_size(file: IO[Any]) -> int:
     file.flush()
     os.fsync(file.fileno())
     return os.fstat(file.fileno()).st_size
-
-
-def _cut(file: IO[Any], size: int) -> None:
-    found = os.fstat(file.fileno()).st_size
-    if found < size:
-        warnings.warn(
-            f"expected {file.name} with the {size} bytes that it had at the checkpoint, got {found}: episodes before "
-            "the checkpoint are missing in it",
-            UserWarning,
-            stacklevel=3,
-        )
-        return
-    os.truncate(file.fileno(), size)
 
 
 class SharedReward(TeamVecEnvWrapper):

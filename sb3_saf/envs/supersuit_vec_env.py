@@ -163,8 +163,10 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Return a warning if all games began alike in ten episodes that differ."""
         if not self._beginnings:
             return []
+        parts = observations.values() if isinstance(observations, dict) else [observations]
         for game in begun:
-            self._beginnings[game].append(hash(_bytes_of(observations, game, self.n_agents)))
+            rows = slice(game * self.n_agents, (game + 1) * self.n_agents)
+            self._beginnings[game].append(hash(b"".join(part[rows].tobytes() for part in parts)))
         if min(map(len, self._beginnings)) < _N_BEGINNINGS:
             return []
         first, *others = (beginnings[:_N_BEGINNINGS] for beginnings in self._beginnings)
@@ -253,16 +255,14 @@ class SuperSuitVecEnv(TeamVecEnv):
         if method_name == "action_masks" and not method_args and not method_kwargs:
             masks = self._ask(self._games_of(rows), _action_masks, self.possible_agents, self.conversions)
             return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
-        return [self._call(game, method_name, method_args, method_kwargs) for game in self._games_of(rows)]
+        call = (_call_method, method_name, method_args, method_kwargs)
+        return [self._ask([game], *call)[0] for game in self._games_of(rows)]
 
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
         """Call a method once per game (see the base class)."""
         return self._ask(chosen_indices(games, self.n_games, "game"), _call_method, method_name, args, kwargs)
-
-    def _call(self, game: int, *call: Any) -> Any:
-        return self._ask([game], _call_method, *call)[0]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """Return whether the rows' games are wrapped in a wrapper."""
@@ -306,12 +306,3 @@ def _action_masks(env: Any, agents: Sequence[Any], conversions: Sequence[AgentCo
         conversion.mask(masks.get(agent, np.ones(sum(conversion.action.choices)))).astype(bool)
         for agent, conversion in zip(agents, conversions, strict=True)
     ]
-
-
-def _bytes_of(observations: Any, game: int, n_agents: int) -> bytes:
-    """Return the rows of a game as bytes."""
-    if isinstance(observations, Mapping):
-        return b"".join(_bytes_of(part, game, n_agents) for part in observations.values())
-    if isinstance(observations, tuple):
-        return b"".join(_bytes_of(part, game, n_agents) for part in observations)
-    return np.asarray(observations[game * n_agents : (game + 1) * n_agents]).tobytes()

@@ -249,9 +249,7 @@ def _kill(processes: Sequence[BaseProcess]) -> None:
 
 
 def _joined(parts: Sequence[Any]) -> Any:
-    """Join observations of the rows of several processes."""
-    if isinstance(parts[0], Mapping):
-        return {key: _joined([part[key] for part in parts]) for key in parts[0]}
-    if isinstance(parts[0], tuple):
-        return tuple(_joined(entries) for entries in zip(*parts, strict=True))
+    """Join the rows of several processes."""
+    if isinstance(parts[0], dict):
+        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return np.concatenate(parts)

@@ -104,15 +104,16 @@ class TeamSpaces:
     ``CentralizedValueWrapper`` adds ``"team"``, ``"agent"`` and ``"episode_start"``, and makes ``"active"`` that of the
     whole team.
 
-    :param own: space of one agent's own observation, shape ``(*shape)``
+    :param own: space of one agent's own observation, shape ``(*shape)``: Box, Discrete, MultiDiscrete or MultiBinary
     :param n_agents: N
     :param has_active: whether rows have ``"active"``
     :param n_masked_actions: A if rows have action masks, else None
     :param state: space of the game's state if rows have it
     :param names: the agents' names in index order, if they are known
-    :param is_dict: whether rows below ``CentralizedValueWrapper`` are Dicts
     :param conversions: of the agents' observations and actions in the game, in index order; None if rows are the game's
     :param has_starts: whether rows of ``CentralizedValueWrapper`` have ``"episode_start"``
+    :param is_dict: whether rows below ``CentralizedValueWrapper`` are Dicts, as those with a signal always are
+    :raises ValueError: if ``own`` or ``state`` is another kind of space
     """
 
     own: spaces.Space[Any]
@@ -120,42 +121,20 @@ class TeamSpaces:
     has_active: bool = False
     n_masked_actions: int | None = None
     state: spaces.Space[Any] | None = None
-    names: tuple[Any, ...] | None = None
-    is_dict: bool = False
-    conversions: tuple[AgentConversion, ...] | None = None
+    names: Sequence[Any] | None = None
+    conversions: Sequence[AgentConversion] | None = None
     has_starts: bool = False
+    is_dict: bool = False
 
-    @classmethod
-    def of(
-        cls,
-        own: spaces.Space[Any],
-        n_agents: int,
-        active: bool = False,
-        n_masked_actions: int | None = None,
-        state: spaces.Space[Any] | None = None,
-        names: Sequence[Any] | None = None,
-        conversions: Sequence[AgentConversion] | None = None,
-        has_starts: bool = False,
-    ) -> TeamSpaces:
-        """
-        Return the form of rows of a team whose agents share one observation space, which is checked.
-
-        :param own: Box, Discrete, MultiDiscrete or MultiBinary
-        :param n_agents: N
-        :param active: whether rows have ``"active"``
-        :param n_masked_actions: A if rows have action masks
-        :param state: space of the game's state if rows have it
-        :param names: the agents' names in index order, if they are known
-        :param conversions: of the agents' observations and actions in the game, in index order
-        :param has_starts: whether rows have ``"episode_start"``
-        :raises ValueError: if ``own`` or ``state`` is another kind of space
-        """
-        bounds_of(own)
-        if state is not None:
-            _check_state(state)
-        is_dict = active or n_masked_actions is not None or state is not None
-        known, forms = (None if values is None else tuple(values) for values in (names, conversions))
-        return cls(own, n_agents, active, n_masked_actions, state, known, is_dict, forms, has_starts)
+    def __post_init__(self) -> None:
+        bounds_of(self.own)
+        if self.state is not None and not isinstance(self.state, FIXED_SHAPE):
+            raise ValueError(
+                f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {self.state}; "
+                "flatten it first"
+            )
+        has_signal = self.has_active or self.n_masked_actions is not None or self.state is not None
+        object.__setattr__(self, "is_dict", self.is_dict or has_signal)
 
     @classmethod
     def of_rows(
@@ -174,7 +153,6 @@ class TeamSpaces:
         :param names: the agents' names in index order, if they are known
         :raises ValueError: if the space has rows of teams already, or an optional key has another form
         """
-        known = None if names is None else tuple(names)
         keys = set(space.spaces) if isinstance(space, spaces.Dict) else set()
         if set(TEAM_KEYS) <= keys <= ALL_KEYS:
             raise ValueError(
@@ -182,13 +160,13 @@ class TeamSpaces:
                 "CentralizedValueWrapper; wrap it once (sb3_saf.make_team_env has done so)"
             )
         if not isinstance(space, spaces.Dict) or OBS_KEY not in keys or not keys <= {OBS_KEY, *OPTIONAL_KEYS}:
-            return cls(space, n_agents, names=known)
+            return cls(space, n_agents, names=names)
         active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
         if active is not None and active != spaces.Discrete(2):
             raise ValueError(f"expected {ACTIVE_KEY!r} of a row to be Discrete(2), got {active}")
         check_masks(action_mask, action_space)
         n_masked = None if action_mask is None else int((action_mask.shape or ())[0])
-        return cls(space.spaces[OBS_KEY], n_agents, active is not None, n_masked, state, known, is_dict=True)
+        return cls(space.spaces[OBS_KEY], n_agents, active is not None, n_masked, state, names, is_dict=True)
 
     @classmethod
     def from_observation_space(cls, space: spaces.Space[Any]) -> TeamSpaces:
@@ -223,7 +201,7 @@ class TeamSpaces:
             raise ValueError(_not_a_team_space(f"its {EPISODE_START_KEY!r} must be Discrete(2), got {starts}"))
         n_masked = None if action_mask is None else action_mask.shape[0]
         names, conversions = (getattr(agent, name, None) for name in ("names", "conversions"))
-        return cls.of(own, n_agents, active is not None, n_masked, state, names, conversions, starts is not None)
+        return cls(own, n_agents, active is not None, n_masked, state, names, conversions, starts is not None)
 
     @cached_property
     def team(self) -> spaces.Box:
@@ -292,14 +270,6 @@ class TeamSpaces:
             got = sorted(obs) if isinstance(obs, Mapping) else type(obs).__name__
             raise ValueError(f"expected {what} to be a dict with the keys {keys}, got {got}")
         return {key: obs[key] for key in keys}
-
-
-def _check_state(state: spaces.Space[Any]) -> None:
-    if not isinstance(state, FIXED_SHAPE):
-        raise ValueError(
-            f"the space of {STATE_KEY!r} must be Box, Discrete, MultiDiscrete or MultiBinary, got {state}; flatten it "
-            "first"
-        )
 
 
 def n_mask_entries(action_space: spaces.Space[Any]) -> int | None:

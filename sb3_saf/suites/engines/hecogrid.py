@@ -29,7 +29,7 @@ class HECOGridGames(ResumableBatch):
     def __init__(self, batch: GameBatch, render_mode: RenderMode | None = None) -> None:
         games = [TASKS[batch.task].of_batch(batch, game, render_mode) for game in range(batch.n_games)]
         own, n_agents = observation_space(batch.task, batch.params), batch.params.n_agents
-        rows = TeamSpaces.of(own, n_agents)
+        rows = TeamSpaces(own, n_agents)
         actions = spaces.Discrete(N_ACTIONS)
         super().__init__(batch.n_games, games[0].possible_agents, rows, actions, objects=games, shares_reward=True)
         self.settings = {"task": batch.task, **asdict(batch.params)}

@@ -50,7 +50,7 @@ class VmasGames(Batch):
         own = spaces.Box(-np.inf, np.inf, (self._width,), np.float32)
         action_space, self._masks = _row_actions(self._action_spaces)
         n_masked = None if self._masks is None else self._masks.shape[1]
-        super().__init__(env.num_envs, agents, TeamSpaces.of(own, len(agents), True, n_masked), action_space, env)
+        super().__init__(env.num_envs, agents, TeamSpaces(own, len(agents), True, n_masked), action_space, env)
 
     @contextlib.contextmanager
     def _own_randomness(self) -> Iterator[None]:
