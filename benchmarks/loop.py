@@ -5,8 +5,9 @@ Measure the training loop with few games and small networks: SB3's own PPO compa
 ``free``: games that take no time (arrays drawn once), 3 agents, 18 numbers, 5 actions, episodes of 25 steps; MLP of 2 x
 64 without an encoder, for all, and SAF's pool, slots and widths of the zoo's size ``small``; 4 epochs, 4 minibatches.
 SB3 plays the same rows with its ``MlpPolicy``. ``small``: HECOGrid in the zoo's size ``small``, with the zoo's
-settings. ``memory``: the same for MAPPO and SAF, without and with memory. ``growth``: cost by the number of agents,
-``small`` with N agents and the same number of rows.
+settings. ``memory``: the same for MAPPO and SAF, without and with memory, in as many games as ``--memory-games`` says.
+``recurrent``: there, sb3-contrib's RecurrentPPO, and IPPO and MAPPO with LSTMs of ``--units`` for actor and critic (one
+for the team in MAPPO's). ``growth``: cost by the number of agents, ``small`` with N agents and as many rows.
 
 Processor time of one core; programs take turns, the best of their rounds counts. Columns: one step of the rollout in
 milliseconds, the update in microseconds per agent-step (all epochs), agent-steps per second of the whole loop, and the
@@ -24,12 +25,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_saf import CentralizedValueWrapper, TeamMonitor, TeamRolloutBuffer, ppo_settings
+from sb3_saf import CentralizedValueWrapper, LightEncoder, TeamMonitor, TeamRolloutBuffer, ppo_settings
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
 
@@ -48,6 +51,7 @@ NARROW: Final[dict[str, Any]] = {"net_arch": [64, 64], "features_extractor_class
 POLICIES: Final = ("IPPO", "MAPPO", "SAF")
 GROWTH: Final = (2, 5, 10, 20, 50, 100)
 GROWTH_ROWS: Final = 100
+TABLES: Final = ("free", "small", "memory", "recurrent", "growth")
 
 
 class FreeGames(VecEnv):
@@ -163,9 +167,25 @@ def _models(make_games: Callable[[], VecEnv], n_steps: int) -> dict[str, PPO]:
     return models
 
 
-def small_model(algo: str, n_agents: int | None = None) -> PPO:
+def recurrent_models(units: int) -> dict[str, OnPolicyAlgorithm]:
+    """Create sb3-contrib's RecurrentPPO, and IPPO and MAPPO with memory, with equal widths, encoders and settings."""
+    overrides = {"policy_kwargs": {"memory_size": units, "normalize_values": False}}
+    ours: dict[str, OnPolicyAlgorithm] = {}
+    for algo in ("ippo-lstm", "mappo-lstm"):
+        settings = load_settings(algo, "TeamSupport-v0", "small", overrides=overrides)
+        ours[algo] = settings.make_model(settings.make_env(0), 0, device="cpu")  # type: ignore[assignment]
+    names = ("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm")
+    same = {name: getattr(ours["ippo-lstm"], name) for name in names}
+    policy_kwargs = {"net_arch": [64], "lstm_hidden_size": units, "features_extractor_class": LightEncoder}
+    rows = VecExtractDictObs(settings.make_env(0), "obs")
+    theirs = RecurrentPPO("MlpLstmPolicy", rows, policy_kwargs=policy_kwargs, device="cpu", seed=0, **same)
+    return {"RecurrentPPO": theirs, **ours}
+
+
+def small_model(algo: str, n_agents: int | None = None, n_games: int | None = None) -> PPO:
     """Create PPO of the zoo's size ``small``; for any number of agents, with equal rows and density."""
-    settings = load_settings(algo, "TeamSupport-v0", "small")
+    overrides = {} if n_games is None else {"n_envs": n_games}
+    settings = load_settings(algo, "TeamSupport-v0", "small", overrides=overrides)
     if n_agents is None:
         model = settings.make_model(settings.make_env(0), 0, device="cpu")
         assert isinstance(model, PPO)
@@ -184,7 +204,7 @@ def small_model(algo: str, n_agents: int | None = None) -> PPO:
     return model
 
 
-def costs(models: Mapping[str, PPO], rounds: int) -> dict[str, Cost]:
+def costs(models: Mapping[str, OnPolicyAlgorithm], rounds: int) -> dict[str, Cost]:
     """Measure programs in turns; the first round is a warm-up."""
     watches = {name: _Watch(model) for name, model in models.items()}
     for number in range(rounds + 1):
@@ -196,7 +216,7 @@ def costs(models: Mapping[str, PPO], rounds: int) -> dict[str, Cost]:
 class _Watch:
     """Measures a model's processor time in rollouts and updates."""
 
-    def __init__(self, model: PPO) -> None:
+    def __init__(self, model: OnPolicyAlgorithm) -> None:
         self.model = model
         self._spent: dict[str, float] = {}
         self._best = {"collect_rollouts": float("inf"), "train": float("inf")}
@@ -253,11 +273,13 @@ def print_growth(rounds: int) -> None:
 def main() -> None:
     """Print the selected tables, by default all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=("free", "small", "memory", "growth"))
+    parser.add_argument("--only", nargs="+", choices=TABLES)
     parser.add_argument("--games", nargs="+", type=int, default=list(N_STEPS), choices=list(N_STEPS), help="of free")
+    parser.add_argument("--memory-games", type=int, help="of memory, by default the size's")
+    parser.add_argument("--units", type=int, nargs="+", default=[64, 256], help="of the LSTMs of recurrent")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
-    tables = options.only or ("free", "small", "memory", "growth")
+    tables = options.only or TABLES
     th.set_num_threads(1)
     if "free" in tables:
         for n_games in options.games:
@@ -267,8 +289,14 @@ def main() -> None:
         print_table("HECOGrid TeamSupport, size small", costs(models, options.rounds))
     if "memory" in tables:
         for algo in ("mappo", "saf"):
-            models = {name: small_model(name) for name in (algo, f"{algo}-gru", f"{algo}-lstm")}
+            names = (algo, f"{algo}-gru", f"{algo}-lstm")
+            models = {name: small_model(name, n_games=options.memory_games) for name in names}
             print_table(f"HECOGrid TeamSupport, size small, {algo} with memory", costs(models, options.rounds))
+    if "recurrent" in tables:
+        for units in options.units:
+            print_table(
+                f"HECOGrid TeamSupport, size small, LSTMs of {units}", costs(recurrent_models(units), options.rounds)
+            )
     if "growth" in tables:
         print_growth(options.rounds)
 

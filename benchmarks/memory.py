@@ -1,16 +1,17 @@
 """
 A ladder for memory: a cue in the first step of an episode is answered in the last.
 
-    python -m benchmarks.memory [--lengths 3 6 9] [--methods saf mappo ippo qplex] [--memories none gru lstm]
+    python -m benchmarks.memory [--cues own joint] [--lengths 3 6 9] [--methods saf mappo ippo qplex]
+        [--memories none gru lstm] [--episodes 8000] [--seeds 0]
 
-Prints the share of right answers, by length, method and memory; chance is a half.
+Prints the share of right answers, by length, method and memory, one for each seed; chance is a half.
 """
 
 from __future__ import annotations
 
 import argparse
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch as th
@@ -126,17 +127,24 @@ def share_right(model: Any, length: int, cue: Cue = "own") -> float:
 def main() -> None:
     """Print the ladder."""
     parser = argparse.ArgumentParser(description="share of right answers to a cue in the first step")
+    parser.add_argument("--cues", nargs="+", choices=get_args(Cue), default=list(get_args(Cue)))
     parser.add_argument("--lengths", type=int, nargs="+", default=[3, 6, 9])
     parser.add_argument("--methods", nargs="+", default=["saf", "mappo", "ippo", "qplex"])
     parser.add_argument("--memories", nargs="+", default=["none", "gru", "lstm"])
+    parser.add_argument("--episodes", type=int, default=8_000)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     options = parser.parse_args()
     th.set_num_threads(1)
-    for cue in ("own", "joint"):
+    for cue in options.cues:
         for length in options.lengths:
             for method in options.methods:
                 for memory in options.memories:
-                    model = trained(method, None if memory == "none" else memory, length, cue)
-                    print(f"{cue:6}{length:3} {method:6}{memory:5}{share_right(model, length, cue):6.2f}", flush=True)
+                    print(f"{cue:6}{length:3} {method:6}{memory:5}", end="", flush=True)
+                    for seed in options.seeds:
+                        kind = None if memory == "none" else memory
+                        model = trained(method, kind, length, cue, options.episodes, seed)
+                        print(f"{share_right(model, length, cue):6.2f}", end="", flush=True)
+                    print()
 
 
 if __name__ == "__main__":

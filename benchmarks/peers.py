@@ -6,8 +6,9 @@ and with its own settings; only the number of game steps is ours. JaxMARL's and 
 packages, so both need a clone: of https://github.com/FLAIROx/JaxMARL and https://github.com/uoe-agents/epymarl.
 Without one its rows are left out. JaxMARL's programs hang on a single core. Requirements conflict with this project's;
 ``--python`` names interpreters that have them. ``--rates`` measures only speed: JaxMARL's IPPO, Stable-Baselines3's own
-PPO and ours on one environment, with equal networks, epochs and minibatches; then whole trainings of BenchMARL's and
-EPyMARL's MAPPO, and ours on the same tasks, each with its own settings.
+PPO and ours on one environment, with equal networks, epochs and minibatches; the same with memory on SMAX; then whole
+trainings of BenchMARL's and EPyMARL's MAPPO, and ours on the same tasks, each with its own settings.
+``--rates memory`` and the like choose among them.
 
 - JaxMARL: jax 0.4.38, flax, optax, distrax, chex, gymnax, jaxtyping, matplotlib, omegaconf, pyyaml, safetensors
 - BenchMARL: benchmarl 1.5.2, torchrl 0.11.1, vmas
@@ -42,6 +43,12 @@ _LAST: Final = 20
 #: Speed: what is played (also JaxMARL's own choice), and game steps of a measured run.
 _RATE_TASK: Final = "jaxmarl/MPE_simple_spread_v3"
 _RATE_STEPS: Final = 200_000
+#: The same with memory, whose units are JaxMARL's, for numbers of games.
+_MEMORY_TASK: Final = "3m"
+_MEMORY_UNITS: Final = 128
+_MEMORY_STEPS: Final = 50_000
+_MEMORY_GAMES: Final = (64, 256)
+_RATES: Final = ("feedforward", "memory", "trainings")
 
 
 class Peer(NamedTuple):
@@ -230,11 +237,13 @@ def _train_here(peer: Peer, seed: int, clone: Path) -> None:
     print(json.dumps([*row, "" if won is None else round(won, 3), round(spent), source]))
 
 
-def _rate_here(n_games: int, clone: Path) -> None:
+def _rate_here(algorithm: str, n_games: int, clone: Path) -> None:
     """Print game steps per processor second of JaxMARL's IPPO, compiled beforehand."""
-    program, config = _open_jaxmarl("ippo_ff_mpe", clone, [])
-    rollout = n_games * config["NUM_STEPS"]
-    config |= {"NUM_ENVS": n_games, "TOTAL_TIMESTEPS": rollout * max(2, _RATE_STEPS // rollout), "NUM_SEEDS": 1}
+    program, config = _open_jaxmarl(algorithm, clone, [])
+    rollout, n_steps = n_games * config["NUM_STEPS"], _MEMORY_STEPS if "rnn" in algorithm else _RATE_STEPS
+    config |= {"NUM_ENVS": n_games, "TOTAL_TIMESTEPS": rollout * max(2, n_steps // rollout), "NUM_SEEDS": 1}
+    if "MAP_NAME" in config:
+        config["MAP_NAME"] = _MEMORY_TASK
     jax = import_module("jax")
     train = jax.jit(program.make_train(config))
     jax.block_until_ready(train(jax.random.PRNGKey(0)))
@@ -243,19 +252,45 @@ def _rate_here(n_games: int, clone: Path) -> None:
     print(config["TOTAL_TIMESTEPS"] / (time.process_time() - start))
 
 
+def _jaxmarls_rate(algorithm: str, n_games: int, clone: Path, python: str) -> float:
+    """Return game steps per processor second of JaxMARL's IPPO, in a process of its own."""
+    words = [python, __file__, "--rate-here", algorithm, str(n_games), f"--jaxmarl={clone.resolve()}"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"JaxMARL's program: {(done.stderr or 'failed').strip().splitlines()[-1]}")
+    return float(done.stdout.split()[-1])
+
+
+def print_memory_rates(clone: Path, python: str) -> None:
+    """Print game steps per processor second on SMAX with a GRU; ours have a second one for the critic."""
+    loop, saf = import_module("benchmarks.loop"), import_module("sb3_saf")
+    ppo = import_module("stable_baselines3").PPO
+    print("\n| games | JaxMARL's IPPO | IPPO | MAPPO |\n| --- | --- | --- | --- |")
+    kwargs = {"memory": "gru", "memory_size": _MEMORY_UNITS, "net_arch": [_MEMORY_UNITS]}
+    kwargs |= {"features_extractor_class": saf.ObservationEncoder}
+    kwargs |= {"features_extractor_kwargs": {"features_dim": _MEMORY_UNITS}}
+    for n_games in _MEMORY_GAMES:
+        theirs, models = _jaxmarls_rate("ippo_rnn_smax", n_games, clone, python), {}
+        for name in ("IPPO", "MAPPO"):
+            env = saf.make_team_env(f"smax/{_MEMORY_TASK}", n_envs=n_games, seed=0)
+            models[name] = ppo(
+                f"{name}Policy", env, n_steps=loop.SUITE_STEPS, n_epochs=loop.N_EPOCHS, policy_kwargs=kwargs, seed=0,
+                batch_size=loop.SUITE_STEPS * env.num_envs // loop.N_MINIBATCHES, device="cpu",
+                rollout_buffer_class=saf.TeamRolloutBuffer,
+            )  # fmt: skip
+        ours = [1 / cost.whole / loop.N_AGENTS for cost in loop.costs(models, rounds=2).values()]
+        print(f"| {n_games} | " + " | ".join(f"{rate:,.0f}" for rate in (theirs, *ours)) + " |", flush=True)
+
+
 def print_rates(clone: Path, python: str) -> None:
     """Print agent-steps per processor second of whole training loops, SB3's PPO on the rows of the same VecEnv."""
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"  # before jax is imported, for ours as for theirs
     loop = import_module("benchmarks.loop")
     print("| games | JaxMARL's IPPO | " + " | ".join((loop.SB3, *loop.POLICIES)) + " |")
     print("| --- |" + " --- |" * (2 + len(loop.POLICIES)))
     for n_games in loop.N_STEPS:
-        words = [python, __file__, "--rate-here", str(n_games), f"--jaxmarl={clone.resolve()}"]
-        done = subprocess.run(words, capture_output=True, text=True)
-        if done.returncode:
-            sys.exit(f"JaxMARL's program: {(done.stderr or 'failed').strip().splitlines()[-1]}")
+        theirs = _jaxmarls_rate("ippo_ff_mpe", n_games, clone, python)
         costs = loop.costs(loop.suite_models(_RATE_TASK, n_games), rounds=3)
-        rates = [float(done.stdout.split()[-1]) * loop.N_AGENTS, *(1 / cost.whole for cost in costs.values())]
+        rates = [theirs * loop.N_AGENTS, *(1 / cost.whole for cost in costs.values())]
         print(f"| {n_games} | " + " | ".join(f"{rate:,.0f}" for rate in rates) + " |", flush=True)
 
 
@@ -317,12 +352,15 @@ def main() -> None:
     parser.add_argument("--python", nargs="*", default=[], metavar="KIND=PATH", help="interpreters, by kind")
     parser.add_argument("--seeds", type=int, nargs="+", default=(0, 1, 2))
     parser.add_argument("--only", default="", help="tasks that contain this text")
-    parser.add_argument("--rates", action="store_true", help="measure only speed; needs --jaxmarl")
+    parser.add_argument(
+        "--rates", nargs="*", choices=_RATES, help="measure only speed, by default all; needs --jaxmarl"
+    )
     parser.add_argument("--here", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--rate-here", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--rate-here", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.rate_here is not None:
-        return _rate_here(options.rate_here, options.jaxmarl)
+        algorithm, n_games = options.rate_here
+        return _rate_here(algorithm, int(n_games), options.jaxmarl)
     clones = {"jaxmarl": options.jaxmarl, "epymarl": options.epymarl, "benchmarl": Path()}
     if options.here is not None:
         peer = _ALL[options.here]
@@ -330,11 +368,16 @@ def main() -> None:
     if wrong := [pair for pair in options.python if "=" not in pair]:
         parser.error(f"--python: expected KIND=PATH, such as jaxmarl=/opt/jax/bin/python, got {wrong[0]!r}")
     interpreters = dict(pair.split("=", 1) for pair in options.python)
-    if options.rates:
+    if options.rates is not None:
         if options.jaxmarl is None:
             parser.error("--rates: give --jaxmarl, a clone of https://github.com/FLAIROx/JaxMARL")
-        print_rates(options.jaxmarl, interpreters.get("jaxmarl", sys.executable))
-        return print_trainings(clones, interpreters)
+        os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"  # before jax is imported, for ours as for theirs
+        rates, python = options.rates or _RATES, interpreters.get("jaxmarl", sys.executable)
+        if "feedforward" in rates:
+            print_rates(options.jaxmarl, python)
+        if "memory" in rates:
+            print_memory_rates(options.jaxmarl, python)
+        return print_trainings(clones, interpreters) if "trainings" in rates else None
     with FILE.open(encoding="utf-8", newline="") as file:
         rows: list[Sequence[object]] = [*csv.reader(file)][1:]
     for seed in options.seeds:
