@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,25 +24,20 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 import sb3_saf
 from hecogrid_envs.constants import Command
 from hecogrid_envs.task import TaskName, check_task
+from sb3_saf.evaluation import actions_of, play
 from sb3_saf.experiments.definitions import Level
 from sb3_saf.experiments.grid import Cell
 from sb3_saf.experiments.results import Results
 from sb3_saf.inspection.recording import zones_by_attribute
-
-_SETTING: Final = re.compile(r"(?P<task>\w+)-c(?P<c>\d+)-h(?P<h>\d+)(-n(?P<n>\d+))?")
+from sb3_saf.training.folders import Run
 
 
 def cells(results: Results, setting: str = "*") -> Iterator[Cell]:
     """Return the trained teams of an experiment's folder; ``setting`` is e.g. TeamSupport-c2-h1."""
     for model in sorted(results.folder.glob(f"cells/{setting}/*/*/model.zip")):
-        folder, method, seed = model.parts[-4:-1]
-        match = _SETTING.fullmatch(folder)
-        if match is None:
-            raise ValueError(f"expected a folder such as TeamSupport-c2-h1, got {folder}")
-        level = Level.of(coordination=int(match["c"]), heterogeneity=int(match["h"]))
-        if match["n"]:
-            level = Level.of(**level.env_kwargs, n_agents=int(match["n"]))
-        yield Cell(method, f"{check_task(match['task'])}-v0", level, int(seed.removeprefix("seed-")))
+        run = Run(model.parent)
+        level = Level.of(**run.description["options"]["level"])
+        yield Cell(run.settings.algo, run.settings.env_id, level, run.seed)
 
 
 def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
@@ -65,12 +59,14 @@ def look(cell: Cell, results: Results, n_episodes: int) -> dict[str, float]:
 def commands_and_zones(model: BaseAlgorithm, env: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return the commands of one episode of every game, and the agents' zones; (steps, rows) each."""
     params = env.get_attr("params", 0)[0]
-    obs, commands, zones = env.reset(), [], []
-    for _ in range(params.max_cycles):
-        actions, _ = model.predict(obs, deterministic=False)
+    commands, zones, act = [], [], actions_of(model, env)
+
+    def noted(obs: Any, starts: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         zones.append(zones_by_attribute(env))
-        commands.append(params.command_of()[zones[-1], actions])
-        obs, *_ = env.step(actions)
+        return act(obs, starts)
+
+    for step in play(env, noted, env.num_envs // params.n_agents):
+        commands.append(params.command_of()[zones[-1], step.actions])
     return np.stack(commands), np.stack(zones)
 
 
