@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from hecogrid_envs.tasks import TASKS
 from sb3_saf import CheckpointError
@@ -15,11 +16,31 @@ from sb3_saf.envs import game_copies
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from tests.toy_envs import CounterEnv, GlobalEnv, LazyEnv, OuterWrapper, StateEnv, UnpicklableEnv
 
+
+class MaskedChoicesEnv(CounterEnv):
+    """Each agent makes two choices, of which masks in infos allow some."""
+
+    def _make_action_space(self) -> spaces.Space[Any]:
+        return spaces.MultiDiscrete([3, 2])
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        observations, infos = super().reset(seed, options)
+        return observations, self._masked(infos)
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        *results, infos = super().step(actions)
+        return *results, self._masked(infos)
+
+    def _masked(self, infos: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        return {agent: {**info, "action_mask": np.array([1, 0, 1, 1, 1], np.int8)} for agent, info in infos.items()}
+
+
 GAMES: dict[str, Any] = {
     "a lazily made generator": LazyEnv,
     "global generators": GlobalEnv,
     "a lock": UnpicklableEnv,
     "agents that die": partial(CounterEnv, deaths={0: 2}, max_cycles=7),
+    "masks of several choices": MaskedChoicesEnv,
     "a wrapper": lambda: OuterWrapper(LazyEnv()),
     "HECOGrid": partial(TASKS["TeamTogether"], n_agents=2, grid_size=9, n_treasures=4, max_cycles=9),
     "its own methods": StateEnv,
@@ -30,8 +51,14 @@ BY_METHODS = {"its own methods"}
 
 def played(venv: SuperSuitVecEnv, n_steps: int) -> list[bytes]:
     rng = np.random.default_rng(0)
-    steps = [venv.step(rng.integers(0, 4, venv.num_envs)) for _ in range(n_steps)]
-    return [np.asarray(array).tobytes() for step in steps for array in step[:3]]
+    n_choices, shape = getattr(venv.action_space, "n", 2), (venv.num_envs, *(venv.action_space.shape or ()))
+    steps = [venv.step(rng.integers(0, n_choices, shape)) for _ in range(n_steps)]
+    return [serialised(part) for step in steps for part in step[:3]]
+
+
+def serialised(part: Any) -> bytes:
+    arrays = part.values() if isinstance(part, dict) else [part]
+    return b"".join(np.asarray(array).tobytes() for array in arrays)
 
 
 @pytest.mark.parametrize("n_cpus", [1, 2])

@@ -220,20 +220,21 @@ class Trial:
         if all(mask is None for mask in masks.values()):
             shown = game_attribute(self.env, "action_masks")() if has_game_attribute(self.env, "action_masks") else {}
             masks = {agent: shown.get(agent) if isinstance(shown, Mapping) else shown for agent in playing}
-        return {agent: self._sample(agent, mask) for agent, mask in masks.items()}
+        return {agent: legal_sample(self.actions[agent], mask) for agent, mask in masks.items()}
 
-    def _sample(self, agent: Any, mask: Any) -> Any:
-        space = self.actions[agent]
-        flags = np.asarray(mask)
-        if flags.shape != (n_mask_entries(space),):
-            return space.sample()
-        flags = flags.astype(np.int8)
-        if isinstance(space, spaces.MultiDiscrete):
-            return space.sample(mask=tuple(np.split(flags, np.cumsum(space.nvec)[:-1])))
-        if isinstance(space, spaces.MultiBinary):
-            off, on = flags.reshape(-1, 2).astype(bool).T
-            return np.where(off & on, space.sample(), on).astype(space.dtype)
-        return space.sample(mask=flags)
+
+def legal_sample(space: spaces.Space[Any], mask: Any) -> Any:
+    """Draw an action that a flat mask allows; any action if the mask is None or does not fit."""
+    flags = np.asarray(mask)
+    if flags.shape != (n_mask_entries(space),):
+        return space.sample()
+    flags = flags.astype(np.int8)
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.sample(mask=tuple(np.split(flags, np.cumsum(space.nvec)[:-1])))
+    if isinstance(space, spaces.MultiBinary):
+        off, on = flags.reshape(-1, 2).astype(bool).T
+        return np.where(off & on, space.sample(), on).astype(space.dtype)
+    return space.sample(mask=flags)
 
 
 class FormError(ValueError):

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
-from sb3_saf.envs.audit import layers_of, settings_of
+from sb3_saf.envs.audit import layers_of, legal_sample, settings_of
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.rows import ACTION_MASK_KEY
 from sb3_saf.teams.trees import decode, encode
@@ -326,9 +326,7 @@ def _play(
 
 def _actions(space: spaces.Space[Any], rows: Any, n_rows: int) -> npt.NDArray[Any]:
     masks = rows.get(ACTION_MASK_KEY) if isinstance(rows, Mapping) else None
-    if masks is None:
-        return np.array([space.sample() for _ in range(n_rows)], dtype=space.dtype)
-    return np.array([space.sample(mask) for mask in masks], dtype=space.dtype)
+    return np.array([legal_sample(space, None if masks is None else masks[row]) for row in range(n_rows)], space.dtype)
 
 
 def _bytes_of(data: Any) -> bytes:
