@@ -3,11 +3,15 @@
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
+# A shorter training: make train TRAIN_ARGS="--game-steps 50000".
+TRAIN_ARGS ?=
 # Test processes. Tests run torch with one thread each.
 JOBS ?= 2
 
 VENV = .venv
 RUN = $(VENV)/bin/python -m
+# Without setuptools' box on editable installations, which looks like an error.
+INSTALL = $(VENV)/bin/python -W ignore::UserWarning -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # What training needs, and everything: linters, Sphinx, Ray, notebooks, ...
 TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
@@ -20,7 +24,7 @@ help: ## this list (the default)
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 16
 
 train: $(TRAINING) ## train SAF on TeamSupport, compare it with a random team, leave model, curve and GIF
-	@$(RUN) sb3_saf.quickstart
+	@$(RUN) sb3_saf.quickstart $(TRAIN_ARGS)
 
 test: $(INSTALLED) ## run the tests
 	@$(RUN) pytest -n $(JOBS) --dist loadscope $(PYTEST_ARGS)
@@ -76,19 +80,19 @@ $(TRAINING): setup.cfg pyproject.toml constraints.txt
 	    echo "'$(PYTHON)' cannot make virtual environments. On Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 	@echo "== install what training needs into $(VENV) (about a minute the first time)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
-	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[render]'
+	@$(INSTALL) --upgrade pip
+	@$(INSTALL) --editable '.[render]'
 	@touch $@
 
 $(INSTALLED): $(TRAINING)
 	@echo "== install the rest into $(VENV): tests, types, documentation, notebooks, Ray, games of others"
-	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[dev,docs,export,lbf,mpe,notebooks,ray,render,rware,sisl,zoo]'
+	@$(INSTALL) --editable '.[dev,docs,export,lbf,mpe,notebooks,ray,render,rware,sisl,zoo]'
 	@touch $@
 
 # What cannot be installed is left out of the benchmarks, which say so.
 $(GRIDWORLDS): $(INSTALLED)
 	@echo "== install other gridworlds into $(VENV)"
-	@$(RUN) pip install --quiet --constraint constraints.txt --editable '.[bench]' || \
+	@$(INSTALL) --editable '.[bench]' || \
 	    echo "The extra [bench] could not be installed." >&2
 	@touch $@
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import shutil
 import sys
 from importlib import import_module
@@ -31,6 +32,9 @@ html_static_path = ["_static"]
 html_extra_path = ["extra"]
 html_css_files = ["tables.css"]
 html_show_sphinx = False
+#: The repository's address is written once: in the README's ``pip install``.
+(_address,) = re.findall(r'git\+(https://[^"\s]+)', (ROOT / "README.md").read_text(encoding="utf-8"))
+html_theme_options = {"footer_icons": [{"name": "Repository", "url": _address, "html": "Repository", "class": ""}]}
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3

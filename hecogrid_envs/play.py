@@ -217,7 +217,7 @@ class HumanWindow:
                     warnings.simplefilter("ignore")
                     import pygame as imported
             except ImportError as error:
-                raise ImportError("a window needs pygame: pip install -e '.[render]'") from error
+                raise ImportError("a window needs pygame: pip install 'sb3-saf[render]'") from error
             self._pygame = imported
         pygame = self._pygame
         if self._screen is None:

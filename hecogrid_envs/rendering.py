@@ -127,7 +127,7 @@ def _pillow() -> tuple[ModuleType, ModuleType, ModuleType]:
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise ImportError("drawing games needs Pillow: pip install -e '.[render]'") from error
+        raise ImportError("drawing games needs Pillow: pip install 'sb3-saf[render]'") from error
     return Image, ImageDraw, ImageFont
 
 

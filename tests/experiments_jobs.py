@@ -10,6 +10,8 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from sb3_saf.experiments.cell import Job, run_job
 from sb3_saf.experiments.engines import Engine
 
@@ -66,10 +68,9 @@ def read_table(path: Path) -> list[dict[str, str]]:
 def is_running(pid: int) -> bool:
     """Whether a process runs; a zombie does not."""
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
         return False
-    return stat.rpartition(")")[2].split()[0] != "Z"
 
 
 def wait_until(condition: Callable[[], Any], seconds: float = 120) -> None:

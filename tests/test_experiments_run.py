@@ -9,11 +9,13 @@ import sys
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import torch as th
 from stable_baselines3 import PPO
@@ -200,12 +202,11 @@ def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path
 
 def worker_of(driver: int) -> int:
     """Wait for the process of a driver's worker. Never 0, which kill takes for the whole group of the tests."""
-    children = Path(f"/proc/{driver}/task/{driver}/children")
     workers: list[int] = []
 
     def has_worker() -> bool:
-        found = children.read_text().split() if children.exists() else []
-        workers[:] = [int(pid) for pid in found if b"cell" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        with suppress(psutil.Error):  # one that has just ended
+            workers[:] = [child.pid for child in psutil.Process(driver).children() if "cell" in child.cmdline()]
         return bool(workers)
 
     wait_until(has_worker)

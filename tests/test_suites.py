@@ -94,7 +94,7 @@ def test_the_extra_of_a_suite_installs_what_it_requires(suite: Suite) -> None:
 def test_what_is_said_of_packages_that_are_missing_or_of_another_version() -> None:
     one: dict[str, Any] = {"title": "", "extra": "x", "page": "", "list_tasks": list, "examples": (), "game": print}
     assert Suite("x", requires=("no-such-package>=2",), **one).problem() == (
-        "needs no-such-package, which is not installed: pip install -e '.[x]'"
+        "needs no-such-package, which is not installed: pip install 'sb3-saf[x]'"
     )
     old = Suite("x", requires=("gymnasium<0.1",), **one)
     assert f"works with gymnasium<0.1, got version {gym.__version__}: pip install 'gymnasium<0.1'" == old.problem()

@@ -1,11 +1,14 @@
-"""The wheel built by ``pip wheel``: its content, and that it runs without the checkout."""
+"""The sdist, the wheel built from it as ``python -m build`` does, and what its programs print, run as printed."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
+import signal
 import subprocess
 import sys
+import tarfile
 from collections.abc import Sequence
 from email.message import Message
 from email.parser import Parser
@@ -14,9 +17,23 @@ from zipfile import ZipFile
 
 import pytest
 
+from tests.environments import make_environment, shell, start
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("hecogrid_envs", "sb3_saf", "zoo_configs")
-SOURCES = (*PACKAGES, "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
+METADATA = (
+    "CHANGELOG.md",
+    "CITATION.cff",
+    "LICENSE",
+    "README.md",
+    "constraints.txt",
+    "pyproject.toml",
+    "setup.cfg",
+    "setup.py",
+)
+
+
+OFFLINE = ("--no-deps", "--no-index", "--quiet", "--disable-pip-version-check")
 
 
 def call(arguments: Sequence[str | Path], folder: Path, **environment: str) -> str:
@@ -28,18 +45,32 @@ def call(arguments: Sequence[str | Path], folder: Path, **environment: str) -> s
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel from a copy, because building leaves folders beside the sources."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for name in SOURCES:
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(ROOT / name, source)
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
-    call(["-m", "pip", "wheel", *options, "--wheel-dir", target, source], source)
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the sdist from a copy, because building leaves folders beside the sources."""
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("sdist")
+    for name in (*PACKAGES, "tests"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in (*METADATA, "MANIFEST.in"):
+        shutil.copy(ROOT / name, source)
+    call(["-c", f"from setuptools import build_meta; build_meta.build_sdist({str(target)!r})"], source)
+    (path,) = target.glob("*.tar.gz")
+    return path
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel from the sdist, which must have all that it needs."""
+    target = tmp_path_factory.mktemp("wheel")
+    call(["-m", "pip", "wheel", *OFFLINE, "--no-build-isolation", "--wheel-dir", target, sdist], target)
     (path,) = target.glob("*.whl")
     return path
+
+
+def test_sdist_has_the_packages_and_no_tests(sdist: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        paths = [name.split("/")[1:] for name in archive.getnames()]
+    others = {"MANIFEST.in", "PKG-INFO", "sb3_saf.egg-info"}
+    assert {path[0] for path in paths if path} == {*PACKAGES, *METADATA, *others}
 
 
 @pytest.fixture(scope="module")
@@ -73,36 +104,48 @@ def test_the_licence_is_inside(names: list[str], wheel: Path, metadata: Message)
     assert (metadata["License"], metadata["License-File"]) == ("MIT", "LICENSE")
 
 
-def test_metadata_show_the_readme_and_the_version_of_the_changelog(metadata: Message) -> None:
-    assert str(metadata.get_payload()).strip() == (ROOT / "README.md").read_text(encoding="utf-8").strip()
+def test_metadata_show_the_readme_with_links_into_the_repository_that_it_names(metadata: Message) -> None:
+    urls = dict(url.split(", ") for url in metadata.get_all("Project-URL", []))
+    shown, readme = str(metadata.get_payload()), (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"git+{urls['Repository']}" in readme
+    assert not re.search(r"\]\((?!https?:|#)", shown)
+    assert re.sub(rf"{urls['Repository']}/(blob|raw)/main/", "", shown).strip() == readme.strip()
+
+
+def test_version_is_the_newest_of_the_changelog(metadata: Message) -> None:
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     newest = next(line for line in changelog.splitlines() if line.startswith("## "))
     assert newest.startswith(f"## {metadata['Version']},")
 
 
 @pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the wheel's content; its dependencies come from this environment."""
+def folder(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder whose .venv has the wheel; its dependencies come from this environment."""
     folder = tmp_path_factory.mktemp("installed")
-    options = ["--no-deps", "--no-index", "--quiet", "--disable-pip-version-check", "--no-warn-conflicts"]
-    call(["-m", "pip", "install", *options, "--target", folder, wheel], folder)
-    take_over_compiled_kernels(folder)
+    packages = make_environment(folder)
+    call(["-m", "pip", "install", *OFFLINE, "--no-warn-conflicts", "--target", packages, wheel], folder)
+    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("__pycache__/*")):
+        if path.suffix in (".nbi", ".nbc"):  # compiled kernels, which numba accepts if the source is the same
+            copy = packages / path.relative_to(ROOT)
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copy(path, copy)
     return folder
 
 
-def take_over_compiled_kernels(folder: Path) -> None:
-    """Reuse kernels compiled in the checkout; numba accepts them if the source is the same."""
-    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("__pycache__/*")):
-        if path.suffix in (".nbi", ".nbc"):
-            copy = folder / path.relative_to(ROOT)
-            copy.parent.mkdir(exist_ok=True)
-            shutil.copy(path, copy)
+@pytest.mark.timeout(1200)
+def test_programs_and_the_commands_that_they_print_run_without_activation(folder: Path) -> None:
+    """Numbers are small: 400 steps of training, one cell of an experiment."""
+    train = ".venv/bin/python -m sb3_saf.train --algo saf --env TeamSupport-v0 --size smoke --eval-freq -1"
+    with start(train, folder) as process:
+        assert process.stdout is not None
+        next(line for line in process.stdout if line.startswith(" 10 % of"))
+        process.send_signal(signal.SIGINT)
+        printed = process.stdout.read()
+    assert process.returncode == 130
+    shell(re.findall("go on from there with: (.*)", printed)[0], folder)
+    assert (folder / "logs" / "saf" / "TeamSupport-v0_1" / "TeamSupport-v0.zip").is_file()
 
-
-def test_its_commands_run_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
-    code = "import zoo_configs, hecogrid_envs; print(zoo_configs.__file__, hecogrid_envs.__file__)"
-    files = call(["-c", code], tmp_path, PYTHONPATH=str(installed)).split()
-    assert [Path(file).parents[1] for file in files] == [installed] * 2
-    options = ["--algo", "saf", "--env", "TeamSupport-v0", "--size", "smoke", "-f", "logs", "--eval-freq", "-1"]
-    call(["-m", "sb3_saf.train", *options], tmp_path, PYTHONPATH=str(installed))
-    assert (tmp_path / "logs" / "saf" / "TeamSupport-v0_1" / "TeamSupport-v0.zip").is_file()
+    run = ".venv/bin/python -m sb3_saf.experiments run coordination --size smoke -n 40 --episodes 2"
+    printed = shell(f"{run} --methods ippo --tasks TeamSupport --levels 1 --seeds 0", folder)
+    shell(re.findall("next: (.*)", printed)[0], folder)
+    assert (folder / "runs" / "experiments" / "smoke" / "coordination" / "report.md").is_file()

@@ -273,7 +273,7 @@ def require_ray(is_local: bool = False) -> ModuleType:
         import ray
     except ImportError:
         raise ValueError(
-            "--ray needs Ray, which is not installed: pip install -e '.[ray]', or leave --ray out to run in "
+            "--ray needs Ray, which is not installed: pip install 'sb3-saf[ray]', or leave --ray out to run in "
             "processes of this machine"
         ) from None
     return ray

@@ -74,14 +74,16 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
         memory; or the policy itself
     :param folder: output folder
     :return: the folder
-    :raises ImportError: without ``pip install -e '.[export]'``
+    :raises ImportError: without ``pip install 'sb3-saf[export]'``
     :raises ExportError: if the model has no such actor, or the graph's outputs differ from the model's
     """
     try:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401 - torch's exporter is built on it
     except ImportError as error:
-        raise ImportError("export_actors needs onnx, onnxscript and onnxruntime: pip install -e '.[export]'") from error
+        raise ImportError(
+            "export_actors needs onnx, onnxscript and onnxruntime: pip install 'sb3-saf[export]'"
+        ) from error
     policy = _checked_policy(model)
     layer = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
     if layer is not None and layer.norm_obs:

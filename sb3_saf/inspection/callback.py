@@ -201,6 +201,6 @@ def _require_matplotlib() -> None:
         import PIL  # noqa: F401
     except ImportError as error:
         raise ImportError(
-            f"InspectionCallback draws with matplotlib and Pillow ({error}): pip install -e '.[render]', or pass "
+            f"InspectionCallback draws with matplotlib and Pillow ({error}): pip install 'sb3-saf[render]', or pass "
             "pictures=False for numbers only"
         ) from error

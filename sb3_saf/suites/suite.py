@@ -85,7 +85,7 @@ class Suite:
     @property
     def pip_line(self) -> str:
         """Command that installs the suite, in a clone of this repository."""
-        return f"pip install -e '.[{self.extra}]'"
+        return f"pip install 'sb3-saf[{self.extra}]'"
 
     def installed_version(self) -> str | None:
         """Return the version of the suite's own package, None if it is not installed."""

@@ -124,7 +124,7 @@ def require(*modules: str) -> None:
             importlib.import_module(module)
         except ModuleNotFoundError as error:
             raise CommandError(
-                f"this command needs {error.name}, which is not installed: pip install '.[render,zoo]' in the clone"
+                f"this command needs {error.name}, which is not installed: pip install 'sb3-saf[render,zoo]'"
             ) from None
 
 

@@ -282,7 +282,7 @@ def python_command(module: str) -> str:
         return f"python -m {module}"
     with suppress(ValueError):  # another drive
         own = min(own, os.path.relpath(own), key=len)
-    return f"{shlex.quote(own)} -m {module}"
+    return f"{shlex.quote(own) if os.name == 'posix' else subprocess.list2cmdline([own])} -m {module}"
 
 
 def runs_of(log_folder: Path, algo: str, name: str) -> list[tuple[int, Path]]:

@@ -59,7 +59,7 @@ def plot(arguments: Sequence[str] | None = None) -> None:
         with user_errors():
             figure = _draw(options)
     except ModuleNotFoundError as error:
-        raise CommandError(f"figures need {error.name}: pip install '.[render,zoo]' in the clone") from None
+        raise CommandError(f"figures need {error.name}: pip install 'sb3-saf[render,zoo]'") from None
     options.output.parent.mkdir(parents=True, exist_ok=True)
     with user_errors():  # for invalid file formats
         figure.savefig(options.output)
