@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import supersuit
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
@@ -20,7 +19,7 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.teams.rows import TeamSpaces
 from tests.team_venv import Array
-from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv, UnequalEnv
+from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv
 
 N_AGENTS, N_ACTIONS = 3, 4
 #: Agent 0 is active for steps 1 to 3, agent 1 from the observation after step 2, agent 2 until a time limit.
@@ -553,27 +552,3 @@ def test_sb3s_buffer_warns_once_that_idle_rows_enter_the_loss() -> None:
     told = [str(w.message) for w in caught if "take no part" in str(w.message)]
     assert len(told) == 1
     assert "rollout_buffer_class=sb3_saf.TeamRolloutBuffer" in told[0]
-
-
-def test_a_padded_environment_trains() -> None:
-    class Both(UnequalEnv):
-        """Agent 1 has larger observation and action spaces."""
-
-        def action_space(self, agent: str) -> spaces.Space[Any]:
-            return spaces.Discrete(7) if agent == "agent_1" else spaces.Discrete(4)
-
-        def _observation(self, index: int, draw: np.float32) -> Any:
-            own = super()._observation(index, draw)
-            return np.append(own, [0.5, 0.5]).astype(np.float32) if index == 1 else own
-
-        def observation_space(self, agent: str) -> spaces.Space[Any]:
-            return spaces.Box(0.0, 100.0, (5 if agent == "agent_1" else 3,), np.float32)
-
-    def make() -> Any:
-        return supersuit.pad_action_space_v0(supersuit.pad_observations_v0(Both("both", n_agents=2, deaths={0: 2})))
-
-    env = make_team_env(make, 2, seed=0)
-    assert env.team_spaces.own.shape == (5,)
-    assert env.action_space == spaces.Discrete(7)
-    model = make_model("MAPPOPolicy", env, batch_size=20).learn(80)
-    assert evaluate_team(model, env, 2).lengths == [3, 3]

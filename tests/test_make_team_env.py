@@ -99,29 +99,6 @@ def test_a_factory_with_parameters() -> None:
     assert [info["TimeLimit.truncated"] for info in infos] == [False] * 6
 
 
-def test_agents_that_die_stay_as_idle_rows_until_the_team_is_done() -> None:
-    env = make_team_env(CounterEnv(n_agents=2, max_cycles=3, deaths={0: 1}), seed=0, time_limit="bootstrap")
-    env.reset()
-    dones, truncated = [], []
-    for _ in range(3):
-        _, _, done, infos = env.step(np.ones(2, dtype=int))
-        dones.append(done.tolist())
-        truncated.append([info.get("TimeLimit.truncated", False) for info in infos])
-    assert dones == [[False, False], [False, False], [True, True]]
-    assert truncated[2] == [False, True]
-    last = infos[1]["terminal_observation"]
-    assert last["team"][0].tolist() == [0, 0, 0]
-    assert last["team"][1, :2].tolist() == [3, 1]
-    assert infos[0]["episode"]["r"] == (11 + 12) + 22 + 32
-
-
-def test_random_policy_is_evaluated_on_it() -> None:
-    env = make_team_env("TeamTogether", n_envs=3, seed=0, **SMALL)
-    result = evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7)
-    assert result.lengths == [6] * 7
-    assert 0 < result.mean < 36
-
-
 class Walk(gym.Env[Array, int]):
     pass
 

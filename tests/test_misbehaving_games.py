@@ -168,7 +168,7 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"at_reset": lambda env, result: result[0].clear()}, "an observation for agent_0, which takes part, at the reset"),
     ({"at_reset": lambda env, result: result[1].update(agent_0="new")}, "a dict as the info of agent_0 at the reset"),
     ({"setup": set_to("reset", lambda: None)}, "expected counter_v0 to have reset(seed=None, options=None)"),
-    ({"at_step": lambda env, result: env.possible_agents.pop() and None}, "the same possible_agents at all times"),
+    ({"at_step": lambda env, result: env.possible_agents.pop() and None}, "removes agents from both: write"),
     ({"space": spaces.Box(0, 1, (0,))}, "expected an observation space with at least one entry"),
     ({"action_space": spaces.Box(0, 1, (2, 0))}, "expected an action space with at least one entry"),
     ({"space": spaces.Dict()}, "expected an observation space with at least one entry"),

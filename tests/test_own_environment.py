@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from pathlib import Path
 from typing import Any, cast
@@ -28,79 +27,11 @@ from sb3_saf.training.settings import load_settings
 from tests.toy_envs import CounterEnv, TellingEnv
 
 
-class SilentReset(CounterEnv):
-    """Returns only observations at a reset, as in older versions of PettingZoo."""
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        return super().reset(seed, options)[0]
-
-
-class OneDone(CounterEnv):
-    """Returns one dict of dones at a step, as in older versions of PettingZoo."""
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        observations, rewards, terminations, _, infos = super().step(actions)
-        return observations, rewards, terminations, infos
-
-
-class NoTuple(CounterEnv):
-    """Returns lists by agent instead of dicts."""
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        return tuple(list(part.values()) for part in super().step(actions))
-
-
-class Unseeded(CounterEnv):
-    """Has a reset without arguments."""
-
-    def reset(self) -> Any:  # type: ignore[override]
-        return super().reset()
-
-
 class BrokenReset(CounterEnv):
     """Raises a TypeError in its reset."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         return len(3)  # type: ignore[arg-type]
-
-
-class SpaceTable(CounterEnv):
-    """Has a dict instead of PettingZoo's method."""
-
-    @property
-    def observation_space(self) -> Any:
-        return dict.fromkeys(self.possible_agents, self._observation_space)
-
-
-SINCE = "as PettingZoo 1.24 and later do"
-STEP = "(observations, rewards, terminations, truncations, infos)"
-
-
-@pytest.mark.parametrize(
-    ("env", "message"),
-    [
-        (
-            SilentReset,
-            f"expected reset of counter_v0 to return (observations, infos), {SINCE}, got a dict with the keys "
-            "['agent_0', 'agent_1'] (observations alone, as in older versions): return observations, {agent: {}",
-        ),
-        (
-            OneDone,
-            f"expected step of counter_v0 to return {STEP}, {SINCE}, got 4 values: dict, dict, dict, dict (one dict of "
-            "dones, as in older versions): return terminations for",
-        ),
-        (NoTuple, "got 5 values: list, list, list, list, list"),
-        (Unseeded, f"expected counter_v0 to have reset(seed=None, options=None), {SINCE}, got reset() -> "),
-        (
-            SpaceTable,
-            "expected observation_space(agent) to be a method that gives an agent's space, got dict; write it as: "
-            "def observation_space(self, agent): return self.observation_spaces[agent]",
-        ),
-    ],
-)
-def test_environments_of_an_older_pettingzoo(env: type[CounterEnv], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        _played(env)
 
 
 def test_a_type_error_of_the_game_itself_comes_out_as_it_is() -> None:

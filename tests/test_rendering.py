@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -340,12 +339,4 @@ def test_no_display_is_an_error_and_not_an_invisible_window(pygame: Any, monkeyp
     monkeypatch.setattr(pygame.display, "init", lambda: None)
     monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
     with pytest.raises(RuntimeError, match=r'no display\); draw pictures with render_mode="rgb_array"'):
-        HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))
-
-
-@pytest.mark.skipif("DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ, reason="there is a display")
-@pytest.mark.skipif(sys.platform != "linux", reason="how to have no display")
-def test_no_display_for_real(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("SDL_VIDEODRIVER")
-    with pytest.raises(RuntimeError, match="no window can be opened"):
         HumanWindow().show(np.zeros((4, 4, 3), dtype=np.uint8))

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ import pytest
 import supersuit
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from pettingzoo.test import parallel_api_test
 from pettingzoo.utils import parallel_to_aec
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
@@ -36,7 +36,6 @@ from tests.toy_envs import (
     DictEnv,
     EagerEnv,
     FaultyEnv,
-    ImageEnv,
     LateEnv,
     LockedFactory,
     OuterWrapper,
@@ -97,7 +96,8 @@ def test_rows_are_game_major_then_agent(bridge: Bridge, n_cpus: int) -> None:
     observations = venv.reset()
     assert isinstance(observations, np.ndarray)
     assert observations[:, 1].tolist() == [0, 1, 2, 0, 1, 2]
-    observations, rewards, _, _ = venv.step(np.array([0, 1, 2, 3, 0, 0]))
+    observations, rewards, dones, _ = venv.step(np.array([0, 1, 2, 3, 0, 0]))
+    assert [np.asarray(array).dtype.name for array in (observations, rewards, dones)] == ["float32", "float32", "bool"]
     assert rewards.tolist() == [10 + 0 + 0, 10 + 1 + 1, 10 + 2 + 2, 10 + 0 + 3, 10 + 1 + 0, 10 + 2 + 0]
     assert venv.get_attr("last_actions", indices=3) == [{"agent_0": 3, "agent_1": 0, "agent_2": 0}]
 
@@ -124,17 +124,6 @@ def test_seed_of_ppo_reaches_the_games(bridge: Bridge, n_cpus: int) -> None:
     venv = bridge(CounterEnv, n_games=3, seed=1, n_cpus=n_cpus)
     PPO("MlpPolicy", venv, seed=0, n_steps=2, batch_size=12, n_epochs=1, device="cpu").learn(12)
     assert venv.get_attr("last_seed")[::2] == game_seeds(0, 3)
-
-
-@one_and_two_cpus
-def test_two_runs_of_ppo_with_one_seed_end_equal(bridge: Bridge, n_cpus: int) -> None:
-    def train() -> dict[str, Any]:
-        venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
-        model = PPO("MlpPolicy", venv, seed=0, n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(64)
-        return {name: value.numpy() for name, value in model.policy.state_dict().items()}
-
-    first, second = train(), train()
-    assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
 @one_and_two_cpus
@@ -220,16 +209,6 @@ def test_stock_dones_are_numbers() -> None:
     assert venv.step(zeros(venv))[2].dtype == np.uint8
 
 
-@one_and_two_cpus
-def test_dtypes_of_a_step(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
-    venv.reset()
-    observations, rewards, dones, infos = venv.step(zeros(venv))
-    assert isinstance(observations, np.ndarray)
-    assert [array.dtype.name for array in (observations, rewards, dones)] == ["float32", "float32", "bool"]
-    assert (observations.shape, rewards.shape, dones.shape, len(infos)) == ((4, 3), (4,), (4,), 4)
-
-
 def discounted_return_variance(venv: Any, gamma: float, n_steps: int) -> float:
     """Return VecNormalize's variance of discounted returns."""
     normalised = VecNormalize(venv, norm_obs=False, gamma=gamma)
@@ -268,19 +247,25 @@ def test_stock_hides_truncation() -> None:
 
 @one_and_two_cpus
 @pytest.mark.parametrize(
-    ("deaths", "truncated"),
-    [({}, [True, True]), ({0: 3, 1: 3}, [False, False]), ({0: 3}, [False, True]), ({0: 2, 1: 2}, [False, False])],
-    ids=["time limit", "both at once", "one terminated, one not", "true end"],
+    ("ends", "truncated"),
+    [
+        ({}, [True, True]),
+        ({"deaths": {0: 3, 1: 3}}, [False, False]),
+        ({"deaths": {0: 3}}, [False, True]),
+        ({"deaths": {0: 2, 1: 2}}, [False, False]),
+        ({"cuts": {0: 1}}, [False, True]),  # must not be bootstrapped at the end of the team
+    ],
+    ids=["time limit", "both at once", "one terminated, one not", "true end", "its own time limit"],
 )
-def test_truncation_is_told(bridge: Bridge, n_cpus: int, deaths: dict[int, int], truncated: list[bool]) -> None:
+def test_truncation_is_told(bridge: Bridge, n_cpus: int, ends: dict[str, Any], truncated: list[bool]) -> None:
     """In the second case the agents are terminated at the time limit: both flags are set, and termination counts."""
-    venv = bridge(lambda: CounterEnv(2, max_cycles=3, deaths=deaths), n_games=2, n_cpus=n_cpus)
+    venv = bridge(lambda: CounterEnv(2, max_cycles=3, **ends), n_games=2, n_cpus=n_cpus)
     venv.reset()
     for _ in range(3):
         _, _, dones, infos = venv.step(zeros(venv))
-        assert [("TimeLimit.truncated" in info) for info in infos] == dones.tolist()
         if dones.any():
             break
+        assert not any(info.get("TimeLimit.truncated") for info in infos) or "cuts" in ends
     assert dones.all()
     assert [info["TimeLimit.truncated"] for info in infos] == truncated * 2
     assert all(type(info["TimeLimit.truncated"]) is bool for info in infos)
@@ -552,23 +537,6 @@ def test_death_of_an_agent(bridge: Bridge, n_cpus: int) -> None:
 
 
 @one_and_two_cpus
-def test_an_agents_own_time_limit(bridge: Bridge, n_cpus: int) -> None:
-    """A row that was truncated long before the team's end must not be bootstrapped at that end."""
-    venv = bridge(lambda: CounterEnv(2, max_cycles=3, cuts={0: 1}), n_games=1, n_cpus=n_cpus)
-    venv.reset()
-    for _ in range(3):
-        _, _, dones, infos = venv.step(zeros(venv))
-    assert dones.all()
-    assert [info["TimeLimit.truncated"] for info in infos] == [False, True]
-
-
-@one_and_two_cpus
-def test_ppo_trains_on_games_with_deaths(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(lambda: CounterEnv(3, max_cycles=5, deaths={1: 2, 2: 4}), n_games=2, n_cpus=n_cpus)
-    PPO("MlpPolicy", VecMonitor(VecCheckNan(venv)), n_steps=16, batch_size=32, n_epochs=1, device="cpu").learn(96)
-
-
-@one_and_two_cpus
 def test_agent_that_joins_late(bridge: Bridge, n_cpus: int) -> None:
     venv = bridge(LateEnv, n_games=1, n_cpus=n_cpus)
     observations = np.asarray(venv.reset())
@@ -638,7 +606,7 @@ def rps() -> Any:
     return rock_paper_scissors.parallel_env(max_cycles=5)
 
 
-@pytest.mark.parametrize("make", [lambda: CounterEnv(3, deaths={2: 2}), ImageEnv, DictEnv, LateEnv, BareEnv, rps, kaz])
+@pytest.mark.parametrize("make", [lambda: CounterEnv(3, deaths={2: 2}), DictEnv, LateEnv, BareEnv, rps, kaz])
 def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -> None:
     if make in (kaz, rps):
         pytest.importorskip("pygame")
@@ -647,12 +615,6 @@ def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -
     assert same(one, two)
     if make is kaz:
         assert any(info.get("active") is False for part in one[5::5] for info in part)
-
-
-@one_and_two_cpus
-def test_ppo_with_dict_observations_and_continuous_actions(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(DictEnv, n_games=2, seed=0, n_cpus=n_cpus)
-    PPO("MlpPolicy", venv, n_steps=4, batch_size=16, n_epochs=1, device="cpu").learn(32)
 
 
 @one_and_two_cpus
@@ -672,17 +634,6 @@ def test_sb3_wrappers_on_top(bridge: Bridge, n_cpus: int) -> None:
     assert [info["episode"]["l"] for info in infos] == [3] * 4
 
 
-@pytest.mark.parametrize(
-    "env", [CounterEnv(), CounterEnv(3, deaths={1: 2}), ImageEnv(), DictEnv(), ReusingEnv(), EagerEnv()]
-)
-def test_toy_games_are_proper(env: CounterEnv) -> None:
-    parallel_api_test(env, num_cycles=20)
-    observations, _ = env.reset(seed=0)
-    while env.agents:
-        assert all(env.observation_space(agent).contains(seen) for agent, seen in observations.items())
-        observations, *_ = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-
-
 # ---- bad input
 
 
@@ -694,6 +645,7 @@ def test_toy_games_are_proper(env: CounterEnv) -> None:
         (parallel_to_aec(CounterEnv()), "expected a PettingZoo ParallelEnv, got the AECEnv counter_v0; convert it"),
         (dict, "got a function that returned an object of type dict"),
         ("counter", "got an object of type str"),
+        (SimpleNamespace(__name__="games.tag", parallel_env=CounterEnv), "pass games.tag.parallel_env(...)"),
         (UnpicklableEnv(), "pass a function that makes the environment instead"),
         (toy_envs.same_env_again, "got one that returned the same object for 3 games"),
     ],
@@ -723,14 +675,6 @@ def test_what_cannot_be_pickled_stays_in_this_process(bridge: Bridge) -> None:
             bridge(make, n_games=2, n_cpus=2)
 
 
-def test_module_instead_of_environment(bridge: Bridge) -> None:
-    pytest.importorskip("pygame")
-    from pettingzoo.classic.rps import rps as module
-
-    with pytest.raises(ValueError, match=r"type module; pass pettingzoo.classic.rps.rps.parallel_env\(...\)"):
-        bridge(module, n_games=1)
-
-
 class OddSpacesEnv(CounterEnv):
     """Has given spaces."""
 
@@ -738,13 +682,6 @@ class OddSpacesEnv(CounterEnv):
         super().__init__()
         self._observation_space = observation_space or self._observation_space
         self._action_space = action_space or self._action_space
-
-
-def test_spaces_that_do_not_fit_into_arrays(bridge: Bridge) -> None:
-    with pytest.raises(ValueError, match=r"expected an action space that is one of Discrete, .*, got Dict"):
-        bridge(lambda: OddSpacesEnv(action_space=spaces.Dict({"a": spaces.Discrete(2)})), n_games=1)
-    with pytest.raises(ValueError, match=r"expected an observation space that is one of .* or a Dict .*, got Dict\("):
-        bridge(lambda: OddSpacesEnv(spaces.Dict({"a": spaces.Text(3)})), n_games=1)
 
 
 @pytest.mark.parametrize("name", ["n_games", "n_cpus"])
@@ -845,13 +782,6 @@ def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
     [
         ("raise", ArithmeticError, "the game broke"),
         ("exit", SystemExit, "3"),
-        (
-            "shape",
-            ValueError,
-            r"agent_0 in game 1 at step 2: expected float32 of shape \(3,\)",
-        ),
-        ("dtype", ValueError, r"expected float32 of shape \(3,\), got <U1 of shape \(3,\)"),
-        ("info", TypeError, "the info of agent_0 cannot be copied .* leave out what cannot be copied"),
     ],
 )
 def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[BaseException], message: str) -> None:
@@ -870,20 +800,6 @@ def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[Bas
     for _ in range(3):
         dones = venv.step(zeros(venv))[2]
     assert dones.all()
-
-
-@one_and_two_cpus
-def test_reset_that_breaks(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
-    venv.reset()
-    venv.set_options([{}, {}, {"fail": True}, {}])
-    with pytest.raises(LookupError, match="no such level"):
-        venv.reset()
-    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
-        venv.step(zeros(venv))
-    venv.set_options({})
-    venv.reset()
-    venv.step(zeros(venv))
 
 
 @one_and_two_cpus

@@ -76,8 +76,6 @@ class CounterEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        if options and options.get("fail"):
-            raise LookupError("no such level")
         if seed is not None or self._rng is None:
             self._rng = np.random.default_rng(seed)
             self.last_seed = seed
@@ -138,16 +136,6 @@ class CounterEnv(ParallelEnv[str, Any, Any]):
         return os.getpid()
 
 
-class ImageEnv(CounterEnv):
-    """The same with images that show the draw in every pixel."""
-
-    def _make_observation_space(self) -> spaces.Space[Any]:
-        return spaces.Box(0, 255, (8, 8, 3), np.uint8)
-
-    def _observation(self, index: int, draw: np.float32) -> Any:
-        return np.full((8, 8, 3), int(draw * 255), np.uint8)
-
-
 class DictEnv(CounterEnv):
     """The same with a dict observation and continuous actions."""
 
@@ -192,26 +180,6 @@ class ReusingEnv(CounterEnv):
         observations, _ = super().reset(seed, options)
         self._info["steps"] = []
         return observations, dict.fromkeys(self.agents, self._info)
-
-
-class UnequalEnv(CounterEnv):
-    """Agents have different observation spaces or action spaces."""
-
-    def __init__(self, kind: str, **kwargs: Any):
-        self.kind = kind
-        super().__init__(**kwargs)
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        if self.kind == "observation" and agent == "agent_1":
-            return spaces.Box(0.0, 1.0, (5,), np.float32)
-        return self._observation_space
-
-    def action_space(self, agent: str) -> spaces.Space[Any]:
-        if self.kind == "action" and agent == "agent_1":
-            return spaces.Discrete(7)
-        if self.kind == "kind of action" and agent == "agent_1":
-            return spaces.MultiDiscrete([2, 3])
-        return self._action_space
 
 
 class BareEnv(ParallelEnv[str, Any, Any]):
@@ -323,8 +291,7 @@ class FaultyEnv(CounterEnv):
     Fails at the second step if its generator was given the chosen seed.
 
     :param seed: of the failing game, None for all games
-    :param how: "raise", "exit", "die" (the process ends at once), "shape", "dtype" (of the observation),
-        "info" (one that cannot be copied)
+    :param how: "raise", "exit", or "die" (the process ends at once)
     """
 
     def __init__(self, how: str, seed: int | None = None, **kwargs: Any):
@@ -333,7 +300,7 @@ class FaultyEnv(CounterEnv):
         self.unlucky_seed = seed
 
     def step(self, actions: dict[str, Any]) -> Any:
-        observations, *rest, infos = super().step(actions)
+        result = super().step(actions)
         if self.steps == 2 and self.unlucky_seed in (None, self.last_seed):
             if self.how == "raise":
                 raise ArithmeticError("the game broke")
@@ -341,13 +308,7 @@ class FaultyEnv(CounterEnv):
                 raise SystemExit(3)
             if self.how == "die":
                 os._exit(7)
-            if self.how == "shape":
-                observations = dict.fromkeys(observations, np.zeros(4, np.float32))
-            if self.how == "dtype":
-                observations = dict.fromkeys(observations, np.array(["a", "b", "c"]))
-            if self.how == "info":
-                infos = {agent: {"lock": threading.Lock()} for agent in infos}
-        return (observations, *rest, infos)
+        return result
 
 
 class UnpicklableEnv(CounterEnv):
