@@ -2,7 +2,8 @@
 Games as rows, on SuperSuit's classes.
 
 SuperSuit's ``MarkovVectorEnv`` (the agents of a game as rows) and ``ConcatVecEnv`` (several games) are base classes
-here: they split actions, join rows and draw; episodes, ends, infos, seeds, attributes and processes are our own code.
+here: they give actions to games, join their rows and draw. Episodes, ends, infos, seeds, attributes and processes are
+our own code.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import random
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from typing import Any, Final, NamedTuple, TypeAlias
+from functools import partial
+from typing import Any, Final, TypeAlias
 
 import cloudpickle
 import numpy as np
@@ -220,72 +222,44 @@ def _copied(info: Mapping[str, Any], agent: Any) -> Info:
 # ---- the games of one process
 
 
-class GameSource:
+def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], Any]:
     """
-    Factory or environment from which games are made.
+    Return a function that makes a game, a ParallelEnv.
 
-    It is stored pickled if possible, so that a function that returns an existing environment makes copies of it.
+    It holds a pickle if possible, so that a function that returns an existing environment makes copies of it.
 
-    :param make_env: the factory or the environment
+    :param make_env: a factory or an environment
     :param is_factory: whether ``make_env`` is a factory
     :param n_cpus: number of processes in which games will be made; with one process a factory need not be picklable
         (for instance of a local class with ``functools.lru_cache`` on its methods)
     :raises ValueError: if it cannot be copied, with a fix
     """
-
-    def __init__(self, make_env: Any, is_factory: bool, n_cpus: int) -> None:
-        self._is_factory = is_factory
-        self._pickled: bytes | None = None
-        self._original = make_env
-        try:
-            self._pickled = cloudpickle.dumps(make_env)
-        except Exception as error:
-            if n_cpus > 1:
-                raise ValueError(
-                    f"n_cpus={n_cpus} sends {make_env} to worker processes, but pickling it failed ({error}); move "
-                    "what it uses to the top level of a module (functools.lru_cache on methods of a class inside a "
-                    "function is such a thing), or use n_cpus=1, where nothing is sent"
-                ) from error
-            if not is_factory:
-                self._original = self._copy()
-        else:
-            self._original = None
-
-    def build(self) -> Any:
-        """Make a game."""
-        if self._pickled is not None:
-            content = cloudpickle.loads(self._pickled)
-            return as_parallel(content() if self._is_factory else content)
-        return as_parallel(self._original() if self._is_factory else self._copy())
-
-    def _copy(self) -> Any:
-        try:
-            return deepcopy(self._original)
-        except Exception as error:
+    try:
+        return partial(_unpickled_game, cloudpickle.dumps(make_env), is_factory)
+    except Exception as error:
+        if n_cpus > 1:
             raise ValueError(
-                f"each game needs its own copy of {self._original}, but copying it failed ({error}); "
-                "pass a function that makes the environment instead"
+                f"n_cpus={n_cpus} sends {make_env} to worker processes, but pickling it failed ({error}); move "
+                "what it uses to the top level of a module (functools.lru_cache on methods of a class inside a "
+                "function is such a thing), or use n_cpus=1, where nothing is sent"
             ) from error
+    make = make_env if is_factory else partial(_copied_game, _copied_game(make_env))
+    return lambda: as_parallel(make())
 
 
-class Step(NamedTuple):
-    """
-    Results of a step of some games, by row.
+def _unpickled_game(pickled_env: bytes, is_factory: bool) -> Any:
+    content = cloudpickle.loads(pickled_env)
+    return as_parallel(content() if is_factory else content)
 
-    :param observations: observations of the rows
-    :param rewards: float32
-    :param dones: bool
-    :param infos: infos of the rows
-    :param reset_infos: infos of the last reset of each row's game
-    :param notes: texts of warnings to issue
-    """
 
-    observations: Any
-    rewards: npt.NDArray[np.float32]
-    dones: npt.NDArray[np.bool_]
-    infos: Infos
-    reset_infos: Infos
-    notes: list[str]
+def _copied_game(env: Any) -> Any:
+    try:
+        return deepcopy(env)
+    except Exception as error:
+        raise ValueError(
+            f"each game needs its own copy of {env}, but copying it failed ({error}); "
+            "pass a function that makes the environment instead"
+        ) from error
 
 
 class TeamConcatVecEnv(ConcatVecEnv):
@@ -295,24 +269,26 @@ class TeamConcatVecEnv(ConcatVecEnv):
     Changes to :class:`supersuit.vector.ConcatVecEnv`: each game gets its own seed and options, attributes and methods
     of games are accessible, and all games are closed even if closing one fails.
 
-    :param source: makes the games
+    :param make_game: makes a game
     :param reader: reads the games
     :param indices: indices of the games among all E
     :param is_worker: whether the process has no other games: it then seeds the global generators of Python and NumPy,
         from which games may draw, since processes are forked with equal ones
-    :raises ValueError: if the source returns the same environment twice
+    :raises ValueError: if the same environment is made twice
     """
 
-    def __init__(self, source: GameSource, reader: GameReader, indices: Sequence[int], is_worker: bool = False) -> None:
+    def __init__(
+        self, make_game: Callable[[], Any], reader: GameReader, indices: Sequence[int], is_worker: bool = False
+    ) -> None:
         self._notes: list[str] = []
         self._indices = indices
         self._is_worker = is_worker
         self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, close also runs if construction failed
         super().__init__(
-            [lambda index=index: TeamMarkovVectorEnv(source.build(), reader, index, self._notes) for index in indices]
+            [lambda index=index: TeamMarkovVectorEnv(make_game(), reader, index, self._notes) for index in indices]
         )
         self._n_agents = len(reader.agents)
-        self._new_game = lambda: TeamMarkovVectorEnv(source.build(), reader, indices[0], [])
+        self._new_game = lambda: TeamMarkovVectorEnv(make_game(), reader, indices[0], [])
         self._way: Way | None = None
         n_objects = len({id(game.par_env.unwrapped) for game in self.vec_envs})
         if n_objects < len(self.vec_envs):
@@ -320,6 +296,10 @@ class TeamConcatVecEnv(ConcatVecEnv):
                 "expected a function that makes a new environment at each call, got one that returned the same object "
                 f"for {len(self.vec_envs) - n_objects + 1} games"
             )
+
+    def run(self, name: str, *args: Any) -> list[Any]:
+        """Call a method in all processes, as :class:`WorkerGames` does."""
+        return [getattr(self, name)(*args)]
 
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """Begin an episode in every game of this process; seeds and options are those of all E games."""
@@ -331,13 +311,20 @@ class TeamConcatVecEnv(ConcatVecEnv):
         observations, infos = zip(*started, strict=True)
         return self.concat_obs(observations), [info for game in infos for info in game]
 
-    def play(self, actions: npt.NDArray[Any]) -> Step:
-        """Step every game of this process; actions are those of the B rows of all games."""
+    def play(
+        self, actions: npt.NDArray[Any]
+    ) -> tuple[Any, npt.NDArray[Any], npt.NDArray[Any], Infos, Infos, list[str]]:
+        """
+        Step every game of this process.
+
+        :param actions: of the B rows of all games
+        :return: rows, rewards (float32), dones (bool), infos, infos of the last resets, and texts of warnings to issue
+        """
         first, last = self._indices[0], self._indices[-1] + 1
         rows = actions[first * self._n_agents : last * self._n_agents]
         observations, rewards, terminations, truncations, infos = self.step(rows)
         reset_infos = [info for game in self.vec_envs for info in game.reset_infos]
-        return Step(observations, rewards, terminations | truncations, infos, reset_infos, self._notes)
+        return observations, rewards, terminations | truncations, infos, reset_infos, self._notes
 
     def ask(self, games: Iterable[int], function: Callable[..., Any], *args: Any) -> dict[int, Any]:
         """Call a function with each of some games, those of this process, and arguments; return answers by game."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from typing import Any, Final, cast
 
 import numpy as np
@@ -17,7 +18,7 @@ from sb3_saf.envs.audit import Trial, check_is_parallel
 from sb3_saf.envs.game_copies import check_signatures, common_settings, signature
 from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv
 from sb3_saf.envs.gymnasium_team import as_parallel
-from sb3_saf.envs.supersuit_games import GameSource, TeamConcatVecEnv
+from sb3_saf.envs.supersuit_games import TeamConcatVecEnv, game_factory
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.conversion import AgentConversion
@@ -30,7 +31,7 @@ _N_BEGINNINGS: Final = 10
 
 class SuperSuitVecEnv(TeamVecEnv):
     """
-    Games of a PettingZoo ParallelEnv as rows of one VecEnv, flattened by SuperSuit.
+    Games of a PettingZoo ParallelEnv as rows of one VecEnv, on SuperSuit's classes as base classes.
 
     Agents are in the order of ``possible_agents``. The N rows of a team are done together, when its last agent has
     ended. The row of an agent that ended earlier (or has not joined) holds zeros, and its infos hold ``"active":
@@ -88,10 +89,9 @@ class SuperSuitVecEnv(TeamVecEnv):
     ) -> None:
         n_games = check_count("n_games", n_games)
         n_cpus = min(check_count("n_cpus", n_cpus), n_games)
-        source, reader = _source_and_reader(make_env, n_cpus, active, action_masks, state, float64)
+        self._make_game, reader = _factory_and_reader(make_env, n_cpus, active, action_masks, state, float64)
         for note in reader.notes:
             warnings.warn(note, UserWarning, stacklevel=2)
-        self._source = source
         self.possible_agents = list(reader.agents)
         #: How each agent's observations and actions become those of rows, for models that act on the game's own.
         self.conversions = tuple(reader.conversions.values())
@@ -101,9 +101,9 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._beginnings: list[list[int]] = []
         self._games: TeamConcatVecEnv | WorkerGames
         if n_cpus == 1:
-            self._games = TeamConcatVecEnv(source, reader, range(n_games))
+            self._games = TeamConcatVecEnv(self._make_game, reader, range(n_games))
         else:
-            self._games = WorkerGames(source, reader, n_games, n_cpus)
+            self._games = WorkerGames(self._make_game, reader, n_games, n_cpus)
         try:
             super().__init__(
                 n_games,
@@ -123,7 +123,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         self._check_open()
         self._begun, self._actions = False, None
         options = [own or None for own in self._options[:: self.n_agents]]
-        observations, self.reset_infos = self._games.reset_all(self._seeds_of_games(), options)
+        observations, self.reset_infos = self._run("reset_all", self._seeds_of_games(), options)
         self._beginnings = [[] for _ in range(self.n_games)] if self._next_seeds and self.n_games > 1 else []
         self._note_beginnings(observations, range(self.n_games))
         self._next_seeds = None
@@ -149,15 +149,19 @@ class SuperSuitVecEnv(TeamVecEnv):
             raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
         actions = self._actions
         self._begun, self._actions = False, None
-        step = self._games.play(actions)
+        observations, rewards, dones, infos, reset_infos, notes = self._run("play", actions)
         self._begun = True
-        for row in np.flatnonzero(step.dones).tolist():
-            self.reset_infos[row] = step.reset_infos[row]
-        notes = [*step.notes, *self._note_beginnings(step.observations, np.flatnonzero(step.dones[:: self.n_agents]))]
+        for row in np.flatnonzero(dones).tolist():
+            self.reset_infos[row] = reset_infos[row]
+        notes = [*notes, *self._note_beginnings(observations, np.flatnonzero(dones[:: self.n_agents]))]
         if notes and not self._has_warned:
             self._has_warned = True
             warnings.warn(f"{notes[0]}; later warnings are not reported", UserWarning, stacklevel=2)
-        return step.observations, step.rewards, step.dones, step.infos
+        return observations, rewards, dones, infos
+
+    def _run(self, name: str, *args: Any) -> list[Any]:
+        """Call a method of :class:`TeamConcatVecEnv` in each process; return its results for all rows."""
+        return [_joined(parts) for parts in zip(*self._games.run(name, *args), strict=True)]
 
     def _note_beginnings(self, observations: Any, begun: Iterable[int]) -> list[str]:
         """Return a warning if all games began alike in ten episodes that differ."""
@@ -196,12 +200,12 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that new games keep (see the base class)."""
-        return common_settings(self._source.build)
+        return common_settings(self._make_game)
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`)."""
         self._check_open()
-        snapshots = self._games.snapshots()
+        snapshots = [snapshot for some in self._games.run("snapshots") for snapshot in some]
         for snapshot in snapshots:
             if "pickled" in snapshot:
                 snapshot["signature"] = signature(snapshot["pickled"])
@@ -217,7 +221,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Restore a state of :meth:`checkpoint_state`; ForeignGamesError for pickled games of another user."""
         check_signatures(state["games"])
         if state["begun"]:
-            self._games.restore(state["games"])
+            self._games.run("restore", state["games"])
         self.seeded_with = tuple(state["seeds"])
         self._next_seeds = None if None in state["next_seeds"] else list(state["next_seeds"])
         self._begun, self._has_warned, self._actions = state["begun"], state["warned"], None
@@ -229,7 +233,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Call a function with some games, once each, and return one answer for each entry of ``games``."""
         self._check_open()
         listed = list(games)
-        answers = self._games.ask(listed, function, *args)
+        answers = dict(chain.from_iterable(part.items() for part in self._games.run("ask", listed, function, *args)))
         return [answers[game] for game in listed]
 
     def _games_of(self, rows: VecEnvIndices) -> list[int]:
@@ -269,21 +273,21 @@ class SuperSuitVecEnv(TeamVecEnv):
         return self._ask(self._games_of(indices), _is_wrapped, wrapper_class)
 
 
-def _source_and_reader(
+def _factory_and_reader(
     make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks, state: bool, float64: bool
-) -> tuple[GameSource, GameReader]:
-    """Audit a copy of the game, and return the source of the games with their reader."""
+) -> tuple[Callable[[], Any], GameReader]:
+    """Audit a copy of the game; return a function that makes games, and their reader."""
     make_env = as_parallel(make_env)
     is_factory = not isinstance(make_env, (ParallelEnv, AECEnv)) and callable(make_env)
     if not is_factory:
         check_is_parallel(make_env, is_factory)
-    source = GameSource(make_env, is_factory, n_cpus)
-    example = source.build()
+    make_game = game_factory(make_env, is_factory, n_cpus)
+    example = make_game()
     try:
         check_is_parallel(example, is_factory)
         trial = Trial(example)
         trial.play()
-        return source, GameReader(trial, active, action_masks, state, float64)
+        return make_game, GameReader(trial, active, action_masks, state, float64)
     finally:
         with suppress(Exception):  # of games that must be reset before they are closed
             example.close()
@@ -306,3 +310,12 @@ def _action_masks(env: Any, agents: Sequence[Any], conversions: Sequence[AgentCo
         conversion.mask(masks.get(agent, np.ones(sum(conversion.action.choices)))).astype(bool)
         for agent, conversion in zip(agents, conversions, strict=True)
     ]
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Join what the processes gave for their rows: arrays, arrays by key, or lists."""
+    if len(parts) == 1:
+        return parts[0]
+    if isinstance(parts[0], dict):
+        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return list(chain.from_iterable(parts)) if isinstance(parts[0], list) else np.concatenate(parts)

@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing import connection
@@ -18,13 +18,11 @@ from typing import Any, NamedTuple, NoReturn
 
 import cloudpickle
 import gymnasium
-import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_saf.envs.game_reader import GameReader
-from sb3_saf.envs.supersuit_games import GameSource, Info, Infos, Step, TeamConcatVecEnv
+from sb3_saf.envs.supersuit_games import TeamConcatVecEnv
 
 #: Time limit in seconds for a worker process to close its games.
 CLOSE_TIMEOUT = 10.0
@@ -45,22 +43,22 @@ class GameProcess(gymnasium.Env[Any, Any]):
     Payloads are pickled by cloudpickle, which supports lambdas, and exceptions are returned, so that a game's error
     does not end the process.
 
-    :param source: makes the games
-    :param reader: reads the games
-    :param indices: indices of the games among all E
+    :param make_games: makes the games, at the first call
     """
 
     observation_space = action_space = spaces.Discrete(1)
 
-    def __init__(self, source: GameSource, reader: GameReader, indices: Sequence[int]) -> None:
-        self._make_games = partial(TeamConcatVecEnv, source, reader, indices, is_worker=True)
+    def __init__(self, make_games: Callable[[], TeamConcatVecEnv]) -> None:
+        self._make_games = make_games
         self._games: TeamConcatVecEnv | None = None
 
     def run(self, payload: bytes) -> bytes:
-        """Call a method of this class: pickled name and arguments to pickled result or :class:`Failure`."""
+        """Call a method of the games: pickled name and arguments to pickled result or :class:`Failure`."""
         try:
+            if self._games is None:
+                self._games = self._make_games()
             name, args = pickle.loads(payload)
-            result = getattr(self, name)(*args)
+            result = getattr(self._games, name)(*args)
         except (Exception, SystemExit) as error:
             return _packed_failure(error)
         try:
@@ -72,44 +70,31 @@ class GameProcess(gymnasium.Env[Any, Any]):
             )
             return _packed_failure(refusal)
 
-    def build(self) -> None:
-        """Make the games."""
-        self._games = self._make_games()
-
-    def call(self, name: str, *args: Any) -> Any:
-        """Call a method of the games."""
-        return getattr(self._games, name)(*args)
-
-    def close_games(self) -> None:
-        """Close the games."""
-        if self._games is not None:
-            self._games.close()
-
 
 class WorkerGames:
     """
-    Games in several processes, with the methods of :class:`TeamConcatVecEnv`.
+    Games in several processes.
 
-    :param source: makes the games
+    :param make_game: makes a game
     :param reader: reads the games
     :param n_games: E
     :param n_cpus: maximum number of processes, started with the default start method of :mod:`multiprocessing`
     """
 
-    def __init__(self, source: GameSource, reader: GameReader, n_games: int, n_cpus: int) -> None:
+    def __init__(self, make_game: Callable[[], Any], reader: GameReader, n_games: int, n_cpus: int) -> None:
         size = -(-n_games // n_cpus)
         self._groups = [range(first, min(first + size, n_games)) for first in range(0, n_games, size)]
         #: Why the processes have ended, None while they run.
         self.ended: str | None = None
+        makes = [partial(TeamConcatVecEnv, make_game, reader, group, is_worker=True) for group in self._groups]
         self._venv = SubprocVecEnv(
-            [partial(GameProcess, source, reader, group) for group in self._groups],
-            start_method=multiprocessing.get_start_method(),
+            [partial(GameProcess, make) for make in makes], start_method=multiprocessing.get_start_method()
         )
         self._watch = _Watch(self._venv.processes, [_named(group) for group in self._groups])
         self._watch.start()
         # Runs at the interpreter's exit, or when the environment is garbage collected.
         self._finalizer = weakref.finalize(self, _close_workers, self._venv, os.getpid())
-        self._run("build")
+        self.run("ask", (), len)  # the first call makes the games
 
     def __reduce__(self) -> NoReturn:
         """Refuse copies and pickles, which would share the pipes of this object and end its processes."""
@@ -118,47 +103,8 @@ class WorkerGames:
             "n_cpus=1"
         )
 
-    def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
-        """Begin an episode in every game (see :class:`TeamConcatVecEnv`)."""
-        observations, infos = zip(*self._run("call", "reset_all", seeds, options), strict=True)
-        return _joined(observations), [info for group in infos for info in group]
-
-    def play(self, actions: npt.NDArray[Any]) -> Step:
-        """Step every game (see :class:`TeamConcatVecEnv`)."""
-        steps: list[Step] = self._run("call", "play", actions)
-        return Step(
-            _joined([step.observations for step in steps]),
-            np.concatenate([step.rewards for step in steps]),
-            np.concatenate([step.dones for step in steps]),
-            [info for step in steps for info in step.infos],
-            [info for step in steps for info in step.reset_infos],
-            [note for step in steps for note in step.notes],
-        )
-
-    def ask(self, games: Iterable[int], function: Callable[..., Any], *args: Any) -> dict[int, Any]:
-        """Call a function with games (see :class:`TeamConcatVecEnv`)."""
-        answers: dict[int, Any] = {}
-        for group in self._run("call", "ask", list(games), function, *args):
-            answers |= group
-        return answers
-
-    def snapshots(self) -> list[dict[str, Any]]:
-        """Copy all games (see :class:`TeamConcatVecEnv`)."""
-        return [snapshot for group in self._run("call", "snapshots") for snapshot in group]
-
-    def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
-        """Restore snapshots (see :class:`TeamConcatVecEnv`)."""
-        self._run("call", "restore", snapshots)
-
-    def close(self) -> None:
-        """Close all games and end the processes; then raise the first error of a game."""
-        self._finalizer.detach()
-        if self.ended is None:
-            self.ended = "it was closed"
-            self._results(_close_workers(self._venv, os.getpid()))
-
-    def _run(self, name: str, *args: Any) -> list[Any]:
-        """Call a method of :class:`GameProcess` in all processes."""
+    def run(self, name: str, *args: Any) -> list[Any]:
+        """Call a method of :class:`TeamConcatVecEnv` in all processes; return their results."""
         if self.ended is not None:
             raise RuntimeError(f"the vector environment is closed ({self.ended}); make a new one")
         try:
@@ -171,6 +117,13 @@ class WorkerGames:
             self._end("it was interrupted while it waited for its worker processes")
             raise
         return self._results(replies)
+
+    def close(self) -> None:
+        """Close all games and end the processes; then raise the first error of a game."""
+        self._finalizer.detach()
+        if self.ended is None:
+            self.ended = "it was closed"
+            self._results(_close_workers(self._venv, os.getpid()))
 
     def _results(self, replies: Sequence[bytes]) -> list[Any]:
         results = [pickle.loads(reply) for reply in replies]
@@ -235,7 +188,7 @@ def _close_workers(venv: SubprocVecEnv, owner: int) -> list[bytes]:
         return []
     replies: list[bytes] = []
     with suppress(EOFError, OSError):
-        replies = venv.env_method("run", cloudpickle.dumps(("close_games", ())))
+        replies = venv.env_method("run", cloudpickle.dumps(("close", ())))
         venv.close()
     _kill(venv.processes)
     return replies
@@ -246,10 +199,3 @@ def _kill(processes: Sequence[BaseProcess]) -> None:
         process.kill()
     for process in processes:
         process.join()
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    """Join the rows of several processes."""
-    if isinstance(parts[0], dict):
-        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return np.concatenate(parts)
