@@ -21,9 +21,9 @@ from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamRolloutBuff
 from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.memory import Memory
 from tests.team_venv import TeamVenv
+from tests.test_policies import NAMES as POLICIES
 from tests.weights import DyingGame
 
-POLICIES = ("SAFPolicy", "MAPPOPolicy", "IPPOPolicy")
 KINDS = ("gru", "lstm")
 SMALL: dict[str, Any] = {"net_arch": [16], "memory_size": 8}
 

@@ -13,15 +13,10 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import make_proba_distribution
 from torch import nn
 
-from sb3_saf.networks import distributions
-from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy, draw_policy
-from sb3_saf.networks.distributions import (
-    PoolDistribution,
-    SelectedDistribution,
-    distribution_of,
-    mixture_of,
-    n_action_parameters,
-)
+from sb3_saf.networks import mixtures
+from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy
+from sb3_saf.networks.distributions import distribution_of, n_action_parameters
+from sb3_saf.networks.mixtures import PoolDistribution, SelectedDistribution, draw_policy, mixture_of
 
 N_ROWS, N_POLICIES = 4, 3
 DISCRETE = spaces.Discrete(5)
@@ -140,7 +135,7 @@ def test_enumeration_in_parts_gives_the_same_numbers_and_gradients(monkeypatch: 
         return [entropy, *th.autograd.grad(entropy.sum(), (log_weights, parameters)), mixture.mode()]
 
     at_once = entropy_gradients_and_mode()
-    monkeypatch.setattr(distributions, "_ENUMERATED_AT_ONCE", 2 * N_POLICIES * 12)
+    monkeypatch.setattr(mixtures, "_ENUMERATED_AT_ONCE", 2 * N_POLICIES * 12)
     for found, expected in zip(entropy_gradients_and_mode(), at_once, strict=True):
         th.testing.assert_close(found, expected)
 

@@ -30,13 +30,11 @@ from sb3_saf.networks.distributions import (
     is_one_hot,
     likeliest_action,
     masked_parameters,
-    mixture_log_prob,
     mixture_log_probs,
-    mixture_mode,
     n_action_parameters,
-    policy_parameters,
 )
 from sb3_saf.networks.encoders import encoded
+from sb3_saf.networks.mixtures import mixture_log_prob, mixture_mode, policy_parameters
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.qplex.parts import AgentMemory
 from sb3_saf.qplex.policies import QPLEXPolicy

@@ -20,16 +20,14 @@ from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_saf.networks.distributions import (
-    SelectedDistribution,
     distribution_of,
     masked_parameters,
     mixture_log_probs,
-    mixture_of,
     n_action_outputs,
     n_action_parameters,
-    policy_parameters,
 )
 from sb3_saf.networks.layers import AgentHeads, mlp, side_by_side
+from sb3_saf.networks.mixtures import SelectedDistribution, mixture_of
 
 #: Orthogonal gain of the last layer: initial policies are close to uniform.
 ACTION_GAIN = 0.01
@@ -214,7 +212,7 @@ class PolicyPool(ActorNetwork):
 
     ``selection="mixture"``: u is drawn from the weights, then the action from policy u. Likelihood, entropy and most
     likely action are those of the mixture, exact where the action space allows it (see
-    ``sb3_saf.networks.distributions``).
+    ``sb3_saf.networks.mixtures``).
 
     ``selection="gumbel"``: one policy is drawn for each distribution (Gumbel noise on the logits, hard choice,
     straight-through gradient), and likelihood and entropy are that policy's. This is the behaviour of the released
@@ -303,29 +301,9 @@ class PolicyPool(ActorNetwork):
             actions = masked_parameters(self.action_space, actions, masks)
         if self.selection == "mixture":
             return mixture_of(self.action_space, log_weights, actions)
-        favourite = policy_parameters(actions, log_weights.argmax(dim=1))
-        return SelectedDistribution(
-            drawn=distribution_of(self.action_space, draw_policy(log_weights, actions)),
-            favourite=distribution_of(self.action_space, favourite),
-        )
+        return SelectedDistribution(self.action_space).proba_distribution(log_weights, actions)
 
     @property
     def is_categorical_mixture(self) -> bool:
         """Whether the mixture is a single categorical, which is then computed before rows are gathered."""
         return self.selection == "mixture" and isinstance(self.action_space, spaces.Discrete)
-
-
-def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
-    Draw one policy per row by its weight, with straight-through gradients to the weights.
-
-    :param log_weights: (B, U)
-    :param actions: (B, U, P)
-    :return: (B, P), bit for bit the parameters of the drawn policy
-    """
-    uniform = th.rand_like(log_weights).clamp_min(th.finfo(log_weights.dtype).tiny)
-    noisy = log_weights - (-uniform.log()).log()
-    soft = noisy.softmax(dim=1)
-    # Zero in value; its gradient is that of the soft choice.
-    straight_through = ((soft - soft.detach()).unsqueeze(2) * actions.detach()).sum(dim=1)
-    return policy_parameters(actions, noisy.argmax(dim=1)) + straight_through

@@ -14,10 +14,10 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy, draw_policy
+from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
-from sb3_saf.networks.distributions import policy_parameters
 from sb3_saf.networks.memory import MEMORY_NAMES, Memory, MemoryName
+from sb3_saf.networks.mixtures import draw_policy, policy_parameters
 from sb3_saf.qplex.mixers import MIXER_NAMES, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
 from sb3_saf.teams.checks import check_choice, check_count
 
