@@ -16,6 +16,7 @@ from torch import nn
 from sb3_saf.networks import mixtures
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy
 from sb3_saf.networks.distributions import distribution_of, n_action_parameters
+from sb3_saf.networks.layers import NetworkSpec
 from sb3_saf.networks.mixtures import PoolDistribution, SelectedDistribution, draw_policy, mixture_of
 
 N_ROWS, N_POLICIES = 4, 3
@@ -208,8 +209,12 @@ def test_gradients_pass_straight_through_the_choice() -> None:
     assert th.equal(to_parameters, only_chosen)
 
 
+def spec_of(space: spaces.Space[Any], log_std_init: float = 0.0) -> NetworkSpec:
+    return NetworkSpec(6, 3, space, [8], [], nn.Tanh, log_std_init)
+
+
 def make_pool(space: spaces.Space[Any], selection: Selection) -> PolicyPool:
-    pool = PolicyPool(6, space, [8], nn.Tanh, n_policies=4, selection=selection, latent_dim=5, projection_hidden=[7])
+    pool = PolicyPool(spec_of(space), n_policies=4, selection=selection, latent_dim=5, projection_hidden=[7])
     with th.no_grad():
         for parameter in pool.parameters():
             nn.init.normal_(parameter)
@@ -258,7 +263,7 @@ def test_gumbel_is_one_policy_at_a_time_and_its_mode_the_favourites(space: space
 
 @pytest.mark.parametrize("space", SPACES)
 def test_one_policy_is_sb3s_own_distribution(space: spaces.Space[Any]) -> None:
-    actor, features = SinglePolicy(6, space, [8], nn.Tanh, log_std_init=-0.5), th.randn(N_ROWS, 6)
+    actor, features = SinglePolicy(spec_of(space, -0.5)), th.randn(N_ROWS, 6)
     with th.no_grad():
         for parameter in actor.parameters():
             nn.init.normal_(parameter)
@@ -279,8 +284,8 @@ def test_one_policy_is_sb3s_own_distribution(space: spaces.Space[Any]) -> None:
 
 def identified(kind: str, action_space: spaces.Space[Any]) -> ActorNetwork:
     if kind == "single":
-        return SinglePolicy(6, action_space, [8], nn.Tanh, n_identities=3)
-    return PolicyPool(6, action_space, [8], nn.Tanh, 4, "mixture", 8, [8], n_identities=3)
+        return SinglePolicy(spec_of(action_space), identity=True)
+    return PolicyPool(spec_of(action_space), 4, "mixture", 8, [8], identity=True)
 
 
 @pytest.mark.parametrize("kind", ["single", "pool"])
@@ -296,8 +301,3 @@ def test_the_agents_identity_stands_beside_the_features(kind: str) -> None:
     assert not th.allclose(actor(features, agent), actor(features, 2 - agent))
     with pytest.raises(ValueError, match="reads who acts"):
         actor(features)
-
-
-def test_policies_of_each_agents_own_need_no_identity() -> None:
-    with pytest.raises(ValueError, match="already knows who acts"):
-        SinglePolicy(6, spaces.Discrete(5), [8], nn.Tanh, n_agents=3, n_identities=3)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import torch as th
 from gymnasium import spaces
@@ -26,7 +26,7 @@ from sb3_saf.networks.distributions import (
     n_action_outputs,
     n_action_parameters,
 )
-from sb3_saf.networks.layers import AgentHeads, mlp, side_by_side
+from sb3_saf.networks.layers import AgentHeads, NetworkSpec, mlp, side_by_side
 from sb3_saf.networks.mixtures import SelectedDistribution, mixture_of
 
 #: Orthogonal gain of the last layer: initial policies are close to uniform.
@@ -52,30 +52,21 @@ class ActionHead(nn.Module):
     """
     One policy: an MLP, and for Box actions a learned standard deviation that does not depend on the observation.
 
-    :param features_dim: d
-    :param action_space: the action space
-    :param hidden: sizes of the hidden layers
-    :param activation_fn: activation of the hidden layers
-    :param log_std_init: first log standard deviation, Box actions only
+    :param spec: spec of the policy
+    :param n_identities: N if the one-hot index of the agent stands beside the features; else 0
     """
 
     log_std: nn.Parameter | None
 
-    def __init__(
-        self,
-        features_dim: int,
-        action_space: spaces.Space[Any],
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-        log_std_init: float,
-    ):
+    def __init__(self, spec: NetworkSpec, n_identities: int = 0):
         super().__init__()
-        n_outputs = n_action_outputs(action_space)
-        if isinstance(action_space, spaces.Box):
-            self.log_std = nn.Parameter(th.full((n_outputs,), log_std_init))
+        n_outputs = n_action_outputs(spec.action_space)
+        if isinstance(spec.action_space, spaces.Box):
+            self.log_std = nn.Parameter(th.full((n_outputs,), spec.log_std_init))
         else:
             self.register_parameter("log_std", None)
-        self.net = mlp([features_dim, *hidden, n_outputs], activation_fn, output_gain=ACTION_GAIN)
+        sizes = [spec.features_dim + n_identities, *spec.actor_hidden, n_outputs]
+        self.net = mlp(sizes, spec.activation_fn, output_gain=ACTION_GAIN)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
@@ -92,16 +83,16 @@ class ActorNetwork(nn.Module, ABC):
     """
     Base of all networks that act.
 
-    :param action_space: the action space
+    :param spec: spec of the policy
     :param reads_agent: whether ``forward`` needs the agent's index
-    :param n_identities: N if the network reads the agent's index as a one-hot vector beside the features; else 0
+    :param identity: whether the network reads the agent's index as a one-hot vector beside the features
     """
 
-    def __init__(self, action_space: spaces.Space[Any], reads_agent: bool, n_identities: int = 0):
+    def __init__(self, spec: NetworkSpec, reads_agent: bool, identity: bool):
         super().__init__()
-        self.action_space = action_space
+        self.action_space = spec.action_space
         self.reads_agent = reads_agent
-        self.n_identities = n_identities
+        self.n_identities = spec.n_agents if identity else 0
 
     @abstractmethod
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
@@ -162,38 +153,21 @@ class ActorNetwork(nn.Module, ABC):
 
 class SinglePolicy(ActorNetwork):
     """
-    One policy for all agents, or one for each (``n_agents``): the actor of IPPO and MAPPO.
+    One policy for all agents, or one for each: the actor of IPPO and MAPPO.
 
-    :param features_dim: d
-    :param action_space: the action space
-    :param hidden: sizes of the hidden layers
-    :param activation_fn: activation of the hidden layers
-    :param log_std_init: first log standard deviation, Box actions only
-    :param n_agents: N for one policy per agent; None for one that all share
-    :param n_identities: N if a shared policy reads the agent's index as a one-hot vector beside the features
+    :param spec: spec of the policy
+    :param per_agent: whether each agent has a policy of its own
+    :param identity: whether a policy that all share reads the agent's index as a one-hot vector beside the features
     """
 
-    def __init__(
-        self,
-        features_dim: int,
-        action_space: spaces.Space[Any],
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-        log_std_init: float = 0.0,
-        n_agents: int | None = None,
-        n_identities: int = 0,
-    ):
-        if n_agents is not None and n_identities:
-            raise ValueError(
-                "one policy per agent already knows who acts; leave the agent's identity out, or let all agents share "
-                "one policy (heads='shared')"
-            )
-        super().__init__(action_space, n_agents is not None or n_identities > 0, n_identities)
+    def __init__(self, spec: NetworkSpec, per_agent: bool = False, identity: bool = False):
+        identity = identity and not per_agent
+        super().__init__(spec, per_agent or identity, identity)
 
         def make_head() -> ActionHead:
-            return ActionHead(features_dim + n_identities, action_space, hidden, activation_fn, log_std_init)
+            return ActionHead(spec, self.n_identities)
 
-        self.head: ActionHead | AgentHeads = make_head() if n_agents is None else AgentHeads(make_head, n_agents)
+        self.head: ActionHead | AgentHeads = AgentHeads(make_head, spec.n_agents) if per_agent else make_head()
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """See :class:`ActorNetwork`; (K, d) to (K, P)."""
@@ -218,41 +192,31 @@ class PolicyPool(ActorNetwork):
     straight-through gradient), and likelihood and entropy are that policy's. This is the behaviour of the released
     code; two evaluations of one action may use different policies. Deterministic actions use the highest weight.
 
-    :param features_dim: size of z
-    :param action_space: the action space
-    :param hidden: sizes of the policies' hidden layers
-    :param activation_fn: activation of all MLPs
+    :param spec: spec of the policy
     :param n_policies: U, at least 2
     :param selection: ``"mixture"`` or ``"gumbel"``
     :param latent_dim: d, size of queries and signature keys
     :param projection_hidden: sizes of the hidden layers of g_psel
-    :param log_std_init: first log standard deviation, Box actions only
-    :param n_identities: N if selection and policies read the agent's index as a one-hot vector beside z; else 0
+    :param identity: whether selection and policies read the agent's index as a one-hot vector beside z
     """
 
     def __init__(
         self,
-        features_dim: int,
-        action_space: spaces.Space[Any],
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
+        spec: NetworkSpec,
         n_policies: int,
         selection: Selection,
         latent_dim: int,
         projection_hidden: Sequence[int],
-        log_std_init: float = 0.0,
-        n_identities: int = 0,
+        identity: bool = False,
     ):
-        super().__init__(action_space, n_identities > 0, n_identities)
-        features_dim += n_identities
+        super().__init__(spec, identity, identity)
         self.selection = selection
         self.n_policies = n_policies
         # Initial selection is close to uniform, so that policies differentiate before the selection settles.
-        self.query_net = mlp([features_dim, *projection_hidden, latent_dim], activation_fn, output_gain=ACTION_GAIN)
+        sizes = [spec.features_dim + self.n_identities, *projection_hidden, latent_dim]
+        self.query_net = mlp(sizes, spec.activation_fn, output_gain=ACTION_GAIN)
         self.signature_keys = nn.Parameter(th.randn(n_policies, latent_dim))
-        self.policies = nn.ModuleList(
-            ActionHead(features_dim, action_space, hidden, activation_fn, log_std_init) for _ in range(n_policies)
-        )
+        self.policies = nn.ModuleList(ActionHead(spec, self.n_identities) for _ in range(n_policies))
 
     def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
         """See :class:`ActorNetwork`."""

@@ -47,7 +47,7 @@ class NetworkSpec(NamedTuple):
     actor_hidden: list[int]
     value_hidden: list[int]
     activation_fn: type[nn.Module]
-    log_std_init: float
+    log_std_init: float = 0.0
     state_space: spaces.Space[Any] | None = None
     memory: MemoryName | None = None
     memory_size: int = 0

@@ -61,22 +61,9 @@ class TeamParts(ABC):
         """Heads of the critic."""
         return self.critic_heads or self.heads
 
-    def n_identities(self, spec: NetworkSpec) -> int:
-        """Return N if a shared actor reads the agent's index, else 0."""
-        return spec.n_agents if self.actor_identity else 0
-
     def actor(self, spec: NetworkSpec) -> ActorNetwork:
         """Make the actor; separate actors do not need the agent's index."""
-        per_agent = self.heads == "per_agent"
-        return SinglePolicy(
-            spec.features_dim,
-            spec.action_space,
-            spec.actor_hidden,
-            spec.activation_fn,
-            spec.log_std_init,
-            n_agents=spec.n_agents if per_agent else None,
-            n_identities=0 if per_agent else self.n_identities(spec),
-        )
+        return SinglePolicy(spec, self.heads == "per_agent", self.actor_identity)
 
     @abstractmethod
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:

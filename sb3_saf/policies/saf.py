@@ -141,18 +141,8 @@ class SAFParts(MAPPOParts):
         """Make the policy pool, or MAPPO's actor for a single policy."""
         if self.n_policies == 1:
             return super().actor(spec)
-        return PolicyPool(
-            spec.features_dim,
-            spec.action_space,
-            spec.actor_hidden,
-            spec.activation_fn,
-            n_policies=self.n_policies,
-            selection=self.selection,
-            latent_dim=self.latent_dim,
-            projection_hidden=self.projection_arch,
-            log_std_init=spec.log_std_init,
-            n_identities=self.n_identities(spec),
-        )
+        arguments = (self.n_policies, self.selection, self.latent_dim, self.projection_arch)
+        return PolicyPool(spec, *arguments, identity=self.actor_identity)
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:
         """Make the critic: V_i from s_i^SAF, or without knowledge source MAPPO's or IPPO's."""

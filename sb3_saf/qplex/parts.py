@@ -6,7 +6,6 @@ Letters: K rows, N agents, A actions, U heads of a pool, d features, H size of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -16,6 +15,7 @@ from torch import nn
 
 from sb3_saf.networks.actor import ActorNetwork, PolicyPool, SinglePolicy
 from sb3_saf.networks.critic import Heads
+from sb3_saf.networks.layers import NetworkSpec
 from sb3_saf.networks.memory import MEMORY_NAMES, Memory, MemoryName
 from sb3_saf.networks.mixtures import draw_policy, policy_parameters
 from sb3_saf.qplex.mixers import MIXER_NAMES, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
@@ -123,28 +123,11 @@ class QPLEXParts:
         for name in ("projection_arch", "kernel_arch"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
-    def actor(
-        self,
-        features_dim: int,
-        n_agents: int,
-        action_space: spaces.Discrete,
-        hidden: Sequence[int],
-        activation_fn: type[nn.Module],
-    ) -> ActorNetwork:
+    def actor(self, spec: NetworkSpec) -> ActorNetwork:
         """Make the Q heads: an actor whose logits are Q values."""
         if self.n_policies == 1:
-            heads = n_agents if self.heads == "per_agent" else None
-            return SinglePolicy(features_dim, action_space, hidden, activation_fn, n_agents=heads)
-        return PolicyPool(
-            features_dim,
-            action_space,
-            hidden,
-            activation_fn,
-            n_policies=self.n_policies,
-            selection="gumbel",
-            latent_dim=self.latent_dim,
-            projection_hidden=self.projection_arch,
-        )
+            return SinglePolicy(spec, self.heads == "per_agent")
+        return PolicyPool(spec, self.n_policies, "gumbel", self.latent_dim, self.projection_arch)
 
     def agent_memory(self, features_dim: int, action_space: spaces.Discrete, n_agents: int) -> AgentMemory | None:
         """Make each agent's memory, if any."""

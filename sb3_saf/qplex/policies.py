@@ -18,7 +18,7 @@ from torch import nn
 from sb3_saf.buffers.replay import TeamSteps
 from sb3_saf.networks.actor import ActorNetwork
 from sb3_saf.networks.encoders import ObservationEncoder
-from sb3_saf.networks.layers import HIDDEN_GAIN, gather, orthogonal_init
+from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather, orthogonal_init
 from sb3_saf.policies.rows import ChunkSize, TeamRowsPolicy
 from sb3_saf.qplex.mixers import Mixer
 from sb3_saf.qplex.parts import AgentMemory, QPLEXParts, QPLEXPoolParts, q_values
@@ -139,7 +139,9 @@ class QPLEXPolicy(TeamRowsPolicy):
         parts, n_agents = self.parts, self.team_spaces.n_agents
         self.actor_memory = parts.agent_memory(self.features_dim, self.action_space, n_agents)
         latent_dim = self.features_dim if self.actor_memory is None else self.actor_memory.size
-        self.actor = parts.actor(latent_dim, n_agents, self.action_space, self.net_arch, self.activation_fn)
+        self.actor = parts.actor(
+            NetworkSpec(latent_dim, n_agents, self.action_space, self.net_arch, [], self.activation_fn)
+        )
         if self.ortho_init:
             self.features_extractor.apply(partial(self.init_weights, gain=HIDDEN_GAIN))
             orthogonal_init(self.actor)
