@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, ItemsView, Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 from weakref import WeakValueDictionary
 
@@ -37,17 +38,19 @@ _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values
 Ends = Literal["own", "team"]
 
 
+@dataclass
 class RolloutReturns:
     """
     Returns of one rollout, for policies that normalise values.
 
     :param returns: all returns used for training
     :param agents: their agents, in the same shape
+    :param known: the conversion of values, once it was asked for
     """
 
-    def __init__(self, returns: npt.NDArray[np.floating], agents: npt.NDArray[np.integer]) -> None:
-        self._returns, self._agents = returns, agents
-        self._rescaling: Rescaling | None = None
+    returns: npt.NDArray[np.floating]
+    agents: npt.NDArray[np.integer]
+    known: Rescaling | None = None
 
     def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
         """
@@ -55,9 +58,9 @@ class RolloutReturns:
 
         :param normalizer: normaliser of the trained policy
         """
-        if self._rescaling is None:
-            self._rescaling = normalizer.update(self._returns, self._agents)
-        return self._rescaling
+        if self.known is None:
+            self.known = normalizer.update(self.returns, self.agents)
+        return self.known
 
 
 class Sequences(NamedTuple):
@@ -258,27 +261,26 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             by_row = [key for key in (OBS_KEY, ACTION_MASK_KEY) if key in self.obs_shape]
             self.obs_shape = {key: self.obs_shape[key] for key in by_row}
             super().reset()
-            self._allocate_by_game()
+            # One entry per step and game, (T, E, ...).
+            self._agents_of_steps = th.arange(self.n_agents, device=self.device).repeat(
+                self.buffer_size * self.n_games, 1
+            )
+            self.active: Array | None = None
+            self.states: Array | None = None
+            self.starts: Array | None = None
+            shape = (self.buffer_size, self.n_games)
+            if self.team_spaces.has_starts:
+                self.starts = np.zeros((self.buffer_size, self.n_envs, 1), dtype=np.int8)
+            if self.team_spaces.active is not None:
+                self.active = np.ones((*shape, self.n_agents), dtype=np.int8)
+            if self.team_spaces.state is not None:
+                state = self.team_spaces.state
+                self.states = np.zeros((*shape, *(state.shape or ())), dtype=state.dtype)
             self._allocated = True
         self.generator_ready = False
         self._later.clear()
         self.memories = None
         BaseBuffer.reset(self)
-
-    def _allocate_by_game(self) -> None:
-        """Allocate the arrays with one entry per step and game, (T, E, ...)."""
-        self._agents_of_steps = th.arange(self.n_agents, device=self.device).repeat(self.buffer_size * self.n_games, 1)
-        self.active: Array | None = None
-        self.states: Array | None = None
-        self.starts: Array | None = None
-        shape = (self.buffer_size, self.n_games)
-        if self.team_spaces.has_starts:
-            self.starts = np.zeros((self.buffer_size, self.n_envs, 1), dtype=np.int8)
-        if self.team_spaces.active is not None:
-            self.active = np.ones((*shape, self.n_agents), dtype=np.int8)
-        if self.team_spaces.state is not None:
-            state = self.team_spaces.state
-            self.states = np.zeros((*shape, *(state.shape or ())), dtype=state.dtype)
 
     @property
     def nbytes(self) -> int:
@@ -325,17 +327,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             value = log_prob  # placeholder: compute_returns_and_advantage overwrites it
         super().add(obs, action, reward, episode_start, value, log_prob)
 
-    def _compute_later_values(self) -> None:
-        at_once = max(1, ROWS_AT_ONCE // self.n_envs)
-        for start in range(0, len(self._later), at_once):
-            positions, steps = zip(*self._later[start : start + at_once], strict=True)
-            for position, values in zip(positions, compute_together(steps), strict=True):
-                self.values[position] = values.reshape(-1).cpu().numpy()
-        cuts = [value.step.memory for _, value in self._later[:: self.sequence_length]]
-        memories = [memory for memory in cuts if memory is not None]
-        self.memories = th.stack(memories) if memories else None
-        self._later.clear()
-
     def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
         """Return an entry that all rows of a game share, once per game: (B, ...) -> (E, ...)."""
         expected = (self.n_envs, *stored.shape[2:])
@@ -377,7 +368,15 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param last_values: (B,) or (B, 1) values after the last step
         :param dones: (B,) whether an episode ended with the last step
         """
-        self._compute_later_values()
+        at_once = max(1, ROWS_AT_ONCE // self.n_envs)
+        for start in range(0, len(self._later), at_once):
+            positions, steps = zip(*self._later[start : start + at_once], strict=True)
+            for position, values in zip(positions, compute_together(steps), strict=True):
+                self.values[position] = values.reshape(-1).cpu().numpy()
+        cuts = [value.step.memory for _, value in self._later[:: self.sequence_length]]
+        memories = [memory for memory in cuts if memory is not None]
+        self.memories = th.stack(memories) if memories else None
+        self._later.clear()
         counted = np.ones((self.buffer_size, self.n_envs), dtype=np.bool_)
         if self.active is not None:
             counted = self.active.reshape(self.buffer_size, self.n_envs) != 0
@@ -461,8 +460,12 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param env: unused, as in SB3's buffers for rollouts
         :return: L * S * N rows without those of inactive agents
         """
-        sequences = None if self.memories is None else self._sequences(batch_inds)
-        batch_inds = batch_inds.reshape(-1)
+        first, batch_inds, sequences = batch_inds[0], batch_inds.reshape(-1), None
+        if self.memories is not None and self.starts is not None:
+            starts = self._gather(self.starts, batch_inds).view(-1, len(first), self.n_agents) != 0
+            cut, game = first // (self.sequence_length * self.n_games), first % self.n_games
+            at = th.as_tensor(cut * self.n_games + game, device=self.memories.device)
+            sequences = Sequences(starts, self.memories.flatten(0, 1)[at].to(self.device))
         parts = {
             name: self._gather(getattr(self, name), batch_inds).flatten(end_dim=1)
             for name in ("actions", "values", "log_probs", "advantages", "returns")
@@ -488,14 +491,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             advantages=parts["advantages"],
             returns=parts["returns"],
         )
-
-    def _sequences(self, team_steps: npt.NDArray[np.int64]) -> Sequences:
-        """Return beginnings and memories of the sequences of team steps (L, S)."""
-        assert self.memories is not None and self.starts is not None
-        starts = self._gather(self.starts, team_steps.reshape(-1)).view(*team_steps.shape, self.n_agents) != 0
-        cut, game = team_steps[0] // (self.sequence_length * self.n_games), team_steps[0] % self.n_games
-        rows = th.as_tensor(cut * self.n_games + game, device=self.memories.device)
-        return Sequences(starts, self.memories.flatten(0, 1)[rows].to(self.device))
 
     def _of_games_at(self, array: Array, team_steps: npt.NDArray[np.int64]) -> Array:
         """Select team steps: (T, E, ...) -> (K, ...)."""

@@ -9,8 +9,6 @@ import json
 import logging
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
@@ -291,8 +289,12 @@ class ActingNetwork(nn.Module):
 
 def _written(network: ActingNetwork, inputs: Tensors, metadata: dict[str, str]) -> bytes:
     rows = th.export.Dim("rows", max=2**31 - 1)  # torch 2.7 fails without a limit
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # it prints its progress
     try:
-        with _quiet():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             program = th.onnx.export(
                 network,
                 kwargs={"inputs": inputs},
@@ -306,25 +308,13 @@ def _written(network: ActingNetwork, inputs: Tensors, metadata: dict[str, str]) 
             )
     except Exception as error:  # a user's encoder may raise anything
         raise ExportError(f"the network cannot be written as ONNX: {error}") from error
+    finally:
+        logger.setLevel(level)
     assert program is not None
     proto = program.model_proto
     for key, value in metadata.items():
         proto.metadata_props.add(key=key, value=value)
     return proto.SerializeToString(deterministic=True)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the exporter's progress messages."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def _check(graph: bytes, network: ActingNetwork, policy: ExportablePolicy, inputs: Tensors) -> None:
