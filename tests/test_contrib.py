@@ -22,11 +22,11 @@ from sb3_saf import make_team_env
 from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.distributions import distribution_of, masked_parameters
 from sb3_saf.networks.mixtures import mixture_of
-from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
+from sb3_saf.policies.base import TeamMaskablePolicy
 from sb3_saf.registration import DECLARATIONS
-from sb3_saf.teams.rows import TeamSpaces
+from tests import test_policies
 from tests.contrib_teams import MaskedTeams, choices_of, is_allowed, random_masks
-from tests.test_policies import ACTIONS, equal_weights
+from tests.test_policies import ACTIONS, SMALL, SMALL_SAF, VARIANTS, equal_weights
 from tests.toy_envs import CounterEnv
 from tests.toy_teams import VECTOR, ToyTeams, team_rows, to_numpy
 
@@ -39,20 +39,6 @@ NAMES = [f"{family}{kind}Policy" for kind in ALGORITHMS for family in FAMILIES]
 CLASSES: dict[str, Any] = {
     policy.__name__: policy for one in DECLARATIONS for policies in one.policies.values() for policy in policies
 }
-#: All options of critics and actors that change what is computed.
-VARIANTS: list[tuple[str, dict[str, Any]]] = [
-    ("IPPO", {}),
-    ("IPPO", {"heads": "per_agent"}),
-    ("MAPPO", {}),
-    ("MAPPO", {"agent_identity": False}),
-    ("MAPPO", {"heads": "per_agent"}),
-    ("SAF", {}),
-    ("SAF", {"heads": "per_agent"}),
-    ("SAF", {"critic_input": "team"}),
-    ("SAF", {"selection": "gumbel"}),
-    ("SAF", {"n_policies": 1, "knowledge_source": False}),
-    ("SAF", {"actor_identity": True}),
-]
 
 
 def kind_of(name: str) -> str:
@@ -61,24 +47,14 @@ def kind_of(name: str) -> str:
 
 def sizes_of(name: str) -> dict[str, Any]:
     """Arguments of a small policy."""
-    sizes: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
-    if name.startswith("SAF"):
-        sizes |= {"latent_dim": 8, "projection_arch": (10,)}
-    return sizes
+    return SMALL | (SMALL_SAF if name.startswith("SAF") else {})
 
 
 def make_policy(
     name: str, action_space: spaces.Space[Any] = ACTIONS["discrete"], noise: float = 0.3, **kwargs: Any
 ) -> Any:
-    """Create a small policy for three agents; noise on the actor's small first weights makes every part matter."""
-    th.manual_seed(0)
-    policy_class: type[TeamPolicy] = CLASSES[name]
-    space = TeamSpaces(VECTOR, 3, has_starts=True).to_dict_space()
-    policy = policy_class(space, action_space, lambda _: 1e-3, **(sizes_of(name) | kwargs))
-    with th.no_grad():
-        for parameter in policy.actor.parameters():
-            parameter.add_(noise * th.randn_like(parameter))
-    return policy
+    """Create a small policy for three agents, by its name, for rows that tell where episodes begin."""
+    return test_policies.make_policy(CLASSES[name], VECTOR, action_space, noise=noise, has_starts=True, **kwargs)
 
 
 def make_venv(name: str, action: str = "discrete") -> ToyTeams:
@@ -335,9 +311,10 @@ def test_the_mask_leaves_the_choice_among_policies_as_it_is() -> None:
     th.testing.assert_close(found.probs, th.tensor([[0.5, 0.0, 0.5]]))
 
 
-@pytest.mark.parametrize(("family", "kwargs"), VARIANTS)
-def test_masked_actions_depend_on_own_observation_and_own_mask_only(family: str, kwargs: dict[str, Any]) -> None:
-    policy, obs = make_policy(f"{family}MaskablePolicy", **kwargs), team_rows(VECTOR)
+@pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
+def test_masked_actions_depend_on_own_observation_and_own_mask_only(policy_class: Any, kwargs: dict[str, Any]) -> None:
+    name = policy_class.__name__.replace("Policy", "MaskablePolicy")
+    policy, obs = make_policy(name, **kwargs), team_rows(VECTOR)
     others = obs | {"team": team_rows(VECTOR, n_views=12, seed=1)["team"]}
     masks = random_masks(ACTIONS["discrete"], 12, np.random.default_rng(0))
     other_masks = random_masks(ACTIONS["discrete"], 12, np.random.default_rng(1))

@@ -155,7 +155,7 @@ def test_decides_as_the_model_does(name: str, exports: Callable[[str], Exported]
         tensors = {key: th.as_tensor(value) for key, value in rows.items()}
         with th.no_grad():
             distribution = policy.get_distribution(tensors)
-            likelihoods = distribution.log_prob(th.as_tensor(actions))
+            likelihoods = distribution.log_prob(th.as_tensor(actions).float())  # SB3's MultiBinary takes floats
         np.testing.assert_allclose(actor.log_prob(obs, actions), likelihoods, rtol=1e-5, atol=1e-5)
         if isinstance(policy.action_space, spaces.Discrete):
             probabilities = distribution.distribution.probs.numpy()
@@ -244,7 +244,7 @@ def test_masks_of_maskable_ppo_are_optional(exports: Callable[[str], Exported]) 
     actions = samples(policy.action_space, 40)
     with th.no_grad():
         distribution = policy.get_distribution(th.as_tensor(obs), action_masks=masks)
-        likelihoods = distribution.log_prob(th.as_tensor(actions))
+        likelihoods = distribution.log_prob(th.as_tensor(actions).float())  # SB3's MultiBinary takes floats
     np.testing.assert_allclose(actor.log_prob(obs, actions, action_mask=masks), likelihoods, rtol=1e-5, atol=1e-5)
 
 

@@ -63,8 +63,8 @@ VARIANTS_AND_SPACES: list[tuple[type[TeamActorCriticPolicy], dict[str, Any], spa
     (SAFPolicy, {}, PICTURE),
     (SAFPolicy, {}, CodeSpace()),
 ]
-SMALL = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
-SMALL_SAF = {"latent_dim": 8, "projection_arch": (10,)}
+SMALL: dict[str, Any] = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 12}}
+SMALL_SAF: dict[str, Any] = {"latent_dim": 8, "projection_arch": (10,)}
 
 
 def constant(_: float) -> float:
@@ -77,12 +77,13 @@ def make_policy(
     action_space: spaces.Space[Any] = ACTIONS["discrete"],
     seed: int = 0,
     noise: float = 0.3,
+    has_starts: bool = False,
     **kwargs: Any,
 ) -> TeamActorCriticPolicy:
     """Create a small policy for three agents; noise on the actor's small first weights makes every part matter."""
     th.manual_seed(seed)
-    sizes: dict[str, Any] = SMALL | (SMALL_SAF if policy_class is SAFPolicy else {})
-    space = TeamSpaces(own, 3).to_dict_space()
+    sizes: dict[str, Any] = SMALL | (SMALL_SAF if policy_class.__name__.startswith("SAF") else {})
+    space = TeamSpaces(own, 3, has_starts=has_starts).to_dict_space()
     policy = policy_class(space, action_space, constant, **(sizes | kwargs))
     with th.no_grad():
         for parameter in policy.actor.parameters():
