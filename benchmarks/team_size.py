@@ -124,7 +124,7 @@ def main() -> None:
         + "\n".join(f"{row.name}, {row.n_agents} agents: {row.score:.1f} %" for row in scripted.itertuples(index=False))
     )
     if options.figure is not None:
-        draw_levels(table, "n_agents", y_label="treasures collected (%)", references=scripted).savefig(options.figure)
+        draw_levels(table, "n_agents", y_label="treasures collected (%)").savefig(options.figure)
 
 
 if __name__ == "__main__":

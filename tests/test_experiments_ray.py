@@ -132,7 +132,7 @@ def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any,
     assert engine.lost
     assert all("NodeDied" in str(error) for error in engine.lost)
     run(joint, CHOICE, SMOKE, Results(tmp_path / "here"), InlineEngine())
-    ray, here = (read_table(tmp_path / name / "joint" / "table.csv") for name in ("ray", "here"))
+    ray, here = (read_table(tmp_path / name / "joint" / "runs.csv") for name in ("ray", "here"))
     assert len(ray) == 6
     assert ray == here
     assert (tmp_path / "ray/cells/TeamSupport-c2-h2/ippo/seed-0/model.zip").exists()

@@ -16,14 +16,13 @@ from sb3_saf.experiments import cli
 from sb3_saf.experiments.definitions import EXPERIMENTS, Level, View, find_experiment, own_experiment
 from sb3_saf.experiments.grid import RunConfig, Selection
 from sb3_saf.experiments.page import losses, means
-from sb3_saf.experiments.report import read_scale
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
-from sb3_saf.experiments.tables import compare, complete, read_results
+from sb3_saf.experiments.tables import Frames, complete, marl_eval, read_results
 from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import finish_run
-from sb3_saf.training.statistics import Estimate, learning_curve, mean_over_seeds
+from sb3_saf.training.statistics import learning_curve, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
 
 pytest.importorskip("rliable")
@@ -58,7 +57,7 @@ def page(folder: Path) -> str:
 
 
 def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> None:
-    assert len(read_table(folder / "coordination" / "table.csv")) == N_CELLS
+    assert len(read_table(folder / "coordination" / "runs.csv")) == N_CELLS
     assert "missing" not in page
     names = {
         "levels-coordination.png",
@@ -69,6 +68,7 @@ def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> N
     assert {path.name for path in (folder / "coordination").glob("*.png")} == names
     assert all(f"({name})" in page for name in names)
     assert "Size `smoke`: 4 agents, 6 treasures, 80 game steps of training. saf, ippo and a random team" in page
+    assert "over 16 new games with drawn actions, the same for all methods of a seed" in page
     again = (
         "run coordination --size smoke --game-steps 80 --hyperparams n_epochs:1 --eval-freq 40 --eval-episodes 2 "
         "--episodes 16 --seeds 0 1 --methods saf ippo --tasks TeamTogether TeamSupport"
@@ -78,27 +78,18 @@ def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> N
 
 
 def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> None:
-    table = pd.read_csv(folder / "coordination" / "table.csv")
+    table = pd.read_csv(folder / "coordination" / "runs.csv")
     runs = table[(table.method == "saf") & (table.task == "TeamSupport") & (table.coordination == 1)]
     low, high = stats.t.interval(0.95, 1, loc=runs.return_mean.mean(), scale=runs.return_mean.sem())
-    assert f"| saf | {runs.return_mean.mean():.2f} [{low:.2f}, {high:.2f}] |" in page
+    assert f"| SAF | {runs.return_mean.mean():.2f} [{low:.2f}, {high:.2f}] |" in page
     every = np.sort(table[table.method == "ippo"].score)
     assert f"{stats.trim_mean(every, 0.25):.3f} [" in page.split("## Aggregates")[1].split("## ")[0]
     rows = [
         line
         for line in part_of(page, "Paired").splitlines()
-        if line.count("|") == 9 and "against" not in line and "---" not in line
+        if line.count("|") == 10 and "against" not in line and "---" not in line
     ]
-    assert [line.split(" | ")[-1] for line in rows] == ["no winner: fewer than 3 seeds |"] * (2 * len(LEVELS))
-
-
-def test_returns_while_learning_are_means_of_whole_curves(folder: Path, page: str) -> None:
-    curves = [pd.read_csv(folder / f"cells/{LEVELS[-1]}/saf/seed-{seed}/curve.csv")["score"] for seed in (0, 1)]
-    low, high = stats.t.interval(
-        0.95, 1, loc=np.mean([c.mean() for c in curves]), scale=stats.sem([c.mean() for c in curves])
-    )
-    row = part_of(page, "Return while learning").strip().splitlines()[-1]
-    assert row.startswith(f"| TeamSupport | c=3, h=1 | ippo | 0, 1 | {(low + high) / 2:.2f} [{low:.2f}, {high:.2f}] |")
+    assert [line.split(" | ")[-1] for line in rows] == ["fewer than 3 pairs |"] * (2 * len(LEVELS))
 
 
 def test_losses_are_shares_of_the_first_level(page: str) -> None:
@@ -116,7 +107,7 @@ def test_losses_are_shares_of_the_first_level(page: str) -> None:
     # Seed 0 has 3, 2, 1 treasures, seed 1 has 4, 2, 1.
     second, third = (mean_over_seeds([100 * (1 - each / 3), 100 * (1 - each / 4)]) for each in (2, 1))
     cells = " | ".join(f"{e.value:.0f} [{e.low:.0f}, {e.high:.0f}]" for e in (second, third))
-    assert text.splitlines()[-2:] == [f"| TeamSupport | saf | {cells} |", "| TeamSupport | ippo | – | – |"]
+    assert text.splitlines()[-2:] == [f"| TeamSupport | SAF | {cells} |", "| TeamSupport | IPPO, shared | – | – |"]
     assert "## Loss by coordination" in page
     assert losses(table, EXPERIMENTS["ood-coordination"].views[0]) == ""
 
@@ -133,8 +124,10 @@ def test_parts_of_an_experiment(folder: Path, tmp_path: Path) -> None:
 
 def test_results_as_tables(folder: Path) -> None:
     tests, curves = read_results(folder, "coordination")
-    stored = pd.read_csv(folder / "coordination" / "table.csv", float_precision="round_trip")
-    pd.testing.assert_frame_equal(tests, stored[list(tests.columns)], check_exact=True)
+    stored = pd.read_csv(folder / "coordination" / "runs.csv", float_precision="round_trip")
+    pd.testing.assert_frame_equal(tests, stored, check_exact=True, check_dtype=False)
+    kept = pd.read_csv(folder / "coordination" / "curves.csv", float_precision="round_trip")
+    pd.testing.assert_frame_equal(curves, kept, check_exact=True)
     last = curves.groupby(["method", "task", "level", "coordination", "seed"])["game_steps"].max()
     assert len(last) == 2 * len(LEVELS) * 2 and set(last) == {80}
     assert (curves["processor_seconds"] > 0).all()
@@ -162,7 +155,7 @@ def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert f"- ippo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page
     assert f"- damaged: {damaged / 'finished.json'} cannot be read: " in page
     assert f"- damaged: {other / 'curve.csv'} has changed since the run was finished" in page
-    assert "| saf | – |" in page
+    assert "| SAF | – |" in page
     assert f"4 of {2 * N_CELLS // 3} cells are missing; the page names them" in capsys.readouterr().err
 
 
@@ -203,63 +196,50 @@ def test_a_killed_report_leaves_the_old_one(folder: Path, tmp_path: Path, monkey
     assert {path.name: path.read_bytes() for path in (part / "coordination").iterdir() if path.is_file()} == before
 
 
-def test_reference_teams_are_drawn_where_they_belong(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scale = tmp_path / "scale.csv"
-    rows = ["TeamSupport,1,4,scripted,5.5", "TeamSupport,1,9,other size,5", "TeamSupport,1,4,random,1"]
-    scale.write_text("\n".join(["task,coordination,n_agents,name,mean", *rows]) + "\n")
-    found: dict[str, set[str]] = {}
-
-    def labels(self: Figure, path: Path) -> None:
-        found[path.name] = {text.get_text() for legend in self.legends for text in legend.get_texts()}
-        path.write_bytes(b"")
-
-    monkeypatch.setattr(Figure, "savefig", labels)
-    report(shutil.copytree(folder, tmp_path / "part"), "--scale", str(scale), "--levels", "1", "2")
-    curves = {"saf (2 seeds)", "ippo (2 seeds)", "random (2 seeds)"}
-    assert found["curve-TeamSupport-c1-h1.png"] == {*curves, "reference: scripted"}
-    assert found["curve-TeamSupport-c2-h1.png"] == found["curve-TeamTogether-c1-h1.png"] == curves
-    assert found["levels-coordination.png"] == {"saf", "ippo", "random", "reference: scripted"}
-    scale.write_text("a,b\n")
-    with pytest.raises(ValueError, match=r"is no file of reference teams: .* name, mean is missing"):
-        read_scale(scale)
-
-
 def test_seeds_that_were_never_measured_at_the_same_time_have_no_curve() -> None:
     apart = pd.DataFrame({"method": "saf", "seed": [0, 0, 1, 1], "game_steps": [1.0, 2.0, 3.0, 4.0], "score": 1.0})
     assert learning_curve(apart).empty
     draw_curves(apart)
 
 
-def table_of(values: list[float]) -> pd.DataFrame:
-    return pd.DataFrame({"seed": range(len(values)), "return_mean": values})
+def test_published_results_are_drawn_beside_ones_own(folder: Path, tmp_path: Path) -> None:
+    """Only the two files are needed; own cells, other games and trainings of another length are left alone."""
+    for name in ("runs.csv", "curves.csv"):
+        (tmp_path / "published" / "coordination").mkdir(parents=True, exist_ok=True)
+        table = pd.read_csv(folder / "coordination" / name)
+        others = table[table["method"] == "ippo"].assign(method="theirs")
+        longer = others.assign(method="longer", **({"game_steps": 99} if name == "runs.csv" else {}))
+        larger = others.assign(method="larger", n_agents=50)
+        path = tmp_path / "published" / "coordination" / name
+        pd.concat([table, others, longer, larger]).to_csv(path, index=False)
+    mine = shutil.copytree(folder, tmp_path / "mine")
+    page = report(mine, "--beside", str(tmp_path / "published"))
+    row = part_of(page, "Team return by").split("| theirs |")[1].splitlines()[0]
+    assert f"| IPPO, shared |{row}" in page  # equal numbers
+    assert "longer" not in page and "larger" not in page
+    assert set(pd.read_csv(mine / "coordination" / "runs.csv")["method"]) == {"saf", "ippo", "random"}
+    (tmp_path / "published" / "coordination" / "runs.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(SystemExit, match="2"):
+        report(mine, "--beside", str(tmp_path / "published"))
 
 
-def test_a_winner_needs_intervals_apart() -> None:
-    low, high = [1.0, 1.1, 1.2], [3.0, 3.1, 3.3]
-    above = compare(table_of(high), table_of(low))
-    assert above is not None
-    assert (above.seeds, above.verdict) == ([0, 1, 2], "higher")
-    assert above.difference.value == pytest.approx(np.mean(high) - np.mean(low))
-    below = compare(table_of(low), table_of(high))
-    assert below is not None and below.verdict == "lower"
-    near = compare(table_of([1.0, 1.1, 1.2]), table_of([1.1, 1.2, 1.3]))
-    # The differences agree to the last digit, but the intervals overlap.
-    assert near is not None
-    assert near.difference.high < 0
-    assert near.verdict == "no winner: intervals overlap"
-    # Two equal seeds are not enough.
-    two = compare(table_of([1.0, 1.0]), table_of([2.0, 2.0]))
-    assert two is not None
-    assert (two.first, two.verdict) == (Estimate(1.0, 1.0, 1.0), "no winner: fewer than 3 seeds")
-
-
-def test_only_common_seeds_are_compared() -> None:
-    found = compare(table_of([1.0, 2.0, 3.0]), pd.DataFrame({"seed": [2, 1, 7], "return_mean": [5.0, 4.0, 9.0]}))
-    assert found is not None
-    assert (found.seeds, found.first.value, found.second.value, found.difference.value) == ([1, 2], 2.5, 4.5, -2.0)
-    assert compare(table_of([1.0]), pd.DataFrame({"seed": [5], "return_mean": [1.0]})) is None
+def test_marl_eval_gets_means_over_the_episodes_of_complete_runs(folder: Path) -> None:
+    """The format that ``marl_eval.utils.data_processing_utils.data_process_pipeline`` reads."""
+    frames = read_results(folder, "coordination")
+    content = marl_eval(frames, "hecogrid")["hecogrid"]
+    assert set(content) == {f"{level.replace('-', '_').lower()}" for level in LEVELS}
+    assert all(list(methods) == ["saf", "ippo"] for methods in content.values())
+    assert all(list(runs) == ["seed_0", "seed_1"] for methods in content.values() for runs in methods.values())
+    run = content["teamsupport_c1_h1"]["saf"]["seed_1"]
+    assert list(run) == ["step_0", "step_1", "absolute_metrics"]
+    assert [run[step]["step_count"] for step in ("step_0", "step_1")] == [40, 80]
+    test = read_json(folder / "cells" / "TeamSupport-c1-h1" / "saf" / "seed-1" / "tests" / "c1-h1.json")["plays"][0]
+    assert run["absolute_metrics"] == {
+        "return": [pytest.approx(np.mean(test["returns"]))],
+        "score": [pytest.approx(np.mean(test["returns"]) / 6)],
+    }
+    lacking = Frames(frames.tests[(frames.tests["method"] != "ippo") | (frames.tests["seed"] == 0)], frames.curves)
+    assert list(marl_eval(lacking, "x")["x"]["teamsupport_c1_h1"]["saf"]) == ["seed_0"]
 
 
 def test_aggregates_compare_like_with_like() -> None:
@@ -302,7 +282,7 @@ def test_an_environment_of_ones_own(
     page = (folder / name / "report.md").read_text(encoding="utf-8")
     assert "2 agents, 24 game steps of training. mappo, ippo and a random team" in page
     assert "| tests.toy_envs:CounterEnv | max_cycles=3 | max_cycles=5 | seeds |" in page
-    table = pd.read_csv(folder / name / "table.csv")
+    table = pd.read_csv(folder / name / "runs.csv")
     assert table["score"].between(0, 1).all() and table["max_return"].isna().all()
     # The printed command runs as printed, and finds everything finished.
     (again,) = (line for line in page.splitlines() if line.startswith("python -m sb3_saf.experiments run"))

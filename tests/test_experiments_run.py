@@ -71,7 +71,7 @@ def cell_of(folder: Path, method: str = "mappo", seed: int = 1, level: int = 2) 
 
 
 def test_the_table_has_a_row_for_each_cell_and_level(undisturbed: Path) -> None:
-    table = read_table(undisturbed / "joint" / "table.csv")
+    table = read_table(undisturbed / "joint" / "runs.csv")
     assert len(table) == N_CELLS
     keys = {(row["method"], row["coordination"], row["heterogeneity"], row["seed"]) for row in table}
     assert keys == {(m, c, c, s) for m in ("ippo", "mappo", "random") for c in "23" for s in "01"}
@@ -139,7 +139,7 @@ def test_evaluations_do_not_change_the_training(undisturbed: Path, tmp_path: Pat
         evaluations = read_table(cell_of(folder) / "evaluations.csv")
         assert [int(row["game_steps"]) for row in evaluations] == steps
         best = max(evaluations, key=lambda row: float(row["return_mean"]))
-        (table_row,) = (row for row in read_table(folder / "joint" / "table.csv") if row["cell"] == CELL)
+        (table_row,) = (row for row in read_table(folder / "joint" / "runs.csv") if row["cell"] == CELL)
         assert table_row["best_game_steps"] == best["game_steps"]
     assert_same_weights(cell_of(undisturbed) / "model.zip", cell_of(tmp_path) / "model.zip")
 
@@ -165,17 +165,17 @@ def test_training_evaluations_and_tests_have_games_of_their_own(tmp_path: Path, 
 
 
 def test_finished_cells_are_never_run_again(undisturbed: Path) -> None:
-    table = (undisturbed / "joint" / "table.csv").read_bytes()
+    table = (undisturbed / "joint" / "runs.csv").read_bytes()
     summary, engine = run_inline(undisturbed)
     assert (summary, engine.jobs) == (Summary(0, [], []), [])
-    assert (undisturbed / "joint" / "table.csv").read_bytes() == table
+    assert (undisturbed / "joint" / "runs.csv").read_bytes() == table
 
 
 def test_cells_depend_on_nothing_but_themselves(undisturbed: Path, tmp_path: Path) -> None:
     """In reverse order, in two parts, after other cells: the same numbers."""
     for number in (2, 1):
         run_inline(tmp_path, Selection((1, 0), ("mappo", "ippo"), (), ("3",)), shard=Shard(number, 2))
-    ours, theirs = (read_table(folder / "joint" / "table.csv") for folder in (tmp_path, undisturbed))
+    ours, theirs = (read_table(folder / "joint" / "runs.csv") for folder in (tmp_path, undisturbed))
     assert sorted(map(str, ours)) == sorted(str(row) for row in theirs if row["coordination"] == "3")
 
 
@@ -195,9 +195,9 @@ def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path
     assert 1 <= len(kept) < 4
     run_inline(tmp_path, replace(ONE, seeds=(0, 1)))
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    rows = read_table(undisturbed / "joint" / "table.csv")
+    rows = read_table(undisturbed / "joint" / "runs.csv")
     known = [row for row in rows if row["method"] != "mappo" and row["coordination"] == "2"]
-    assert read_table(tmp_path / "joint" / "table.csv") == known
+    assert read_table(tmp_path / "joint" / "runs.csv") == known
 
 
 def worker_of(driver: int) -> int:
@@ -222,7 +222,7 @@ def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> No
     levels = (Level.of(coordination=1, heterogeneity=1), Level.of(coordination=3, heterogeneity=1))
     assert [(job.cell.method, job.cell.tests) for job in engine.jobs] == [("qplex", levels)]
     run_inline(tmp_path / "alone", one, "ood-coordination", short)
-    both, alone = (read_table(tmp_path / name / "ood-coordination" / "table.csv") for name in ("both", "alone"))
+    both, alone = (read_table(tmp_path / name / "ood-coordination" / "runs.csv") for name in ("both", "alone"))
     assert both == alone
     assert [row["coordination"] for row in both if row["method"] == "qplex"] == ["1", "2", "3"]
     assert {row["train_coordination"] for row in both if row["method"] == "qplex"} == {"2"}
@@ -261,10 +261,10 @@ def test_a_failed_cell_says_why_and_is_tried_again(tmp_path: Path, capsys: pytes
     results, (failed,) = Results(tmp_path), summary.failed
     error = results.failure(failed)
     assert error is not None and "out of luck" in error.read_text()
-    assert len(read_table(tmp_path / "joint" / "table.csv")) == 2
+    assert len(read_table(tmp_path / "joint" / "runs.csv")) == 2
     assert run_inline(tmp_path, both)[0] == Summary(1, [], [])
     assert results.failure(failed) is None
-    assert len(read_table(tmp_path / "joint" / "table.csv")) == 3
+    assert len(read_table(tmp_path / "joint" / "runs.csv")) == 3
 
 
 def test_a_cell_that_diverges_is_one_line_and_the_exit_code_is_1(
@@ -334,8 +334,8 @@ def test_runs_at_once_divide_the_cells(undisturbed: Path, tmp_path: Path, capsys
     assert (engine.other.finished, len(engine.other.elsewhere)) == (1, 1)  # the other one of two is running
     assert (summary.finished, len(summary.elsewhere)) == (3, 1)
     assert "1 cells were left to another run" in capsys.readouterr().out
-    ours = read_table(tmp_path / "joint" / "table.csv")
-    theirs = read_table(undisturbed / "joint" / "table.csv")
+    ours = read_table(tmp_path / "joint" / "runs.csv")
+    theirs = read_table(undisturbed / "joint" / "runs.csv")
     assert ours == [row for row in theirs if row["method"] != "mappo" and row["coordination"] == "2"]
 
 
@@ -397,7 +397,7 @@ def test_damaged_cells_are_named_and_run_again(
     summary, engine = run_inline(folder)
     assert (summary, engine.with_model) == (Summary(1, [], []), [name.startswith("tests/")])
     assert str(cell_of(folder)) in capsys.readouterr().out
-    assert read_table(folder / "joint" / "table.csv") == read_table(undisturbed / "joint" / "table.csv")
+    assert read_table(folder / "joint" / "runs.csv") == read_table(undisturbed / "joint" / "runs.csv")
     assert_same_weights(cell_of(folder) / "model.zip", cell_of(undisturbed) / "model.zip")
     # Nothing that was found is removed.
     assert len(list(folder.glob("damaged/*/*/seed-1_*"))) == (not name.startswith("tests/"))

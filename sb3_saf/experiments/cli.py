@@ -31,8 +31,6 @@ from sb3_saf.training.folders import python_command
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
-#: Returns of reference teams, which reports draw if the file exists.
-DEFAULT_SCALE: Final = Path("results", "scale.csv")
 #: Episodes of tests, game steps between evaluations, their episodes; the size smoke is for trying commands.
 _PROTOCOL: Final = (RunConfig.episodes, RunConfig.eval_freq, RunConfig.eval_episodes)
 _SMOKE: Final = (16, 200, 2)
@@ -147,9 +145,7 @@ def _add_machine(parser: argparse.ArgumentParser) -> None:
 
 def _add_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--scale",
-        type=Path,
-        help=f"returns of reference teams to draw; default: {DEFAULT_SCALE}, if it is there",
+        "--beside", type=Path, nargs="+", default=[], help="folders of published results to draw beside these"
     )
 
 
@@ -293,7 +289,7 @@ def _run(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return _INTERRUPTED
-    print(f"table: {results.folder / experiment.name / 'table.csv'}")
+    print(f"table: {results.folder / experiment.name / 'runs.csv'}")
     if summary.failed:
         print(f"{len(summary.failed)} cells failed; the same command tries them again", file=sys.stderr)
         return 1
@@ -313,11 +309,10 @@ def _report(options: argparse.Namespace) -> int:
     if results.config() is None or not results.selections(name):
         damaged = "".join(f" ({error})" for error in results.damaged.values())
         raise ValueError(f"{results.folder} has no results of {name!r}{damaged}; {remedy}")
-    from sb3_saf.experiments.report import read_scale, write_report
+    from sb3_saf.experiments.report import write_report
+    from sb3_saf.experiments.tables import read_results
 
-    path = options.scale or (DEFAULT_SCALE if DEFAULT_SCALE.is_file() else None)
-    scale = None if path is None else read_scale(path)
-    report = write_report(experiment, results, selection, scale)
+    report = write_report(experiment, results, selection, [read_results(path, name) for path in options.beside])
     print(f"page: {report.page}")
     print(f"figures: {', '.join(path.name for path in report.figures)}")
     if report.missing:

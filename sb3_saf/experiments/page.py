@@ -10,12 +10,20 @@ from typing import Final, NamedTuple
 
 import pandas as pd
 
-from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experiment, Level, View
+from sb3_saf.experiments.comparisons import MARGIN, comparisons, holm
+from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experiment, Level, View, find_method
 from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.tables import FEWEST_SEEDS, Compared, comparisons, complete, of_view, strata
+from sb3_saf.experiments.tables import Frames, complete, of_view, strata
 from sb3_saf.training.commands import option_words
-from sb3_saf.training.statistics import Estimate, interquartile_means, mean_over_seeds, score_matrices
+from sb3_saf.training.statistics import (
+    Estimate,
+    interquartile_means,
+    mean_over_seeds,
+    optimality_gaps,
+    probability_of_improvement,
+    score_matrices,
+)
 
 #: Maximum number of missing cells to list.
 _MOST_NAMED: Final = 20
@@ -32,8 +40,7 @@ class Content(NamedTuple):
     :param cells: all requested cells
     :param missing: unfinished cells
     :param left_out: levels that do not fit the size
-    :param table: table of tests, see ``tables``
-    :param curves: table of learning curves, see ``tables``
+    :param frames: tables of tests and curves, see ``tables``
     :param figures: file names of the figures
     """
 
@@ -43,14 +50,13 @@ class Content(NamedTuple):
     cells: Sequence[Cell]
     missing: Sequence[Cell]
     left_out: Sequence[LeftOut]
-    table: pd.DataFrame
-    curves: pd.DataFrame
+    frames: Frames
     figures: Sequence[str]
 
 
 def page(content: Content) -> str:
     """Return the page."""
-    views, table = content.experiment.views, content.table
+    views, table = content.experiment.views, content.frames.tests
     sections = [
         _head(content),
         _missing(content),
@@ -60,14 +66,13 @@ def page(content: Content) -> str:
         aggregates(content.experiment, table),
         *(_comparisons(table, view) for view in views),
         _pictures(content, "curve-"),
-        *(_learning(content.curves, view) for view in views if view.train is None),
         _reproduction(content),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
 def _head(content: Content) -> str:
-    experiment, config, table = content.experiment, content.config, content.table
+    experiment, config, table = content.experiment, content.config, content.frames.tests
     trained = table[table["method"] != RANDOM]
     methods = list(dict.fromkeys(trained["method"]))
     steps = " or ".join(f"{count:,}" for count in sorted(trained["game_steps"].unique()))
@@ -80,8 +85,8 @@ def _head(content: Content) -> str:
         "",
         f"Size `{config.size}`: {_numbers(table['n_agents'])} agents{treasures}, {steps} game steps of training. "
         f"{', '.join(methods) or 'No method'} and a random team, seeds {_numbers(table['seed'])}. Each number is "
-        f"{meaning} over {config.episodes} episodes with {actions}, in games that no run trains on and that are the "
-        "same for all methods of a seed.",
+        f"{meaning} of the best policy of a run by evaluations during training, over {config.episodes} new games with "
+        f"{actions}, the same for all methods of a seed.",
     ]
     if config.overrides:
         lines += ["", f"Settings in the place of those of `zoo_configs`: `{dict(config.overrides)}`."]
@@ -111,7 +116,7 @@ def _missing(content: Content) -> str:
 
 def _pictures(content: Content, *prefixes: str) -> str:
     names = [name for name in content.figures if name.startswith(prefixes)]
-    heading = "## Learning curves\n\nMean and 95 % interval over seeds, returns of the training episodes.\n\n"
+    heading = "## Learning curves\n\nMean and 95 % interval over seeds, returns of evaluations on other games.\n\n"
     pictures = "\n\n".join(f"![{name.removesuffix('.png')}]({name})" for name in names)
     return (heading if "curve-" in prefixes else "") + pictures if names else ""
 
@@ -125,6 +130,11 @@ def _table(head: Sequence[object], body: Iterable[Sequence[object]]) -> list[str
 def _text(name: object) -> str:
     """Return a user's name as text that Markdown does not format."""
     return re.sub(r"([\\`*<>\[\]])", r"\\\1", str(name))
+
+
+def _name(method: object) -> str:
+    """Return the name of a method in words."""
+    return _text(find_method(str(method)).words)
 
 
 def _show(estimate: Estimate, digits: int = 2) -> str:
@@ -147,7 +157,7 @@ def means(table: pd.DataFrame, view: View) -> str:
         for method, of_method in of_task.groupby("method", sort=False):
             by_level = [of_method.loc[of_method["level"] == level.slug, "return_mean"] for level in levels]
             counts = sorted({len(values) for values in by_level if len(values)})
-            body.append([_text(method), *map(_mean, by_level), " or ".join(map(str, counts))])
+            body.append([_name(method), *map(_mean, by_level), " or ".join(map(str, counts))])
         parts += [*_table([_text(task), *map(_text, levels), "seeds"], body), ""]
     return "\n".join(parts).rstrip()
 
@@ -167,7 +177,7 @@ def losses(table: pd.DataFrame, view: View) -> str:
     for task, of_task in rows.groupby("task", sort=False):
         for method, of_method in of_task.groupby("method", sort=False):
             easy, *hard = (_by_seed(of_method, level) for level in (first, *harder))
-            body.append([_text(task), _text(method), *(_loss(easy, each) for each in hard)])
+            body.append([_text(task), _name(method), *(_loss(easy, each) for each in hard)])
     text = (
         f"Share of the return at {first} that is lost, in percent: mean over seeds of each seed's own loss, 95 % "
         f"interval (Student's t). {_NOTHING} where a seed has no return at {first} to lose."
@@ -208,8 +218,13 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
         columns = {_text(level): found for level in view.levels if (found := _of_level(common, view, level))}
         if columns:
             parts += [*_estimates([f"by {view.axis}{view.suffix}", *columns], methods, columns.values()), ""]
-    over_all = interquartile_means(score_matrices(common, "stratum"))
-    return "\n".join([*parts, *_estimates(["over everything", "all"], methods, [over_all])])
+    scores = score_matrices(common, "stratum")
+    ours = "saf" if "saf" in methods else methods[0]
+    better = {method: probability_of_improvement(scores[ours], scores[method]) for method in methods}
+    head = ["over everything", "all", "optimality gap", f"probability that {_name(ours)} is better"]
+    return "\n".join(
+        [*parts, *_estimates(head, methods, [interquartile_means(scores), optimality_gaps(scores), better])]
+    )
 
 
 def _of_level(common: pd.DataFrame, view: View, level: Level) -> dict[str, Estimate]:
@@ -221,43 +236,30 @@ def _of_level(common: pd.DataFrame, view: View, level: Level) -> dict[str, Estim
 
 def _estimates(head: Sequence[str], methods: Iterable[str], columns: Iterable[Mapping[str, Estimate]]) -> list[str]:
     found = list(columns)
-    return _table(head, [[method, *(_show(column[method], 3) for column in found)] for method in methods])
+    return _table(head, [[_name(method), *(_show(column[method], 3) for column in found)] for method in methods])
 
 
 def _comparisons(table: pd.DataFrame, view: View) -> str:
     """Return comparisons of the first method with each other one, paired by seed."""
-    text = (
-        "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed. "
-        f"Where the intervals of the two overlap, that of the difference holds 0, or there are fewer than "
-        f"{FEWEST_SEEDS} seeds, no winner is named. Every line is a test of its own; many lines name a winner "
-        "by chance now and then."
-    )
-    return _compared(f"## Paired comparisons by {view.axis}{view.suffix}", text, comparisons(table, view))
-
-
-def _learning(curves: pd.DataFrame, view: View) -> str:
-    """Return a table of the returns in training."""
-    if curves.empty:
-        return ""
-    of_runs = curves.groupby(["method", "task", "level", "seed"], sort=False, as_index=False)["score"].mean()
-    table = of_runs.rename(columns={"score": "return_mean"}).assign(train_level=of_runs["level"])
-    text = (
-        "Mean return of the training episodes of a whole run, from its first game step to its last: of two that "
-        "end alike, who learns sooner has more."
-    )
-    return _compared(f"## Return while learning by {view.axis}", text, comparisons(table, view))
-
-
-def _compared(heading: str, text: str, compared: Sequence[Compared]) -> str:
+    compared = comparisons(table, view)
     if not compared:
         return ""
-    ours = compared[0].ours
-    head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", f"{ours} is"]
+    ours = _name(compared[0].ours)
+    text = (
+        "Mean returns on the seeds that both have, with 95 % intervals over seeds; differences are taken seed by seed, "
+        "and their spread is at least the noise of the tests. Equivalent: a difference of "
+        f"{100 * MARGIN:g} % of the largest return is excluded (5 %). p is of no difference, corrected for the lines "
+        "of this table (Holm)."
+    )
+    head = ["task", "level", f"{ours} against", "seeds", ours, "other", "difference", "p", f"{ours} is"]
+    corrected = iter(holm([one.found.test.p for one in compared if not math.isnan(one.found.test.p)]))
     body = []
     for task, level, _, other, found in compared:
         numbers = [_show(found.first), _show(found.second), _show(found.difference)]
+        p = _NOTHING if math.isnan(found.test.p) else f"{next(corrected):.3f}"
         seeds = ", ".join(map(str, found.seeds))
-        body.append([_text(task), _text(level), _text(other), seeds, *numbers, found.verdict])
+        body.append([_text(task), _text(level), _name(other), seeds, *numbers, p, found.verdict])
+    heading = f"## Paired comparisons by {view.axis}{view.suffix}"
     return "\n".join([heading, "", text, "", *_table(head, body)])
 
 

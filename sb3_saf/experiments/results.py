@@ -14,7 +14,7 @@ Folder of results. A finished cell is one folder of a run (``training/folders.py
     damaged/...                      cells with changed or missing files, after they were run again
     coordination/experiment.json     a user's experiment
     coordination/selections/*.json   requested selections, for missing cells in reports
-    coordination/table.csv           one row per cell and test level, made from the cells
+    coordination/runs.csv            one row per cell and test level, made from the cells; curves.csv beside it
 """
 
 from __future__ import annotations

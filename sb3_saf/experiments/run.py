@@ -22,7 +22,7 @@ from sb3_saf.experiments.definitions import Experiment
 from sb3_saf.experiments.engines import Engine
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
 from sb3_saf.experiments.results import BEST_MODEL, MODEL, Results
-from sb3_saf.experiments.tables import write_table
+from sb3_saf.experiments.tables import write_tables
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.folders import Run
 
@@ -151,7 +151,7 @@ def run(
     summary = progress.summary()
     if summary.elsewhere:
         print(f"{len(summary.elsewhere)} cells were left to another run in {results.folder}")
-    write_table(experiment, results)
+    write_tables(experiment, results)
     return summary
 
 

@@ -1,7 +1,8 @@
 """
-Results as tidy pandas tables, for reports and custom figures.
+Results as tidy pandas tables, for reports and custom figures, and as ``runs.csv`` and ``curves.csv`` of an experiment.
 
-Tables of tests have one row per cell and test level, and are always computed from the cells:
+Everything that reports draw is in the two files, so that committed ones can be drawn beside new results. ``runs.csv``
+has one row per cell and test level:
 
 ``method``, ``task``                 name of the method, or ``"random"``; the environment
 ``train_level``, ``level``           levels of training and test, such as ``"c2-h1"``
@@ -23,6 +24,9 @@ Tables of tests have one row per cell and test level, and are always computed fr
 ``wall_seconds_training``, ``wall_seconds_test``
 ``commit``, ``processor``            version of this package, and kind of processor
 ``cell``                             folder below ``cells``
+
+``curves.csv`` has one row per evaluation during training: ``method``, ``task``, ``level`` and its parameters, ``seed``,
+``game_steps``, ``processor_seconds`` of the training until then, and ``score``, the mean team return.
 """
 
 from __future__ import annotations
@@ -35,25 +39,19 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_saf.experiments.definitions import MODULE, RANDOM, Experiment, Level, View
+from sb3_saf.experiments.definitions import MODULE, RANDOM, Experiment, View
 from sb3_saf.experiments.grid import Cell, Grid, expand, merge
 from sb3_saf.experiments.results import BEST, EVALUATIONS, LAST, MOST_LIKELY, Results
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.folders import python_command, read_curve
-from sb3_saf.training.statistics import Estimate, mean_over_seeds
+from sb3_saf.training.statistics import require_columns
 
-#: Minimum seeds for a comparison: two may agree by chance, and the interval then has no width.
-FEWEST_SEEDS: Final = 3
+RUNS: Final = "runs.csv"
+CURVES: Final = "curves.csv"
 
 
 class Frames(NamedTuple):
-    """
-    Results of an experiment.
-
-    :param tests: see the module
-    :param curves: one row for each point of a learning curve, columns ``method``, ``task``, ``level``, the level's
-        parameters, ``seed``, ``game_steps``, ``processor_seconds`` and ``score``, mean training return
-    """
+    """Tables of an experiment, see the module: ``runs.csv``, and ``curves.csv`` of evaluations during training."""
 
     tests: pd.DataFrame
     curves: pd.DataFrame
@@ -63,11 +61,14 @@ def read_results(folder: str | Path, name: str) -> Frames:
     """
     Return the results of an experiment, complete or not.
 
-    :param folder: folder of results, as in ``python -m sb3_saf.experiments run NAME -f FOLDER``
+    :param folder: folder of results, as in ``python -m sb3_saf.experiments run NAME -f FOLDER``; or one that has only
+        ``NAME/runs.csv`` and ``NAME/curves.csv``
     :param name: name of the experiment
     :raises ValueError: for an unknown name, or if no cell is finished
     """
     results = Results(Path(folder))
+    if results.config() is None and (found := _published(results.folder / name)) is not None:
+        return found
     experiment = results.experiment(name)
     cells = [] if results.config() is None else requested(experiment, results).cells
     tests = frame_of_tests(results, cells)
@@ -75,7 +76,44 @@ def read_results(folder: str | Path, name: str) -> Frames:
         raise ValueError(
             f"{folder} has no finished cell of {name!r}; run it first: {python_command(MODULE)} run {name} -f {folder}"
         )
-    return Frames(tests.drop(columns=["cell"]), frame_of_curves(results, cells))
+    return Frames(tests, frame_of_curves(results, cells))
+
+
+def _published(folder: Path) -> Frames | None:
+    """Read the two files of an experiment; None if they are not there."""
+    paths = [folder / name for name in (RUNS, CURVES)]
+    if not all(path.is_file() for path in paths):
+        return None
+    try:
+        tests, curves = (pd.read_csv(path, float_precision="round_trip") for path in paths)
+        require_columns(tests, ("method", "task", "train_level", "level", "seed", "return_mean", "score"))
+        return Frames(tests, curves)
+    except ValueError as error:
+        raise ValueError(f"{folder} has no {RUNS} and {CURVES} of experiments: {error}") from None
+
+
+def beside(ours: Frames, theirs: Frames) -> Frames:
+    """
+    Return results with published ones beside them.
+
+    :param ours: results, whose cells take precedence
+    :param theirs: published results; only those on the same games (task, level, agents, largest return) and of
+        trainings of the same length are taken
+    """
+    rows, here = theirs.tests, ours.tests
+    same_games = _keys(rows, "task", "level", "n_agents").isin(_keys(here, "task", "level", "n_agents"))
+    names = "method", "task", "train_level", "level", "seed"
+    is_new = ~_keys(rows, *names).isin(_keys(here, *names))
+    tests = rows[same_games & is_new & rows["game_steps"].isin({0, *here["game_steps"]})]
+    if tests.empty:
+        return ours
+    of_curves = _keys(theirs.curves, "method", "task", "level", "seed")
+    curves = theirs.curves[of_curves.isin(_keys(tests, "method", "task", "train_level", "seed"))]
+    return Frames(*(pd.concat(pair, ignore_index=True) for pair in ((here, tests), (ours.curves, curves))))
+
+
+def _keys(table: pd.DataFrame, *columns: str) -> pd.Series:
+    return pd.Series(list(table[list(columns)].itertuples(index=False, name=None)), index=table.index, dtype=object)
 
 
 def requested(experiment: Experiment, results: Results) -> Grid:
@@ -152,22 +190,57 @@ def _scores(table: pd.DataFrame) -> pd.Series:
     return (table["return_mean"] / known).where(known.notna(), of_range)
 
 
-def write_table(experiment: Experiment, results: Results) -> None:
-    """Write ``table.csv`` of all requested and finished cells; floats are stored exactly."""
-    table = frame_of_tests(results, requested(experiment, results).cells)
-    write_text(results.folder / experiment.name / "table.csv", table.to_csv(index=False, lineterminator="\n"))
+def write_tables(experiment: Experiment, results: Results) -> Frames:
+    """Write ``runs.csv`` and ``curves.csv`` of all requested and finished cells, with exact floats; return them."""
+    cells = requested(experiment, results).cells
+    frames = Frames(frame_of_tests(results, cells), frame_of_curves(results, cells))
+    for name, frame in zip((RUNS, CURVES), frames, strict=True):
+        write_text(results.folder / experiment.name / name, frame.to_csv(index=False, lineterminator="\n"))
+    return frames
 
 
 def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
-    """Return the learning curves of all trained cells in one table; empty if there are none."""
+    """Return the evaluations during training of all trained cells in one table; empty if there are none."""
     curves = []
     for cell in cells:
         run = results.run(cell) if cell.is_trained else None
         if run is not None:
             names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, **cell.level.env_kwargs}
-            curve = read_curve(run.folder)[["game_steps", "processor_seconds", "score"]]
+            evaluations, training = pd.read_csv(run.folder / EVALUATIONS), read_curve(run.folder)
+            steps = evaluations["game_steps"].astype(float)
+            seconds = np.interp(steps, training["game_steps"], training["processor_seconds"])
+            curve = pd.DataFrame(
+                {"game_steps": steps, "processor_seconds": seconds, "score": evaluations["return_mean"]}
+            )
             curves.append(curve.assign(**names, seed=cell.seed))
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+
+
+def marl_eval(frames: Frames, environment: str) -> dict[str, Any]:
+    """
+    Return results in the format of marl-eval: environment, task, algorithm, run, step, metrics.
+
+    Its functions compare complete data only: settings and seeds that every method has, with as many evaluations.
+    Absolute metrics are means over the test episodes of a run; ``score`` is normalised by the largest return.
+
+    :param environment: name of the suite
+    """
+    tests = frames.tests[(frames.tests["train_level"] == frames.tests["level"]) & (frames.tests["game_steps"] > 0)]
+    tests = complete(tests.assign(stratum=tests["task"] + " " + tests["level"]))
+    curves = dict(list(frames.curves.groupby(["method", "task", "level", "seed"]))) if len(frames.curves) else {}
+    n_steps = min(map(len, curves.values()), default=0)
+    content: dict[str, Any] = {}
+    for row in tests.itertuples(index=False):
+        curve = curves[row.method, row.task, row.train_level, row.seed].sort_values("game_steps").tail(n_steps)
+        scale = row.score / row.return_mean if row.return_mean else 0.0
+        steps: dict[str, Any] = {
+            f"step_{index}": {"step_count": int(step), "return": [value], "score": [value * scale]}
+            for index, (step, value) in enumerate(zip(curve["game_steps"], curve["score"], strict=True))
+        }
+        steps["absolute_metrics"] = {"return": [row.return_mean], "score": [row.score]}
+        task = f"{row.task}_{row.level}".lower().replace("-", "_")
+        content.setdefault(task, {}).setdefault(row.method.replace("-", "_"), {})[f"seed_{row.seed}"] = steps
+    return {environment: content}
 
 
 def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
@@ -208,71 +281,3 @@ def complete(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows[rows.groupby("stratum")["method"].transform("nunique") == n_methods]
     n_strata = rows["stratum"].nunique()
     return rows[rows.groupby("seed")["stratum"].transform("size") == n_methods * n_strata]
-
-
-class Comparison(NamedTuple):
-    """
-    Comparison of two methods on the same seeds and the same test games.
-
-    :param seeds: common seeds
-    :param first: mean return of the first, with its 95 % interval over these seeds
-    :param second: the same for the second
-    :param difference: mean of first - second, paired by seed
-    """
-
-    seeds: list[int]
-    first: Estimate
-    second: Estimate
-    difference: Estimate
-
-    @property
-    def verdict(self) -> str:
-        """Whether the first is higher or lower, or why there is no verdict."""
-        if len(self.seeds) < FEWEST_SEEDS:
-            return f"no winner: fewer than {FEWEST_SEEDS} seeds"
-        if self.first.low > self.second.high and self.difference.low > 0:
-            return "higher"
-        if self.first.high < self.second.low and self.difference.high < 0:
-            return "lower"
-        return "no winner: intervals overlap"
-
-
-class Compared(NamedTuple):
-    """Comparison of a view's first method with another one, at a level of a task."""
-
-    task: str
-    level: Level
-    ours: str
-    other: str
-    found: Comparison
-
-
-def comparisons(table: pd.DataFrame, view: View) -> list[Compared]:
-    """Compare SAF, or the first method if SAF is missing, with each other one, if they have common seeds."""
-    rows, levels = of_view(table, view), {level.slug: level for level in view.levels}
-    methods = list(dict.fromkeys(rows["method"]))
-    ours = "saf" if "saf" in methods else next(iter(methods), RANDOM)
-    return [
-        Compared(str(task), levels[level], ours, other, found)
-        for (task, level), here in rows.groupby(["task", "level"], sort=False)
-        for other in methods
-        if other != ours and (found := compare(*(here[here["method"] == one] for one in (ours, other)))) is not None
-    ]
-
-
-def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
-    """
-    Compare two methods at one level of one task, naming a winner only where intervals do not overlap.
-
-    :param first: columns ``seed`` and ``return_mean``
-    :param second: the same
-    :return: None if they have no seed in common
-    """
-    columns = ["seed", "return_mean"]
-    pairs = first[columns].merge(second[columns], on="seed", suffixes=("_first", "_second")).sort_values("seed")
-    if pairs.empty:
-        return None
-    ours, theirs = (pairs[f"return_mean_{side}"].to_numpy(dtype=np.float64) for side in ("first", "second"))
-    return Comparison(
-        pairs["seed"].tolist(), mean_over_seeds(ours), mean_over_seeds(theirs), mean_over_seeds(ours - theirs)
-    )

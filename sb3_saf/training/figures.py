@@ -44,9 +44,14 @@ _COLOURS: Final = {
     "vdn": "#332288",
     "random": "#666666",
 }
-#: Line and hatch of variants of a method, which share its colour: with memory, with separate weights per agent.
-_VARIANTS: Final = {"-gru": ("--", "//"), "-lstm": (":", "\\\\"), "-separate": ("-.", "xx")}
-#: Horizontal lines of reference teams.
+#: Line, hatch and mark of variants of a method, which share its colour: with memory, with weights for each agent.
+_VARIANTS: Final = {
+    "-gru": ("--", "//", "^"),
+    "-lstm": (":", "\\\\", "v"),
+    "-separate": ("-.", "xx", "s"),
+    "-paper": ("-.", "xx", "s"),
+}
+#: Horizontal lines, of references and of the largest possible score.
 _REFERENCE: Final = "#222222"
 _REFERENCE_LINES: Final = ("-.", ":", (0, (1, 3)), (0, (5, 5)))
 
@@ -64,6 +69,7 @@ class Style(NamedTuple):
     colour: str
     line: str = "-"
     hatch: str | None = None
+    mark: str = "o"
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, Style]:
@@ -79,9 +85,9 @@ def method_styles(methods: Sequence[str]) -> dict[str, Style]:
 def _style(method: str) -> Style | None:
     if method == "random":
         return Style(_COLOURS[method], "--")
-    for ending, (line, hatch) in _VARIANTS.items():
+    for ending, variant in _VARIANTS.items():
         if method.endswith(ending) and method.removesuffix(ending) in _COLOURS:
-            return Style(_COLOURS[method.removesuffix(ending)], line, hatch)
+            return Style(_COLOURS[method.removesuffix(ending)], *variant)
     return Style(_COLOURS[method]) if method in _COLOURS else None
 
 
@@ -143,6 +149,7 @@ def draw_curves(
     title: str | None = None,
     panel: str | None = None,
     y_label: str = TEAM_RETURN,
+    names: Mapping[str, str] | None = None,
     references: Mapping[str, float] | None = None,
 ) -> Figure:
     """
@@ -150,7 +157,8 @@ def draw_curves(
 
     :param runs: columns ``method``, ``seed``, ``game_steps``, ``score``
     :param panel: column with one panel per value, for instance ``"task"``
-    :param references: names and scores of horizontal lines, for instance of scripted teams
+    :param names: names of methods in words
+    :param references: names and scores of horizontal lines, for instance of a random team
     """
     require_columns(runs, CURVE_COLUMNS)
     panels, methods = _panels(runs, panel), _methods_of(runs)
@@ -161,7 +169,7 @@ def draw_curves(
             of_method, style = rows[rows["method"] == method], styles[method]
             curve, n_seeds = learning_curve(of_method), of_method["seed"].nunique()
             marker = "o" if len(curve) == 1 else None
-            label = f"{method} ({n_seeds} seed{'s' * (n_seeds > 1)})"
+            label = f"{(names or {}).get(method, method)} ({n_seeds} seed{'s' * (n_seeds > 1)})"
             steps = curve["game_steps"]
             ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
             ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
@@ -179,7 +187,8 @@ def draw_levels(
     title: str | None = None,
     panel: str | None = None,
     y_label: str = TEAM_RETURN,
-    references: pd.DataFrame | None = None,
+    names: Mapping[str, str] | None = None,
+    maximum: float | None = None,
 ) -> Figure:
     """
     Draw bars of the return against a level: mean and 95 % interval (Student's t) over seeds.
@@ -188,23 +197,23 @@ def draw_levels(
         (episodes) are averaged
     :param level: for instance ``"coordination"``
     :param panel: column with one panel per value, for instance ``"task"``
-    :param references: horizontal lines over the bars of a level, for instance of scripted teams: columns ``name``,
-        ``score`` and those named by ``level`` and ``panel``
+    :param names: names of methods in words
+    :param maximum: the largest possible score, drawn as a line
     """
     require_columns(results, ("method", "seed", level, "score"))
     panels = _panels(results, panel)
     styles = method_styles(_methods_of(results))
     figure, all_axes = _figure(len(panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
-        _draw_bars(ax, rows, level, styles)
-        if references is not None:
-            _draw_lines(ax, references if panel is None else references[references[panel] == name], level, rows)
+        _draw_bars(ax, rows, level, styles, names or {})
+        if maximum is not None:
+            ax.axhline(maximum, color=_REFERENCE, linestyle=":", label="largest possible")
         ax.set(xlabel=level, ylabel=y_label, title=_wrapped(name))
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
 
 
-def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, Style]) -> None:
+def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, Style], names: Mapping[str, str]) -> None:
     """Draw the bars of one panel: side by side at each level, in the order of the methods."""
     methods, levels = _methods_of(rows), sorted(rows[level].unique())
     width = min(0.3, 0.8 / len(methods))
@@ -219,29 +228,29 @@ def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, St
         margins = np.array([[e.value - e.low, e.high - e.value] for e in estimates]).reshape(-1, 2).T
         places = [levels.index(value) + (index - (len(methods) - 1) / 2) * width for value in found]
         style = styles[method]
-        ax.bar(places, values, width * 0.92, color=style.colour, hatch=style.hatch, edgecolor="white", label=method)
+        label = names.get(method, method)
+        ax.bar(places, values, width * 0.92, color=style.colour, hatch=style.hatch, edgecolor="white", label=label)
         ax.errorbar(places, values, yerr=margins, fmt="none", ecolor="black", capsize=3, linewidth=1)
     ax.set_xticks(range(len(levels)), [str(value) for value in levels])
     ax.set_xlim(-0.6, len(levels) - 0.4)
 
 
-def _draw_lines(ax: Axes, references: pd.DataFrame, level: str, rows: pd.DataFrame) -> None:
-    """Draw the reference teams of one panel, each at its level."""
-    places = {value: place for place, value in enumerate(sorted(rows[level].unique()))}
-    for (name, of_name), line in zip(references.groupby("name", sort=False), cycle(_REFERENCE_LINES), strict=False):
-        here = of_name[of_name[level].isin(places)]
-        at = here[level].map(places).to_numpy(dtype=float)
-        ax.hlines(here["score"], at - 0.47, at + 0.47, color=_REFERENCE, linestyle=line, label=str(name))
-
-
 def draw_differences(
-    compared: pd.DataFrame, title: str | None = None, panel: str | None = None, x_label: str = "difference"
+    compared: pd.DataFrame,
+    title: str | None = None,
+    panel: str | None = None,
+    x_label: str = "difference",
+    names: Mapping[str, str] | None = None,
+    band: float | None = None,
 ) -> Figure:
     """
-    Draw paired differences with their intervals, one group of lines per level.
+    Draw paired differences with their intervals, one group of lines per level (a forest plot).
 
-    :param compared: columns ``method``, ``level``, ``value``, ``low``, ``high`` (NaN for a single run)
+    :param compared: columns ``method``, ``level``, ``value``, ``low``, ``high`` (NaN for a single run), and optionally
+        ``pooled``, whether a row is a mean over others, drawn as a diamond
     :param panel: column with one panel per value, for instance ``"task"``
+    :param names: names of methods in words
+    :param band: differences up to this size do not matter; drawn as a grey band
     """
     require_columns(compared, ("method", "level", "value", "low", "high"))
     panels, styles = _panels(compared, panel), method_styles(_methods_of(compared))
@@ -249,11 +258,18 @@ def draw_differences(
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
         places = rows.assign(place=range(len(rows)))
         for method, here in places.groupby("method", sort=False):
-            value, low, high, place = here[["value", "low", "high", "place"]].to_numpy(dtype=float).T
-            colour = styles[str(method)].colour
-            ax.errorbar(
-                value, place, xerr=[value - low, high - value], fmt="o", color=colour, capsize=3, label=str(method)
-            )
+            style, name_in_words = styles[str(method)], (names or {}).get(str(method), str(method))
+            is_pooled = here["pooled"] if "pooled" in here else pd.Series(False, here.index)
+            for rows_of_mark, mark, size in ((here[~is_pooled], style.mark, 5), (here[is_pooled], "D", 9)):
+                if rows_of_mark.empty:
+                    continue
+                value, low, high, place = rows_of_mark[["value", "low", "high", "place"]].to_numpy(dtype=float).T
+                ends, label = [value - low, high - value], name_in_words if mark == style.mark else None
+                ax.errorbar(
+                    value, place, xerr=ends, fmt=mark, color=style.colour, markersize=size, capsize=3, label=label
+                )
+        if band is not None:
+            ax.axvspan(-band, band, color="#DDDDDD", zorder=0)
         middles = places.groupby("level", sort=False)["place"].mean()
         ax.set_yticks(middles.to_numpy(), middles.index)
         ax.axvline(0, color="black", linewidth=1)
@@ -263,7 +279,10 @@ def draw_differences(
 
 
 def draw_aggregates(
-    scores: Mapping[str, Floats], title: str | None = None, x_label: str = "normalised score"
+    scores: Mapping[str, Floats],
+    title: str | None = None,
+    x_label: str = "normalised score",
+    names: Mapping[str, str] | None = None,
 ) -> Figure:
     """
     Draw interquartile means and performance profiles, both with stratified bootstrap intervals (rliable).
@@ -278,7 +297,8 @@ def draw_aggregates(
         colour = styles[method].colour
         left.barh(row, estimate.high - estimate.low, left=estimate.low, height=0.6, color=colour, alpha=0.5)
         left.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color="black", linewidth=1.5)
-    left.set_yticks(range(len(methods)), methods)
+    words = [(names or {}).get(method, method) for method in methods]
+    left.set_yticks(range(len(methods)), words)
     left.invert_yaxis()
     left.margins(x=0.1)
     left.use_sticky_edges = False  # bars end within the axes
@@ -286,9 +306,9 @@ def draw_aggregates(
     left.set(xlabel=x_label, title="interquartile mean")
     top = max(float(runs.max()) for runs in scores.values())
     thresholds = np.linspace(0, top if top > 0 else 1, 101)
-    for method, profile in performance_profiles(ordered, thresholds).items():
-        colour, line, _ = styles[method]
-        right.plot(thresholds, profile.share, color=colour, linestyle=line, label=method)
+    for name, (method, profile) in zip(words, performance_profiles(ordered, thresholds).items(), strict=True):
+        colour, line = styles[method].colour, styles[method].line
+        right.plot(thresholds, profile.share, color=colour, linestyle=line, label=name)
         right.fill_between(thresholds, profile.low, profile.high, color=colour, alpha=0.2, linewidth=0)
     right.set(xlabel=f"{x_label}, threshold", ylabel="share of runs above it", title="performance profile")
     right.set_ylim(-0.02, 1.02)

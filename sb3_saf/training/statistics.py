@@ -120,6 +120,34 @@ def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
     }
 
 
+def optimality_gaps(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
+    """Return the mean missing part of a score of 1 for each method's (S, K) scores, as :func:`interquartile_means`."""
+    values, intervals = _bootstrap(scores, lambda runs: np.array([1 - np.minimum(runs, 1).mean()]))
+    return {method: Estimate(float(values[method][0]), *map(float, intervals[method][:, 0])) for method in scores}
+
+
+def probability_of_improvement(first: Floats, second: Floats) -> Estimate:
+    """
+    Return the probability that a run of one method is better than one of another, with a stratified bootstrap interval.
+
+    It is rliable's: the mean over tasks of P(X > Y) + P(X = Y) / 2, without the checks that take most of its time.
+
+    :param first: (S, K) scores
+    :param second: (S', K) scores
+    """
+
+    def probability(x: Floats, y: Floats) -> Floats:
+        pairs = x[:, np.newaxis], y[np.newaxis]
+        return np.array([np.mean(pairs[0] > pairs[1]) + 0.5 * np.mean(pairs[0] == pairs[1])])
+
+    from rliable.library import get_interval_estimates
+
+    with own_randomness(BOOTSTRAP_SEED, th.device("cpu")):
+        values, intervals = get_interval_estimates({"": [first, second]}, probability, reps=N_RESAMPLES)
+    ends = intervals[""][:, 0] if min(len(first), len(second)) > 1 else (np.nan, np.nan)
+    return Estimate(float(values[""][0]), *map(float, ends))
+
+
 def _interquartile_mean(runs: Floats) -> float:
     """Return rliable's ``aggregate_iqm`` without scipy's checks, which take most of its time."""
     scores = np.sort(runs, axis=None)
