@@ -10,11 +10,10 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from stable_baselines3.common.base_class import BaseAlgorithm
+from typing import Any
 
 from hecogrid_envs import TASK_NAMES
 from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
@@ -31,24 +30,8 @@ N_EPISODES = 64
 N_INSPECTIONS = 2
 
 
-class Options(NamedTuple):
-    """
-    Options of the command line.
-
-    :param settings: settings of the training
-    :param seed: seed of the run
-    :param output: folder for all results
-    :param progress_bar: whether to draw a progress bar
-    """
-
-    settings: Settings
-    seed: int
-    output: Path
-    progress_bar: bool
-
-
-def parse(arguments: list[str] | None = None) -> Options:
-    """Read the command line."""
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser."""
     parser = argparse.ArgumentParser(prog="python -m sb3_saf.quickstart", description=__doc__.strip().splitlines()[0])
     parser.add_argument("--task", choices=TASK_NAMES, default="TeamSupport")
     parser.add_argument("--coordination", type=int, default=2, help="agents that one treasure needs")
@@ -63,38 +46,18 @@ def parse(arguments: list[str] | None = None) -> Options:
         default=sys.stdout.isatty(),
         help="a line for every tenth of the training instead, as without a terminal",
     )
-    given = parser.parse_args(arguments)
-    level = {"coordination": given.coordination, "heterogeneity": given.heterogeneity}
-    try:
-        settings = load_settings("saf", f"{given.task}-v0", "small", level, {"game_steps": given.game_steps})
-    except ValueError as error:
-        parser.error(str(error))
-    return Options(settings, given.seed, given.output, given.progress_bar)
+    return parser
 
 
-def train_team(options: Options) -> BaseAlgorithm:
-    """Train; write TensorBoard logs, ``monitor.csv`` and the model to the output folder."""
-    run = RunOptions(
-        tensorboard_log=options.output / "tb",
-        inspect_freq=max(1, options.settings.game_steps // N_INSPECTIONS),
-        progress=options.progress_bar,
-        num_threads=1,  # more threads do not help small networks, and slow down on a busy machine
-    )
-    lines = ProgressLines(verbose=int(not options.progress_bar))
-    return train(options.settings, options.seed, options.output, run, [lines])
-
-
-def evaluate(options: Options, model: Any, film: Path | None = None) -> EvaluationResult:
+def evaluate(settings: Settings, seed: int, model: Any, film: Path | None = None) -> EvaluationResult:
     """
     Return team returns of games not used in training, the same for every model.
 
     :param film: GIF of the first game to write; None for none
     """
-    games = options.settings.make_env(
-        options.seed, evaluation=True, n_envs=N_EPISODES, render_mode=None if film is None else "rgb_array"
-    )
+    mode = None if film is None else "rgb_array"
     frames: list[Any] = []
-    with closing(games):
+    with closing(settings.make_env(seed, evaluation=True, n_envs=N_EPISODES, render_mode=mode)) as games:
         env = games if film is None else Film(games, frames.append)
         result = evaluate_team(model, env, n_eval_episodes=N_EPISODES, deterministic=False)
     if film is not None:
@@ -102,53 +65,46 @@ def evaluate(options: Options, model: Any, film: Path | None = None) -> Evaluati
     return result
 
 
-def describe(settings: Settings) -> str:
-    """Return the game's name and level."""
-    level = settings.env_kwargs
-    return f"{settings.task}, coordination {level['coordination']}, heterogeneity {level['heterogeneity']}"
-
-
-def draw_curve(options: Options, random: EvaluationResult) -> Path:
-    """Draw the team return of the training episodes against game steps."""
-    curve = read_curve(options.output).assign(method=options.settings.algo, seed=options.seed)
-    figure = draw_curves(curve, describe(options.settings), references={"random team": random.mean})
-    path = options.output / "learning_curve.png"
-    figure.savefig(path)
-    return path
-
-
-def write_replay(options: Options, model: BaseAlgorithm) -> Path:
-    """Write a replay page of the first evaluation game."""
-    seed = evaluation_seed(options.seed)
-    with closing(options.settings.make_env(options.seed, evaluation=True, n_envs=1)) as games:
-        return replay({"SAF": model}, games, options.output / "replay.html", seed=seed)
-
-
-def main(arguments: list[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Train, compare with a random team, and print the paths of the results."""
-    options = parse(arguments)
-    options.output.mkdir(parents=True, exist_ok=True)
-    settings = options.settings
-    given = sys.argv[1:] if arguments is None else arguments
-    command = shlex.join(["python", "-m", "sb3_saf.quickstart", *given])
-    write_run(options.output, settings.as_dict(), options.seed, command)
+    parser = make_parser()
+    options = parser.parse_args(arguments)
+    level = {"coordination": options.coordination, "heterogeneity": options.heterogeneity}
+    try:
+        settings = load_settings("saf", f"{options.task}-v0", "small", level, {"game_steps": options.game_steps})
+    except ValueError as error:
+        parser.error(str(error))
+    seed, output = options.seed, options.output
+    output.mkdir(parents=True, exist_ok=True)
+    words = sys.argv[1:] if arguments is None else arguments
+    write_run(output, settings.as_dict(), seed, shlex.join(["python", "-m", "sb3_saf.quickstart", *words]))
+    title = f"{options.task}, coordination {options.coordination}, heterogeneity {options.heterogeneity}"
     print(
-        f"Training SAF on {describe(settings)}: {settings.game_steps:,} game steps with {settings.n_agents} agents in "
+        f"Training SAF on {title}: {settings.game_steps:,} game steps with {settings.n_agents} agents in "
         f"{settings.n_envs} games, in a few minutes"
     )
-    model = train_team(options)
-    gif = options.output / "episode.gif"
-    trained = evaluate(options, model, gif)
-    random = evaluate(options, RandomPolicy(model.action_space, seed=options.seed))
-    curve, page = draw_curve(options, random), write_replay(options, model)
+    run = RunOptions(
+        tensorboard_log=output / "tb",
+        inspect_freq=max(1, settings.game_steps // N_INSPECTIONS),
+        progress=options.progress_bar,
+        num_threads=1,  # more threads do not help small networks, and slow down on a busy machine
+    )
+    model = train(settings, seed, output, run, [ProgressLines(verbose=int(not options.progress_bar))])
+    gif, curve, page = (output / name for name in ("episode.gif", "learning_curve.png", "replay.html"))
+    trained = evaluate(settings, seed, model, gif)
+    random = evaluate(settings, seed, RandomPolicy(model.action_space, seed=seed))
+    points = read_curve(output).assign(method=settings.algo, seed=seed)
+    draw_curves(points, title, references={"random team": random.mean}).savefig(curve)
+    with closing(settings.make_env(seed, evaluation=True, n_envs=1)) as games:
+        replay({"SAF": model}, games, page, seed=evaluation_seed(seed))
     print(f"\nTeam return (treasures collected), {N_EPISODES} fresh games, mean and 95 % interval")
     print(f"  SAF     {trained}")
     print(f"  random  {random}")
-    print(f"\nmodel           {options.output / 'model.zip'}")
+    print(f"\nmodel           {output / 'model.zip'}")
     print(f"learning curve  {curve}")
     print(f"episode         {gif}")
     print(f"replay          {page} (open it in a browser)")
-    print(f"TensorBoard     {python_command('tensorboard.main')} --logdir {options.output / 'tb'}")
+    print(f"TensorBoard     {python_command('tensorboard.main')} --logdir {output / 'tb'}")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ ROLLOUT = 24  # agent steps
 
 
 class Seen(BaseCallback):
-    """Record the coefficients with which a model was updated."""
+    """Record the coefficients of updates, and those between them, with which a model would be saved."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,13 +24,11 @@ class Seen(BaseCallback):
         self.saved: set[float] = set()
 
     def _on_step(self) -> bool:
-        model: Any = self.model
-        self.saved.add(model.ent_coef)
+        self.saved.add(vars(self.model)["ent_coef"])
         return True
 
     def _on_rollout_end(self) -> None:
-        model: Any = self.model
-        self.coefficients.append(model.ent_coef)
+        self.coefficients.append(vars(self.model)["ent_coef"])
 
 
 def learner(algorithm: Any, **settings: Any) -> Any:

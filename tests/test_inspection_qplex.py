@@ -16,7 +16,6 @@ from sb3_saf import QPLEX, InspectionCallback, evaluate_team, make_team_env
 from sb3_saf.inspection.reading import QReader
 from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.actor import PolicyPool
-from sb3_saf.qplex.policies import QPLEXPolicy
 from tests.probe_envs import ConstantReward
 from tests.toy_envs import TellingEnv
 
@@ -67,10 +66,6 @@ def test_training_ends_with_the_same_weights_to_the_last_bit() -> None:
         assert th.equal(weights, watched.policy.state_dict()[name]), name
 
 
-def policy_on(env: VecEnv, policy: str = "QPLEXPolicy", **parts: Any) -> QPLEXPolicy:
-    return model_on(env, policy, **parts).policy
-
-
 def rows_of(env: VecEnv) -> dict[str, th.Tensor]:
     obs = env.reset()
     assert isinstance(obs, dict)
@@ -80,7 +75,7 @@ def rows_of(env: VecEnv) -> dict[str, th.Tensor]:
 @th.no_grad()
 def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
     env = telling()
-    policy = policy_on(env, mixer="vdn")
+    policy = model_on(env, mixer="vdn").policy
     obs = rows_of(env)
     view = QReader(policy).step(obs, np.ones(12, dtype=bool))
     best = policy.own_q_values(obs).max(dim=1).values.view(4, 3)
@@ -92,7 +87,7 @@ def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
 @pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
 def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
     env = telling()
-    team = policy_on(env, policy)
+    team = model_on(env, policy).policy
     recording = record_episodes(team, env, 8, seed=3, gamma=0.5)
     env.seed(3)
     assert recording.episode_returns == evaluate_team(team, env, 8).returns
@@ -104,7 +99,7 @@ def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
 def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> None:
     """Two agents get 1 each at both steps; a time limit that does not terminate is followed by the next value."""
     env = make_team_env(ConstantReward(n_agents=2, length=2), n_envs=4, time_limit=time_limit)
-    team = policy_on(env)
+    team = model_on(env).policy
     recording = record_episodes(team, env, 4, seed=0, gamma=0.5)
     assert recording.episode_returns == [4.0] * 4
     assert (recording.rewards == 2).all()
@@ -119,7 +114,7 @@ def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> No
 @th.no_grad()
 def test_heads_of_a_pool_differ_where_their_best_actions_do() -> None:
     env = telling(masks=None, joins={}, deaths={})
-    team = policy_on(env, "QPLEXPoolPolicy", n_policies=2)
+    team = model_on(env, "QPLEXPoolPolicy", n_policies=2).policy
     obs = rows_of(env)
     view = QReader(team).step(obs, np.ones(12, dtype=bool))
     assert view.pool_weights is not None and view.pool_actions is not None

@@ -29,14 +29,7 @@ ENV_IDS = [f"{task}-v0" for task in hecogrid_envs.TASK_NAMES]
 COUNT = int(os.environ.get("MUTATIONS", "100"))
 #: Processor seconds after which a mutation counts as a hang.
 PATIENCE = 30
-SMALL: dict[str, Any] = {
-    "n_agents": 3,
-    "grid_size": 8,
-    "n_treasures": 4,
-    "n_keys": 2,
-    "coordination": 1,
-    "max_cycles": 9,
-}
+SMALL = {"n_agents": 3, "grid_size": 8, "n_treasures": 4, "n_keys": 2, "coordination": 1, "max_cycles": 9}
 CONFIGS = sorted(Path(hecogrid_envs.__file__).parents[1].glob("zoo_configs/*.yml"))
 
 
@@ -85,23 +78,11 @@ def scrambled(text: str, rng: random.Random) -> str:
     return text
 
 
-BOMB = "\n".join(["x0: &x0 [1, 1]", *(f"x{i + 1}: &x{i + 1} [{', '.join([f'*x{i}'] * 9)}]" for i in range(40))])
 ODD_WORDS = (
     *("null", "true", "-1", "0", "1e400", ".nan", "-.inf", "99999999999999999999", "0.5", "''", "[]", "{}", "[1, 2]"),
-    *(
-        "../../etc/passwd",
-        "2024-99-99",
-        "2024-01-01",
-        "0x",
-        "0o9",
-        "12:30:45",
-        "*unknown",
-        "&a",
-        "!!set {a, b}",
-        "<<: 1",
-    ),
+    *("../../etc/passwd", "2024-99-99", "2024-01-01", "0x", "0o9", "12:30:45", "*unknown", "&a", "!!set {a, b}"),
     *("!!python/object/apply:os.system ['false']", "!!binary abc", "!!int abc", "? [a]: b", "[" * 2000, "{a: " * 500),
-    *("lin_x", "lin_-1", "os.system", "a\x00b", "&r [*r]", "\ufeff", "%YAML 9", "--- 1", "1" * 5000),
+    *("lin_x", "lin_-1", "os.system", "a\x00b", "&r [*r]", "\ufeff", "%YAML 9", "--- 1", "1" * 5000, "<<: 1"),
 )
 
 
@@ -118,17 +99,8 @@ def test_mutated_settings_are_refused_in_our_own_words_or_load(tmp_path: Path) -
     assert count > COUNT / 4
 
 
-@pytest.mark.parametrize(
-    "text", [BOMB, "default: &a {b: *a}", "default: " + "[" * 100_000, "default:\n  n_envs: " + "9" * 9_000]
-)
-def test_settings_that_unfold_without_end_are_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "settings.yml"
-    path.write_text(text, encoding="utf-8")
-    assert refused(lambda: load_settings("saf", ENV_IDS[0], "smoke", config=path))
-
-
 def a_game(seed: int = 0) -> hecogrid_envs.HECOGridEnv:
-    env = hecogrid_envs.parallel_env("KeyForTreasure", observation="tiles", **SMALL)
+    env = hecogrid_envs.parallel_env("KeyForTreasure", observation="tiles", **SMALL)  # type: ignore[arg-type]
     env.reset(seed=seed)
     return env
 
@@ -200,13 +172,8 @@ def test_mutated_levels_are_refused_in_our_own_words_or_can_be_played() -> None:
     assert count > COUNT / 4
 
 
-# --- names with paths -------------------------------------------------------------------------------------------------
-
-ELSEWHERE = ("../x", "/etc/passwd", "saf/../../x", "..", "", "saf\x00", "C:\\x", "a/b")
-
-
-@pytest.mark.parametrize("name", ELSEWHERE)
-def test_names_that_lead_elsewhere_are_unknown(name: str) -> None:
+@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "saf/../../x", "..", "", "saf\x00", "C:\\x", "a/b"])
+def test_names_with_paths_are_unknown(name: str) -> None:
     assert refused(lambda: load_settings(name, ENV_IDS[0], "smoke"))
     assert refused(lambda: load_settings("saf", name, "smoke"))
     assert refused(lambda: load_settings("saf", ENV_IDS[0], name))  # type: ignore[arg-type]

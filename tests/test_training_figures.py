@@ -43,13 +43,6 @@ def test_mean_and_interval_over_seeds() -> None:
     assert np.isnan([alone.low, alone.high]).all()
 
 
-def test_a_curve_is_the_mean_over_seeds_at_every_point() -> None:
-    curve = learning_curve(runs(saf=[[1, 2, 3], [3, 4, 8]]))
-    assert curve["game_steps"].tolist() == [100, 200, 300]
-    assert curve["value"].tolist() == [2, 3, 5.5]
-    assert curve[["low", "high"]].iloc[2].tolist() == pytest.approx(list(confidence_interval([3, 8])))
-
-
 def test_a_curve_ends_where_a_seed_ends_and_is_interpolated_between() -> None:
     table = pd.DataFrame(
         {"seed": [0, 0, 0, 1, 1], "game_steps": [0, 100, 200, 50, 150], "score": [0.0, 10.0, 20.0, 5.0, 25.0]}
@@ -67,6 +60,8 @@ def test_curves_are_drawn_where_they_are() -> None:
     assert list(lines) == ["saf (2 seeds)", "mappo (1 seed)"]
     assert np.array_equal(lines["saf (2 seeds)"].get_xdata(), [100, 200, 300])
     assert np.array_equal(lines["saf (2 seeds)"].get_ydata(), [2, 3, 5.5])
+    curve = learning_curve(table[table["method"] == "saf"])
+    assert curve[["low", "high"]].iloc[2].tolist() == pytest.approx(list(confidence_interval([3, 8])))
     assert to_hex(str(lines["mappo (1 seed)"].get_color())) == method_styles(["mappo"])["mappo"].colour.lower()
     assert (axes.get_xlabel(), axes.get_title()) == ("game steps", "t")
     assert figure.get_suptitle() == "T"
@@ -116,9 +111,6 @@ def test_interquartile_mean_and_its_interval() -> None:
 def test_the_interquartile_mean_is_rliables(shape: tuple[int, int]) -> None:
     scores = np.random.default_rng(0).normal(size=shape)
     assert interquartile_means({"saf": scores})["saf"].value == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
-
-
-def test_seeds_without_spread_have_an_interval_without_width() -> None:
     assert interquartile_means({"saf": np.full((3, 2), 0.25)})["saf"] == (0.25, 0.25, 0.25)
 
 
@@ -179,6 +171,16 @@ def test_the_largest_possible_return_is_a_line() -> None:
     assert "SAF" in [container.get_label() for container in axes.containers]
 
 
+def test_panels_have_their_own_levels() -> None:
+    rows = [("saf", 0, 1, 2.0, "a"), ("saf", 0, 2, 3.0, "a"), ("saf", 0, 5, 1.0, "b")]
+    table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "score", "task"])
+    ticks = [
+        [label.get_text() for label in axes.get_xticklabels()]
+        for axes in draw_levels(table, "coordination", None, "task").axes
+    ]
+    assert ticks == [["1", "2"], ["5"]]
+
+
 def test_methods_keep_their_styles_and_none_looks_like_another() -> None:
     assert method_styles(["ippo", "saf"])["saf"] == method_styles(["saf", "other"])["saf"]
     methods = [*ALGOS, "random", "saf gamma=0.9", "saf, variant 1"]
@@ -186,14 +188,11 @@ def test_methods_keep_their_styles_and_none_looks_like_another() -> None:
     assert method_styles(methods)["saf-lstm"].colour == method_styles(methods)["saf"].colour
 
 
-def long_names(count: int) -> dict[str, list[list[float]]]:
-    return {f"saf with_a_setting_of_a_long_name={index}": [[0.0, 1.0]] for index in range(count)}
-
-
 @pytest.mark.parametrize("n_panels", [1, 2, 9])
 def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
     """Constrained layout only warns if it does not fit; warnings are errors here."""
-    table = pd.concat([runs(**long_names(12)).assign(task=f"task {index}") for index in range(n_panels)])
+    long_names = runs(**{f"saf with_a_setting_of_a_long_name={index}": [[0.0, 1.0]] for index in range(12)})
+    table = pd.concat([long_names.assign(task=f"task {index}") for index in range(n_panels)])
     for figure in (
         draw_curves(table, panel="task"),
         draw_levels(table.assign(coordination=1), "coordination", panel="task"),
@@ -204,16 +203,6 @@ def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
         assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0
         boxes = [axes.get_tightbbox() for axes in figure.axes if axes.axison]
         assert all(each is not None and box.y1 <= each.y0 + 1 for each in boxes)
-
-
-def test_panels_have_their_own_levels() -> None:
-    rows = [("saf", 0, 1, 2.0, "a"), ("saf", 0, 2, 3.0, "a"), ("saf", 0, 5, 1.0, "b")]
-    table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "score", "task"])
-    ticks = [
-        [label.get_text() for label in axes.get_xticklabels()]
-        for axes in draw_levels(table, "coordination", None, "task").axes
-    ]
-    assert ticks == [["1", "2"], ["5"]]
 
 
 def test_returns_that_are_never_negative_are_drawn_from_zero() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
 import inspect
 from contextlib import closing
 from dataclasses import asdict
@@ -20,8 +19,8 @@ from hecogrid_envs.params import HECOGridParams
 from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
-from sb3_saf.training.settings import ALGOS, SIZES, Settings, load_settings, saved_settings
-from sb3_saf.training.yaml_files import Size, config_names, read_settings
+from sb3_saf.training.settings import ALGOS, load_settings, saved_settings
+from sb3_saf.training.yaml_files import SIZES, Size, config_names, read_settings
 
 ENV = "TeamTogether-v0"
 ENV_IDS = suites()["hecogrid"].tasks
@@ -121,6 +120,8 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
     assert of_the_size["features_extractor_class"] is LightEncoder
     assert settings.hyperparams["policy_kwargs"] == {**of_the_size, "n_slots": 8}
     assert (settings.env_kwargs["coordination"], settings.env_kwargs["grid_size"]) == (2, 15)
+    other = load_settings("saf", ENV, "smoke", overrides={"batch_size": 500, "time_limit": "bootstrap"})
+    assert other.hyperparams["batch_size"] == 500 and other.make_env(0).time_limit == "bootstrap"
 
 
 @pytest.mark.parametrize("algorithm", ["A2C", "TRPO"])
@@ -136,10 +137,6 @@ def test_another_algorithm_takes_the_settings_that_it_has(algorithm: str) -> Non
         assert saved_settings(own.as_dict()).hyperparams["use_rms_prop"] is False
     with pytest.raises(ValueError, match=f"unknown setting of {algorithm} 'clip_range'"):
         load_settings("saf", ENV, "small", overrides={"algorithm": algorithm, "clip_range": 0.1})
-
-
-def test_a_batch_size_replaces_the_number_of_minibatches() -> None:
-    assert load_settings("saf", ENV, "small", overrides={"batch_size": 500}).hyperparams["batch_size"] == 500
 
 
 def test_minibatches_are_whole_teams() -> None:
@@ -176,7 +173,6 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"size": "smal"}, "did you mean 'small'"),
         ({"env_kwargs": {"coordinaton": 2}}, "did you mean 'coordination'"),
         ({"env_kwargs": {"coordination": 11}}, "coordination"),
-        ({"env_kwargs": {"grid_size": 6}}, "n_treasures"),
         ({"overrides": {"learning_rat": 1}}, "did you mean 'learning_rate'"),
         ({"overrides": {"seed": 1}}, "'seed'"),  # set per run
         ({"overrides": {"algo": "MaskablePPO"}}, "'algo'"),  # the method; its algorithm has another name
@@ -186,19 +182,11 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),
         ({"overrides": {"learning_rate": "fast"}}, "learning_rate='fast': .*lin_7e-4"),
         ({"overrides": {"learning_rate": "lin_x"}}, "learning_rate='x'"),
-        ({"overrides": {"clip_range": "lin_-0.2"}}, "clip_range='-0.2'"),
         ({"overrides": {"gamma": float("nan")}}, "gamma=nan"),
         ({"overrides": {"gamma": 50}}, "gamma=50"),
-        ({"overrides": {"gamma": "9" * 401}}, "gamma='9"),
-        ({"overrides": {"gae_lambda": 7}}, "gae_lambda=7"),
-        ({"overrides": {"max_grad_norm": -1}}, "max_grad_norm=-1"),
-        ({"overrides": {"n_epochs": 0}}, "n_epochs=0"),
-        ({"overrides": {"stats_window_size": -1}}, "stats_window_size=-1"),
         ({"overrides": {"n_steps": 1.5}}, "n_steps=1.5"),
         ({"overrides": {"n_envs": 0}}, "n_envs=0"),
-        ({"overrides": {"n_envs": 10**8}}, "n_envs=100000000"),
         ({"overrides": {"n_envs": True}}, "n_envs=True"),
-        ({"overrides": {"normalize_advantage": "yes"}}, "normalize_advantage='yes'"),
         ({"overrides": {"time_limit": "end"}}, "time_limit='end'"),
         ({"overrides": {"policy_kwargs": "dict(n_slots=8)"}}, "policy_kwargs='dict"),
         ({"overrides": {"policy_kwargs": {"n_policys": 2}}}, "did you mean 'n_policies'"),
@@ -263,49 +251,20 @@ def test_settings_survive_a_file() -> None:
         saved_settings({key: value for key, value in settings.as_dict().items() if key != "hyperparams"})
 
 
-@pytest.mark.parametrize("seed", [0, 1, 12345, MAX_SEED])
-def test_no_run_has_the_seed_of_an_evaluation(seed: int) -> None:
-    evaluation = evaluation_seed(seed)
-    assert MAX_SEED < evaluation < 2**63
-    training = {game for run in (0, 1, seed, 12345) for game in game_seeds(run, 64)}
-    assert training.isdisjoint(game_seeds(evaluation, 64))
-
-
-def test_seeds_of_evaluations_differ_and_repeat() -> None:
+def test_no_run_has_the_seed_of_an_evaluation() -> None:
+    seeds = [0, 1, 12345, MAX_SEED]
+    training = {game for seed in seeds for game in game_seeds(seed, 64)}
+    assert all(training.isdisjoint(game_seeds(evaluation_seed(seed), 64)) for seed in seeds)
     assert len({evaluation_seed(seed) for seed in range(100)}) == 100
-    assert evaluation_seed(7) == evaluation_seed(7)
     for bad in (-1, MAX_SEED + 1, True, 0.5):
         with pytest.raises(ValueError, match="seed must be a whole number"):
             evaluation_seed(bad)  # type: ignore[arg-type]
 
 
-def _first_views(settings: Settings, seed: int, evaluation: bool) -> np.ndarray:
-    observations = settings.make_env(seed, evaluation=evaluation).reset()
-    assert isinstance(observations, dict)
-    return observations["obs"]
-
-
 def test_evaluation_plays_other_games_than_training() -> None:
     settings = load_settings("saf", ENV, "smoke")
-    assert np.array_equal(_first_views(settings, 0, False), _first_views(settings, 0, False))
-    assert not np.array_equal(_first_views(settings, 0, False), _first_views(settings, 0, True))
-
-
-def test_monitor_is_left_in_the_folder_and_time_limit_reaches_the_wrapper(tmp_path: Path) -> None:
-    settings = load_settings("saf", ENV, "smoke", overrides={"time_limit": "bootstrap"})
-    env = settings.make_env(0, monitor_dir=tmp_path / "run", n_envs=2)
-    assert (env.num_envs, env.time_limit) == (8, "bootstrap")
-    env.reset()
-    env.step(np.zeros(8, dtype=int))
-    assert (tmp_path / "run" / "monitor.csv").is_file()
-    env.close()
-
-
-def test_every_file_is_installed_with_the_packages() -> None:
-    config = configparser.ConfigParser()
-    config.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
-    assert config["options.package_data"]["zoo_configs"] == "*.yml"
-    assert "zoo_configs*" in config["options.packages.find"]["include"].split()
+    views: list[Any] = [settings.make_env(0, evaluation=other).reset() for other in (False, False, True)]
+    assert np.array_equal(views[0]["obs"], views[1]["obs"]) and not np.array_equal(views[0]["obs"], views[2]["obs"])
 
 
 def test_normalize_without_arguments_normalises() -> None:

@@ -19,9 +19,10 @@ from optuna.trial import TrialState
 
 from sb3_saf import LightEncoder
 from sb3_saf.training import train as zoo_train
+from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.folders import Run
 from sb3_saf.training.settings import ALGOS, load_settings
-from sb3_saf.training.tune import TrialCallback, open_storage, sample_overrides, to_overrides
+from sb3_saf.training.tune import open_storage, sample_overrides, to_overrides
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
@@ -46,10 +47,6 @@ def load_study(storage: str) -> optuna.Study:
     return optuna.load_study(study_name="s", storage=storage)
 
 
-def config_of(run: Path) -> dict[str, Any]:
-    return Run(run).description["settings"]
-
-
 def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     words = given(tmp_path, "--storage", storage, "--n-trials", "2", "--n-evaluations", "1", "-params", "n_epochs:1")
@@ -65,43 +62,34 @@ def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path:
 
     trial_options = ["--storage", storage, "--study-name", "s", "--trial-id", str(study.best_trial.number)]
     zoo_train.main([*SMOKE, *trial_options, "-n", "80", "-f", str(tmp_path / "again")])
-    saved = config_of(tmp_path / "again" / "saf" / f"{ENV}_1")
+    saved = Run(tmp_path / "again" / "saf" / f"{ENV}_1").description["settings"]
     expected = load_settings("saf", ENV, "smoke", overrides={**to_overrides(study.best_params), "game_steps": 80})
     assert saved == expected.as_dict()
 
 
 def test_trials_are_evaluated_n_times_in_game_steps(tmp_path: Path) -> None:
-    study = tune(tmp_path, "--n-evaluations", "4", "--pruner", "none", "-n", "160")
+    folder = tmp_path / "trials"
+    options = ("--n-evaluations", "4", "--pruner", "none", "-n", "160", "--optimization-log-path", str(folder))
+    study = tune(tmp_path, *options)
     (trial,) = study.trials
     assert trial.state is TrialState.COMPLETE
     assert sorted(trial.intermediate_values) == [1, 2, 3, 4]
     assert trial.value == trial.intermediate_values[4]
     assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))  # no run folder is left
     assert list((tmp_path / "logs").glob("saf/report_*.csv"))
-
-
-def test_an_evaluation_that_is_never_due_still_gives_a_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = TrialCallback.__init__
-
-    def never(self: TrialCallback, *args: Any, **kwargs: Any) -> None:
-        original(self, *args, **{**kwargs, "eval_freq": 10**9})
-
-    monkeypatch.setattr(TrialCallback, "__init__", never)
-    (trial,) = tune(tmp_path).trials
-    assert trial.state is TrialState.COMPLETE
-    assert trial.value is not None and math.isfinite(trial.value)
+    assert {"evaluations.npz", "best_model.zip"} <= {path.name for path in (folder / "trial_0").iterdir()}
 
 
 @pytest.mark.parametrize("failure", ["unevaluated", "diverged"])
 def test_a_failed_trial_is_never_complete(
     failure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def evaluate(self: TrialCallback) -> bool:
+    def evaluate(self: SeededEvalCallback) -> bool:
         if failure == "diverged":
             raise ValueError("NaN in the logits")
         return True  # and last_mean_reward stays -inf
 
-    monkeypatch.setattr(TrialCallback, "_evaluate", evaluate)
+    monkeypatch.setattr(SeededEvalCallback, "_evaluate", evaluate)
     assert failed(given(tmp_path), capsys)
     (trial,) = load_study(str(tmp_path / "study.log")).trials
     assert (trial.state, trial.value) == (TrialState.PRUNED, None)
@@ -113,25 +101,18 @@ def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Pa
     options = (*study, "-n", "40", "--eval-freq", "-1", "-f", str(tmp_path / "logs"))
     for number, trial in enumerate(("0", "best"), start=1):
         zoo_train.main([*SMOKE, *options, "--trial-id", trial])
-        saved = config_of(tmp_path / "logs" / "saf" / f"{ENV}_{number}")["hyperparams"]
+        saved = Run(tmp_path / "logs" / "saf" / f"{ENV}_{number}").settings.plain
         assert saved["learning_rate"] == sampled["learning_rate"]
     zoo_train.main([*SMOKE, *options, "--trial-id", "0", "-params", "learning_rate:0.5"])
-    assert config_of(tmp_path / "logs" / "saf" / f"{ENV}_3")["hyperparams"]["learning_rate"] == 0.5
+    assert Run(tmp_path / "logs" / "saf" / f"{ENV}_3").settings.plain["learning_rate"] == 0.5
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--study-name", "other", "--trial-id", "0"), "there is no study 'other'"),
-        (("--study-name", "s", "--trial-id", "7"), "has no trial 7"),
-    ],
-)
-def test_unknown_studies_and_trials_are_one_line(
-    options: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_studies_and_trials_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     storage = str(tmp_path / "study.log")
     optuna.create_study(study_name="s", storage=optuna.storages.JournalStorage(JournalFileBackend(storage)))
-    assert words in failed([*SMOKE, "--storage", storage, "-f", str(tmp_path), *options], capsys)
+    for study, trial, words in (("other", "0", "there is no study 'other'"), ("s", "7", "has no trial 7")):
+        options = ["--storage", storage, "--study-name", study, "--trial-id", trial, "-f", str(tmp_path)]
+        assert words in failed([*SMOKE, *options], capsys)
 
 
 def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -180,6 +161,4 @@ def test_what_is_given_is_not_searched() -> None:
 def test_a_learning_rate_is_constant_or_decreases_to_zero() -> None:
     assert to_overrides({"learning_rate": 1e-3, "lr_schedule": "linear"}) == {"learning_rate": "lin_0.001"}
     assert to_overrides({"learning_rate": 1e-3, "lr_schedule": "constant"}) == {"learning_rate": 1e-3}
-    assert to_overrides({"learning_rate": 1e-3}) == {
-        "learning_rate": 1e-3
-    }  # a study made before schedules were sampled
+    assert to_overrides({"learning_rate": 1e-3}) == {"learning_rate": 1e-3}  # of an older study

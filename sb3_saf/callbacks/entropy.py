@@ -18,7 +18,9 @@ class EntropySchedule(BaseCallback):
     likely actions may then be worse than drawn ones. With a bonus that decreases to 0 they lose less (results page).
 
     Each update uses the value at the end of its rollout, as SB3 does for learning rates, and logs it as
-    ``train/ent_coef``. Outside updates the model has its own value, so that saved models and longer runs keep it.
+    ``train/ent_coef``. Outside updates the model has its own value, so that saved models and longer runs keep it. SB3
+    calls no callback when an exception ends ``learn``: after Ctrl-C within an update the lower value stays in the
+    model, unless ``sb3_saf.resumable_learn`` or ``sb3_saf.train`` trains it, which restore it.
 
     In settings: ``callback: sb3_saf.EntropySchedule``.
 

@@ -71,7 +71,9 @@ class TeamEvalCallback(EvalCallback):
         self.evaluations_agent_results: list[list[list[float]]] = []
         self._next_evaluation = 0
         self._is_done_for_rollout = False
-        self._started = self._seconds = 0.0
+        #: Seconds of the evaluations of this training.
+        self.seconds = 0.0
+        self._started = 0.0
 
     def _init_callback(self) -> None:
         require_n_agents(self.training_env)
@@ -82,7 +84,7 @@ class TeamEvalCallback(EvalCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._started, self._seconds = time.monotonic(), 0.0
+        self._started, self.seconds = time.monotonic(), 0.0
         self._plan_next()
 
     def _on_rollout_start(self) -> None:
@@ -91,32 +93,27 @@ class TeamEvalCallback(EvalCallback):
 
     def _on_training_end(self) -> None:
         super()._on_training_end()
-        if self._seconds:
-            share = self._seconds / (time.monotonic() - self._started)
+        if self.seconds:
+            share = self.seconds / (time.monotonic() - self._started)
             self._say(f"Evaluation took {100 * share:.0f} % of the time")
-
-    def _game_steps(self) -> int:
-        return team_steps(self.model)
 
     def _plan_next(self) -> None:
         """Set the next multiple of ``eval_freq``, which steps of E games at a time may skip."""
         if self.eval_freq > 0:
-            self._next_evaluation = (self._game_steps() // self.eval_freq + 1) * self.eval_freq
+            self._next_evaluation = (team_steps(self.model) // self.eval_freq + 1) * self.eval_freq
 
     def _on_step(self) -> bool:
-        if self.eval_freq <= 0 or self._game_steps() < self._next_evaluation:
+        if self.eval_freq <= 0 or team_steps(self.model) < self._next_evaluation:
             return True
         self._plan_next()
         if self._is_done_for_rollout:
             return True
         self._is_done_for_rollout = True  # the model does not change before the next rollout
-        begin = time.monotonic()
-        go_on = self._evaluate()
-        self._seconds += time.monotonic() - begin
-        return go_on
+        return self._evaluate()
 
     def _evaluate(self) -> bool:
         """Play, store and log; return whether training continues."""
+        began = time.monotonic()
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         result = evaluate_team(
@@ -125,13 +122,15 @@ class TeamEvalCallback(EvalCallback):
         self.last_mean_reward = result.mean
         self._store(result)
         self._log(result)
-        return self._react(result)
+        go_on = self._react(result)
+        self.seconds += time.monotonic() - began
+        return go_on
 
     def _store(self, result: EvaluationResult) -> None:
         if self.log_path is None:
             return
         self.evaluations_timesteps.append(self.num_timesteps)
-        self.evaluations_game_steps.append(self._game_steps())
+        self.evaluations_game_steps.append(team_steps(self.model))
         self.evaluations_results.append(result.returns)
         self.evaluations_agent_results.append([list(returns) for returns in result.agent_returns])
         self.evaluations_length.append(result.lengths)
@@ -149,7 +148,7 @@ class TeamEvalCallback(EvalCallback):
             np.savez(file, **arrays)  # type: ignore[arg-type]
 
     def _log(self, result: EvaluationResult) -> None:
-        steps, mean_length = self._game_steps(), float(np.mean(result.lengths))
+        steps, mean_length = team_steps(self.model), float(np.mean(result.lengths))
         self._say(f"Evaluation after {steps} game steps: team return {result}, {mean_length:.2f} steps per episode")
         self.logger.record("eval/mean_reward", result.mean)
         self.logger.record("eval/mean_ep_length", mean_length)

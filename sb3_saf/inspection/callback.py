@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, Image
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
@@ -20,7 +20,7 @@ from sb3_saf.inspection.recording import Zones, zone_function
 from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.vec_env import require_n_agents
+from sb3_saf.teams.vec_env import layers, require_n_agents
 
 
 class InspectionCallback(BaseCallback):
@@ -73,7 +73,14 @@ class InspectionCallback(BaseCallback):
             raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
         zone_function(eval_env, zones)  # refuses what is no function
         if pictures:
-            _require_matplotlib()
+            try:
+                import matplotlib  # noqa: F401
+                import PIL  # noqa: F401
+            except ImportError as error:
+                raise ImportError(
+                    f"InspectionCallback draws with matplotlib and Pillow ({error}): pip install 'sb3-saf[render]', or "
+                    "pass pictures=False for numbers only"
+                ) from error
         self.eval_env = eval_env
         self.pictures = pictures
         self.hparams = dict(hparams or {})
@@ -179,28 +186,12 @@ def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:
                 f"expected eval_env to have the {name} of the training environment, {of_training}, got {of_eval}; make "
                 "both with the same arguments"
             )
-    limits = [_time_limit(env) for env in (training_env, eval_env)]
+    limits = [
+        next((layer.time_limit for layer in layers(env) if isinstance(layer, CentralizedValueWrapper)), None)
+        for env in (training_env, eval_env)
+    ]
     if None not in limits and limits[0] != limits[1]:
         raise ValueError(
             f"expected eval_env to treat time limits as training does (time_limit={limits[0]!r}), got {limits[1]!r}: "
             "the critic would be compared with returns that it does not learn"
         )
-
-
-def _time_limit(env: VecEnv) -> str | None:
-    while isinstance(env, VecEnvWrapper):
-        if isinstance(env, CentralizedValueWrapper):
-            return env.time_limit
-        env = env.venv
-    return None
-
-
-def _require_matplotlib() -> None:
-    try:
-        import matplotlib  # noqa: F401
-        import PIL  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            f"InspectionCallback draws with matplotlib and Pillow ({error}): pip install 'sb3-saf[render]', or pass "
-            "pictures=False for numbers only"
-        ) from error

@@ -37,7 +37,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.evaluation import PlayedStep, check_trained_on, play
 from sb3_saf.inspection.reading import (
-    OurPolicy,
     PolicyReader,
     QReader,
     Replacement,
@@ -259,7 +258,8 @@ class _Recorder:
             if zones is not None:
                 self.columns["zones"].append(zones_now(zones, self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None
-            reading = self.reader.step(_tensors(policy, obs), starts, masks)
+            tensors: Any = policy.obs_to_tensor(obs)[0]
+            reading = self.reader.step(tensors, starts, masks)
             self.columns["actions"].append(reading.actions)
             for name, value in reading._asdict().items():
                 if isinstance(value, th.Tensor):
@@ -310,12 +310,6 @@ class _Recorder:
         )
 
 
-def _tensors(policy: OurPolicy, obs: Any) -> dict[str, th.Tensor]:
-    tensors, _ = policy.obs_to_tensor(obs)
-    assert isinstance(tensors, dict)
-    return tensors
-
-
 def _active(obs: Any, n_agents: int) -> Bools:
     """Return whether the row's agent takes part, (B,)."""
     if ACTIVE_KEY not in obs:
@@ -330,7 +324,8 @@ def _last_values(reader: PolicyReader | QReader, dones: Bools, infos: list[dict[
     if len(rows):
         last = [infos[row][TERMINAL_OBSERVATION] for row in rows]
         obs = {key: np.stack([observation[key] for observation in last]) for key in last[0]}
-        values[rows] = reader.last_values(_tensors(reader.policy, obs), rows).cpu().numpy()
+        tensors: Any = reader.policy.obs_to_tensor(obs)[0]
+        values[rows] = reader.last_values(tensors, rows).cpu().numpy()
     return values
 
 

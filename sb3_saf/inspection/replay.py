@@ -30,7 +30,7 @@ from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, rec
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY, EPISODE_START_KEY, OBS_KEY, TeamSpaces
-from sb3_saf.teams.vec_env import require_n_agents
+from sb3_saf.teams.vec_env import layers, require_n_agents
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
 MAX_STEPS: Final = 2000
@@ -43,20 +43,11 @@ Packed = dict[str, Any]
 
 
 class _Episode(NamedTuple):
-    """
-    One episode of one game.
-
-    :param actions: (T, N, ...)
-    :param rewards: (T,) of the team
-    :param observations: (T, N, ...) own observations
-    :param frames: pictures, if the game draws them
-    :param arrays: further data of the page by name
-    :param of_team: whether values are the team's
-    """
+    """One episode of one game: T steps of N agents, pictures if the game draws them, and further data of the page."""
 
     actions: npt.NDArray[Any]
     rewards: npt.NDArray[np.float64]
-    observations: npt.NDArray[Any] | None
+    observations: npt.NDArray[Any]
     frames: list[Picture]
     arrays: dict[str, Packed | None]
     of_team: bool = False
@@ -76,7 +67,7 @@ def replay(
 
     Models of SAF, MAPPO, IPPO and QPLEX are shown with action probabilities, pool, knowledge source and values, as far
     as they have them. Exported actors are shown with own observations and actions. HECOGrid is drawn from its state,
-    other games from rendered pictures.
+    other games from pictures, one before each step: the last state has none, since games begin again at once.
 
     :param model: a trained model, its policy, an exported :class:`~sb3_saf.Actor`, or several by name, shown side by
         side
@@ -123,8 +114,8 @@ def replay(
                 scenes, grid = _played_again(episode.actions, env, game, seed)
                 run |= scenes
             run["of_team"] = episode.of_team
-            if atlas is not None and episode.observations is not None:
-                episode.arrays["views"] = _packed(episode.observations, "u1")
+            if atlas is not None:
+                run["views"] = _packed(episode.observations, "u1")
             runs.append(run | {key: value for key, value in episode.arrays.items() if value is not None})
     n_actions = int(env.action_space.n) if isinstance(env.action_space, spaces.Discrete) else 0
     names = env.get_attr("action_names", indices=[0])[0] if env.has_attr("action_names") else range(n_actions)
@@ -181,12 +172,13 @@ def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
     def share(values: npt.NDArray[Any] | None, columns: slice | int) -> Packed | None:
         return None if values is None else _packed(values[steps, columns] * _SHARE, "u2", 1 / _SHARE)
 
+    assert recording.observations is not None
     zero = recording.values_without.get("zero")
     actions, rewards = recording.actions[steps, rows], recording.rewards[steps, rows]
     return _Episode(
         actions,
         (rewards[:, 0] if recording.of_team else rewards.sum(axis=1)).astype(np.float64),
-        None if recording.observations is None else recording.observations[steps, rows],
+        recording.observations[steps, rows],
         recording.pictures[steps] if game == 0 else [],
         {
             "actions": _packed(actions, "u1") if recording.actions.ndim == 2 else None,
@@ -248,10 +240,8 @@ def _played_again(actions: npt.NDArray[Any], env: VecEnv, game: int, seed: int) 
     """
     env.seed(seed)
     replica: Any = env.env_method("replica", indices=[game * require_n_agents(env)])[0]
-    layer: Any = env
-    while not hasattr(layer, "seeded_with"):
-        layer = layer.venv
-    replica.reset(seed=int(layer.seeded_with[game]))
+    seeds: Any = next(layer.seeded_with for layer in layers(env) if hasattr(layer, "seeded_with"))
+    replica.reset(seed=int(seeds[game]))
     scenes = [replica.grid_scene()]
     for of_agents in actions:
         replica.step(dict(zip(replica.possible_agents, of_agents.tolist(), strict=True)))

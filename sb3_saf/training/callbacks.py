@@ -42,40 +42,36 @@ class SeededEvalCallback(TeamEvalCallback):
         self._seed = evaluation_seed(seed)
         self._settings = settings
         self.standing: Standing | None = None
-        self._n_evaluations = 0
+        #: Evaluations of the run so far.
+        self.n_evaluations = 0
         self._evaluated_at = -1
-        #: Seconds of all evaluations of this process.
-        self.seconds = 0.0
 
     def _on_step(self) -> bool:
         return self.num_timesteps >= self.locals["total_timesteps"] or super()._on_step()
 
     def _evaluate(self) -> bool:
-        began = time.perf_counter()
-        self._n_evaluations += 1
-        self._evaluated_at = self._game_steps()
-        with own_randomness(self._seed + self._n_evaluations, self.model.device):
-            go_on = super()._evaluate()
-        self.seconds += time.perf_counter() - began
-        return go_on
+        self.n_evaluations += 1
+        self._evaluated_at = team_steps(self.model)
+        with own_randomness(self._seed + self.n_evaluations, self.model.device):
+            return super()._evaluate()
 
     def _log(self, result: EvaluationResult) -> None:
         settings = self._settings
-        self.standing = standing(settings.environment, settings.env_kwargs, result.scores, self._game_steps())
+        self.standing = standing(settings.environment, settings.env_kwargs, result.scores, team_steps(self.model))
         if self.standing is not None and self.standing.share is not None:
             self.logger.record("eval/share_of_published", self.standing.share)
         super()._log(result)
 
     def checkpoint_state(self) -> dict[str, int]:
         """Return the counters, for exact resume."""
-        return {"n_evaluations": self._n_evaluations, "evaluated_at": self._evaluated_at}
+        return {"n_evaluations": self.n_evaluations, "evaluated_at": self._evaluated_at}
 
     def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
         """Restore the counters."""
-        self._n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
+        self.n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
 
     def _on_training_end(self) -> None:
-        if self.eval_freq > 0 and self._evaluated_at != self._game_steps():
+        if self.eval_freq > 0 and self._evaluated_at != team_steps(self.model):
             self._evaluate()
 
 
@@ -91,8 +87,9 @@ class TrainingClock(BaseCallback):
         self.every_game_steps = every_game_steps
         self._points: list[tuple[float, float]] = []
         self._started_at = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-        self._before = (0.0, 0.0)
-        self._started = (0.0, 0.0)
+        #: Processor and wall seconds of earlier parts of the training, and both clocks at the begin of this part.
+        self._spent = np.zeros(2)
+        self._begin: npt.NDArray[np.float64] | None = None
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
@@ -104,44 +101,45 @@ class TrainingClock(BaseCallback):
         processor, wall = self._seconds()
         return {
             "started": self._started_at,
-            "wall_seconds": wall,
-            "processor_seconds": processor,
+            "wall_seconds": float(wall),
+            "processor_seconds": float(processor),
             "threads": th.get_num_threads(),
             "device": str(self.model.device),
         }
 
+    def _seconds(self) -> npt.NDArray[np.float64]:
+        return self._spent if self._begin is None else self._spent + _clocks() - self._begin
+
+    def _add_point(self) -> None:
+        self._points.append((team_steps(self.model), float(self._seconds()[0])))
+
     def _on_training_start(self) -> None:
-        self._started = (time.process_time(), time.perf_counter())
+        self._begin = _clocks()
 
     def _on_rollout_start(self) -> None:
         # Rollouts of off-policy algorithms are a few steps each.
         if not self._points or team_steps(self.model) >= self._points[-1][0] + self.every_game_steps:
-            self._points.append((team_steps(self.model), self._seconds()[0]))
+            self._add_point()
 
     def _on_step(self) -> bool:
         return True
 
     def _on_training_end(self) -> None:
-        self._before, self._started = self._seconds(), (0.0, 0.0)
-        self._points.append((team_steps(self.model), self._before[0]))
-
-    def _seconds(self) -> tuple[float, float]:
-        """Return processor seconds and wall seconds of all parts of the training."""
-        if self._started == (0.0, 0.0):
-            return self._before
-        now = (time.process_time(), time.perf_counter())
-        processor, wall = (b + n - s for b, n, s in zip(self._before, now, self._started, strict=True))
-        return processor, wall
+        self._spent, self._begin = self._seconds(), None
+        self._add_point()
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Return the points, the time until now, and when training began, as plain data."""
-        return {"points": self.points, "seconds": np.array(self._seconds()), "started_at": self._started_at}
+        return {"points": self.points, "seconds": self._seconds(), "started_at": self._started_at}
 
     def load_checkpoint_state(self, state: dict[str, Any]) -> None:
         """Restore a state of :meth:`checkpoint_state`."""
         self._points = [(float(steps), float(seconds)) for steps, seconds in state["points"]]
-        self._before = (float(state["seconds"][0]), float(state["seconds"][1]))
-        self._started_at = str(state["started_at"])
+        self._spent, self._started_at = state["seconds"], state["started_at"]
+
+
+def _clocks() -> npt.NDArray[np.float64]:
+    return np.array([time.process_time(), time.perf_counter()])
 
 
 class GameStepsProgressBar(ProgressBarCallback):

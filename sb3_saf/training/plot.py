@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
-from sb3_saf.training.commands import CommandError, OneLineParser, run_command, user_errors
+from sb3_saf.training.commands import OneLineParser, require, run_command, user_errors
 from sb3_saf.training.folders import RUN_FILE, Run, Source, python_command
 from sb3_saf.training.settings import Settings, load_settings
 
@@ -55,11 +55,9 @@ def make_parser() -> argparse.ArgumentParser:
 def plot(arguments: Sequence[str] | None = None) -> None:
     """Draw a figure and print its path."""
     options = make_parser().parse_args(arguments)
-    try:
-        with user_errors():
-            figure = _draw(options)
-    except ModuleNotFoundError as error:
-        raise CommandError(f"figures need {error.name}: pip install 'sb3-saf[render,zoo]'") from None
+    require("pandas", "matplotlib", *(["rliable"] if options.kind == "aggregate" else []))
+    with user_errors():
+        figure = _draw(options)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     with user_errors():  # for invalid file formats
         figure.savefig(options.output)

@@ -26,7 +26,7 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.export.weights import read_weights
 from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.teams.checks import evaluation_seed
-from sb3_saf.teams.files import atomic_file
+from sb3_saf.teams.files import atomic_file, remove_leftovers
 from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback, TrainingClock
 from sb3_saf.training.folders import CHECKPOINTS, CURVE_POINTS, MONITOR, finish_run, write_curve
 from sb3_saf.training.settings import Settings
@@ -53,6 +53,7 @@ class RunOptions:
     :param eval_episodes: team episodes per evaluation
     :param n_eval_envs: parallel games for evaluation
     :param eval_settings: settings of the evaluation games; None for those of training
+    :param after_evaluation: called after every evaluation; training ends if it returns False
     :param deterministic_eval: whether evaluation takes the most likely actions; value-based algorithms always do
     :param save_freq: game steps between saved models
     :param inspect_freq: game steps between inspections of the policy, only with ``tensorboard_log`` (None: 10 per run)
@@ -74,6 +75,7 @@ class RunOptions:
     eval_episodes: int = 32
     n_eval_envs: int = 32
     eval_settings: Settings | None = None
+    after_evaluation: BaseCallback | None = None
     deterministic_eval: bool = False
     save_freq: int = 0
     inspect_freq: int | None = None
@@ -158,6 +160,7 @@ class Training:
         if self.folder is not None:
             if (self.folder / MONITOR).is_file():  # users may have moved or compressed it
                 write_curve(self.folder, self.clock.points, self.settings.n_envs)
+            remove_leftovers(self.folder)
             finish_run(self.folder, **self.clock.cost())
             shutil.rmtree(self.folder / CHECKPOINTS, ignore_errors=True)
         return self.model
@@ -196,12 +199,15 @@ class Training:
         return games
 
     def _make_model(self) -> BaseAlgorithm:
-        options = self.options
-        if options.tensorboard_log is not None:
-            options.tensorboard_log.mkdir(parents=True, exist_ok=True)
-        log = None if options.tensorboard_log is None else str(options.tensorboard_log)
+        options, log = self.options, self.options.tensorboard_log
+        if log is not None:
+            log.mkdir(parents=True, exist_ok=True)
         model = self.settings.make_model(
-            self.games, self.seed, device=options.device, tensorboard_log=log, verbose=options.verbose
+            self.games,
+            self.seed,
+            device=options.device,
+            tensorboard_log=None if log is None else str(log),
+            verbose=options.verbose,
         )
         if options.initial_model is not None:
             load_parameters(model, options.initial_model)
@@ -226,18 +232,17 @@ class Training:
         return callbacks
 
     def _evaluation(self, eval_freq: int) -> SeededEvalCallback:
-        options = self.options
-        settings = options.eval_settings or self.settings
+        options, settings = self.options, self.options.eval_settings or self.settings
         if settings.n_agents != self.settings.n_agents:
             raise ValueError(
                 f"evaluation needs the {self.settings.n_agents} agents of training, got n_agents={settings.n_agents}"
             )
-        n_envs = min(options.n_eval_envs, options.eval_episodes)
         folder = None if self.folder is None else str(self.folder)
         return SeededEvalCallback(
-            self._games(settings, evaluation=True, n_envs=n_envs),
+            self._games(settings, evaluation=True, n_envs=min(options.n_eval_envs, options.eval_episodes)),
             seed=self.seed,
             settings=settings,
+            callback_after_eval=options.after_evaluation,
             best_model_save_path=folder,
             log_path=folder,
             n_eval_episodes=options.eval_episodes,
@@ -253,32 +258,22 @@ class Training:
         # Other games may not support pictures.
         render_mode = "rgb_array" if suite is not None and suite.is_drawn_from_state else None
         games = self._games(settings, evaluation=True, n_envs=INSPECTED_EPISODES, render_mode=render_mode)
-        return InspectionCallback(
-            games,
-            every_game_steps,
-            INSPECTED_EPISODES,
-            seed=evaluation_seed(self.seed),
-            hparams={
-                "task": settings.env_id,
-                "level": _level(settings),
-                "seed": self.seed,
-                "method": settings.algo,
-                "size": settings.size,
-            },
-        )
+        of_level = (() if suite is None else suite.level_params) or tuple(settings.env_kwargs)
+        hparams = {
+            "task": settings.env_id,
+            "level": ", ".join(f"{name} {settings.env_kwargs[name]}" for name in of_level),
+            "seed": self.seed,
+            "method": settings.algo,
+            "size": settings.size,
+        }
+        seed = evaluation_seed(self.seed)
+        return InspectionCallback(games, every_game_steps, INSPECTED_EPISODES, seed=seed, hparams=hparams)
 
     def _every(self, frequency: int | None, times_per_run: int) -> int:
         """Return the game steps between two events; 0 for never."""
         if frequency is None:
             return max(1, self.settings.game_steps // times_per_run)
         return max(0, frequency)
-
-
-def _level(settings: Settings) -> str:
-    """Return the parameters of the games as text; only those that define levels if the suite names them."""
-    suite = settings.environment.suite
-    names = (() if suite is None else suite.level_params) or tuple(settings.env_kwargs)
-    return ", ".join(f"{name} {settings.env_kwargs[name]}" for name in names)
 
 
 def load_parameters(model: BaseAlgorithm, path: Path) -> None:

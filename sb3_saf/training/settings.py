@@ -26,7 +26,7 @@ from sb3_saf.registration import COMMANDS, DECLARATIONS
 from sb3_saf.suites.registry import HOME, TeamEnvironment, find_environment, suites
 from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
 from sb3_saf.training.values import algorithm_arguments, convert, policy_arguments
-from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows, wraps_games
+from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows
 from sb3_saf.training.yaml_files import DEFAULT, SIZES, Size, entry_of, merge, read_settings
 
 #: Methods by their names on the command line, in log folders and YAML files.
@@ -101,11 +101,6 @@ class Settings:
         return find_algorithm(self.algo, self.wrapping.get("algorithm"))
 
     @property
-    def task(self) -> str:
-        """The HECOGrid task's name, or the environment's."""
-        return self.env_id.removesuffix("-v0")
-
-    @property
     def environment(self) -> TeamEnvironment:
         """Environment that makes the games."""
         return find_environment(self.env_id)
@@ -140,7 +135,7 @@ class Settings:
         suite = self.environment.suite
         if evaluation and suite is not None:
             params = {key: value for key, value in params.items() if key not in suite.training_params}
-        if wraps_games(self.wrapping):
+        if {"env_wrapper", "frame_stack"} & self.wrapping.keys():  # of single games, not of compiled ones
             source, params = partial(self.make_game, render_mode), {}
         env = make_team_env(
             source,
@@ -182,7 +177,11 @@ class Settings:
         :param seed: the run's seed
         :raises ValueError: if the algorithm rejects its arguments
         """
-        self._check_masks(env)
+        if issubclass(self.spec.algorithm, MaskablePPO) and not is_masking_supported(env):
+            raise ValueError(
+                f"MaskablePPO is for games that tell which actions are legal; {self.env_id} has no action masks: leave "
+                "algorithm:MaskablePPO out"
+            )
         try:
             return self.spec.algorithm(
                 self.spec.policy,
@@ -195,13 +194,6 @@ class Settings:
             )
         except (AssertionError, TypeError) as error:  # SB3's checks of its arguments
             raise ValueError(str(error)) from error
-
-    def _check_masks(self, env: CentralizedValueWrapper) -> None:
-        if issubclass(self.spec.algorithm, MaskablePPO) and not is_masking_supported(env):
-            raise ValueError(
-                f"MaskablePPO is for games that tell which actions are legal; {self.env_id} has no action masks: leave "
-                "algorithm:MaskablePPO out"
-            )
 
     def as_dict(self) -> dict[str, Any]:
         """Return all settings as plain data, for a file with the results."""
@@ -364,15 +356,3 @@ def _build(
     return Settings(
         algo, environment.id, size, n_agents, env_kwargs, time_limit, n_envs, game_steps, hyperparams, plain, wrapping
     )
-
-
-__all__ = [
-    "ALGOS",
-    "SIZES",
-    "AlgorithmSpec",
-    "Settings",
-    "Size",
-    "find_algorithm",
-    "load_settings",
-    "saved_settings",
-]

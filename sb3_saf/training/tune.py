@@ -9,21 +9,23 @@ import socket
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import optuna
+import psutil
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.study import MaxTrialsCallback
 from optuna.trial import TrialState
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf.evaluation import EvaluationResult
+from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.teams.checks import MAX_SEED
 from sb3_saf.training.callbacks import SeededEvalCallback
-from sb3_saf.training.run import RunOptions, train
-from sb3_saf.training.settings import AlgorithmSpec, Settings
+from sb3_saf.training.run import RunOptions, Training
+from sb3_saf.training.settings import Settings
 from sb3_saf.training.values import algorithm_arguments, policy_arguments
 
 #: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.
@@ -106,23 +108,20 @@ def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
 # --- trials -----------------------------------------------------------------------------------------------------------
 
 
-class TrialCallback(SeededEvalCallback):
-    """Evaluation callback of a trial: reports every evaluation, and stops the trial if the pruner does."""
+class TrialReport(BaseCallback):
+    """Report every evaluation to a trial, and stop training if the pruner stops the trial."""
 
-    def __init__(self, *args: Any, trial: optuna.Trial, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, trial: optuna.Trial) -> None:
+        super().__init__()
         self.trial = trial
         self.is_pruned = False
 
-    def _react(self, result: EvaluationResult) -> bool:
-        go_on = super()._react(result)
-        self.trial.report(result.mean, self._n_evaluations)
+    def _on_step(self) -> bool:
+        evaluation = self.parent
+        assert isinstance(evaluation, SeededEvalCallback)
+        self.trial.report(float(evaluation.last_mean_reward), evaluation.n_evaluations)
         self.is_pruned = self.trial.should_prune()
-        return go_on and not self.is_pruned
-
-    def _on_training_end(self) -> None:
-        if not self.is_pruned:
-            super()._on_training_end()
+        return not self.is_pruned
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class Tuning:
     :param study_name: None for a name chosen by Optuna
     :param n_trials: trials of this process
     :param max_total_trials: trials of all processes together, instead of ``n_trials``
-    :param log_path: folder for the evaluations and the best model of every trial; None for none
+    :param log_path: folder for evaluations, models and monitor of every trial; None for none
     """
 
     seed: int
@@ -199,20 +198,8 @@ def _fail_dead_trials(study: optuna.Study) -> None:
     """End the trials of killed processes of this machine, which would stay RUNNING and count for ever."""
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         host, process = trial.user_attrs.get(_PROCESS, ("", 0))
-        if host == socket.gethostname() and not _is_running(process):
+        if host == socket.gethostname() and not psutil.pid_exists(process):
             study.tell(trial.number, state=TrialState.FAIL)
-
-
-def _is_running(process: int) -> bool:
-    if os.name != "posix":  # elsewhere the question itself would end the process
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # another user's
-        return True
-    return True
 
 
 def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
@@ -223,31 +210,23 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
     """
     trial.set_user_attr(_PROCESS, (socket.gethostname(), os.getpid()))
     seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
-    options = tuning.options
-    folder = None if tuning.log_path is None else str(tuning.log_path / f"trial_{trial.number}")
-    n_envs = min(options.n_eval_envs, options.eval_episodes)
-    games = (options.eval_settings or settings).make_env(seed, evaluation=True, n_envs=n_envs)
-    with closing(games):
-        evaluation = TrialCallback(
-            games,
-            trial=trial,
-            seed=seed,
-            n_eval_episodes=options.eval_episodes,
-            eval_freq=max(1, settings.game_steps // tuning.n_evaluations),
-            deterministic=options.deterministic_eval or not settings.spec.draws_actions,
-            best_model_save_path=folder,
-            log_path=folder,
-            verbose=0,
-        )
-        try:
-            train(settings, seed, None, options, [evaluation])
-        except (AssertionError, ValueError) as error:  # sampled settings may lead to NaN
-            raise optuna.TrialPruned(str(error)) from error
-    if evaluation.is_pruned:
-        raise optuna.TrialPruned
-    value = float(evaluation.last_mean_reward)
-    if not math.isfinite(value):
-        raise optuna.TrialPruned(f"the trial ended without a finite team return: {value}")
+    folder = None if tuning.log_path is None else tuning.log_path / f"trial_{trial.number}"
+    report = TrialReport(trial)
+    options = replace(
+        tuning.options,
+        eval_freq=max(1, settings.game_steps // tuning.n_evaluations),
+        after_evaluation=report,
+        checkpoint_freq=0,
+    )
+    try:
+        with closing(Training(settings, seed, folder, options)) as training:
+            training.learn()
+    except (AssertionError, ValueError) as error:  # sampled settings may lead to NaN
+        raise optuna.TrialPruned(str(error)) from error
+    assert training.evaluation is not None
+    value = float(training.evaluation.last_mean_reward)
+    if report.is_pruned or not math.isfinite(value):
+        raise optuna.TrialPruned(f"the trial ended with a team return of {value}")
     return value
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_
 import msgspec
 import torch as th
 from msgspec import Meta
+from stable_baselines3.common import vec_env
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
@@ -118,14 +119,6 @@ def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
 
 
 def _init_hints(owner: type, without: set[str]) -> dict[str, Any]:
-    init = vars(owner).get("__init__") or owner.__init__  # type: ignore[misc]
-    hints = {}
-    for name, parameter in inspect.signature(init).parameters.items():
-        if name in without:
-            continue
-        hints[name] = Any
-        if parameter.annotation is not inspect.Parameter.empty:
-            # One by one: SB3's type of environments, never used in settings, has an unresolvable forward reference.
-            one = types.SimpleNamespace(__annotations__={name: parameter.annotation})
-            hints[name] = get_type_hints(one, init.__globals__)[name]
-    return hints
+    init = owner.__init__  # type: ignore[misc]
+    hints = get_type_hints(init, localns=vars(vec_env) | {"vec_env": vec_env})  # of SB3's type of environments
+    return {name: hints.get(name, Any) for name in inspect.signature(init).parameters if name not in without}

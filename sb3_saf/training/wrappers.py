@@ -10,6 +10,7 @@ the monitor and the joint observation, where each row is one agent's own observa
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,8 +47,13 @@ WRAPPER_KEYS: Final[dict[str, Any]] = {
 NORMALIZATION_FILE: Final = "vecnormalize.npz"
 
 
-def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
-    """Import the objects of a key in RL-Zoo3's format: a dotted name, a mapping of it to arguments, or a list."""
+def _named(wrapping: Mapping[str, Any], key: str) -> Iterator[tuple[Any, Callable[..., Any]]]:
+    """
+    Import the objects of a key in RL-Zoo3's format: a dotted name, a mapping of it to arguments, or a list.
+
+    :return: pairs of an object and a function that calls it, with the arguments of the file behind the given ones
+    """
+    value = wrapping.get(key)
     for item in value if isinstance(value, list) else [value] if value is not None else []:
         name, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
         module, _, function = name.rpartition(".") if isinstance(name, str) else ("", "", "")
@@ -55,16 +61,22 @@ def named(value: object, key: str) -> Iterator[tuple[Callable[..., Any], dict[st
             raise ValueError(
                 f"{key} must be a dotted name such as package.Class, {{name: {{key: value}}}}, got {item!r}"
             )
-        yield import_by_name(module, function, key), dict(arguments or {})
+        found = import_by_name(module, function, key)
+        yield found, partial(_called, key, found, dict(arguments or {}))
+
+
+def _called(key: str, function: Callable[..., Any], arguments: Mapping[str, Any], *given: Any) -> Any:
+    """Call a function; its errors name the key of the settings."""
+    try:
+        return function(*given, **arguments)
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ValueError(f"{key}: {error}") from error
 
 
 def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
     """Wrap one game, a ParallelEnv, by ``env_wrapper`` and ``frame_stack``."""
-    for wrapper, arguments in named(wrapping.get("env_wrapper"), "env_wrapper"):
-        try:
-            game = wrapper(game, **arguments)
-        except TypeError as error:
-            raise ValueError(f"env_wrapper: {error}") from error
+    for wrapper, wrap in _named(wrapping, "env_wrapper"):
+        game = wrap(game)
         if not isinstance(game, ParallelEnv):
             raise ValueError(f"env_wrapper must give a PettingZoo ParallelEnv, {wrapper} gave a {type(game).__name__}")
     if "frame_stack" in wrapping:
@@ -74,11 +86,6 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
             game = EqualSpaces(game)  # gives masks in infos, beside vectors that can be stacked
         game = supersuit.frame_stack_v1(game, wrapping["frame_stack"])
     return game
-
-
-def wraps_games(wrapping: Mapping[str, Any]) -> bool:
-    """Return whether single games are wrapped, which HECOGrid's compiled core does not support."""
-    return "env_wrapper" in wrapping or "frame_stack" in wrapping
 
 
 def wrap_rows(
@@ -99,19 +106,16 @@ def wrap_rows(
     while not isinstance(rows, (TeamMonitor, SharedReward)):
         assert isinstance(rows, VecEnvWrapper), "make_team_env monitors its games"
         rows = rows.venv
-    for wrapper, arguments in named(wrapping.get("vec_env_wrapper"), "vec_env_wrapper"):
+    for wrapper, wrap in _named(wrapping, "vec_env_wrapper"):
         if not isinstance(wrapper, type) or not issubclass(wrapper, VecEnvWrapper):
             raise ValueError(f"vec_env_wrapper must be a class of SB3's VecEnvWrapper, got {wrapper}")
-        try:
-            rows = wrapper(rows, **arguments)
-        except (TypeError, AssertionError) as error:
-            raise ValueError(f"vec_env_wrapper: {error}") from error
+        rows = wrap(rows)
     if normalize is not False:
         rows = _normalized(rows, {} if normalize is True else dict(normalize), gamma, is_training)
     return CentralizedValueWrapper(rows, time_limit=env.time_limit)
 
 
-def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_training: bool) -> VecNormalize:
+def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_training: bool) -> VecEnv:
     """Add VecNormalize; pictures and tile codes are not normalised, since encoders scale them."""
     space = rows.observation_space
     own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
@@ -121,10 +125,7 @@ def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_traini
         arguments["norm_obs_keys"] = [OBS_KEY]
     if not is_training:
         arguments |= {"training": False, "norm_reward": False}
-    try:
-        return VecNormalize(rows, **arguments)
-    except (TypeError, ValueError, AssertionError) as error:
-        raise ValueError(f"normalize: {error}") from error
+    return _called("normalize", VecNormalize, arguments, rows)
 
 
 def stages_of(wrapping: Mapping[str, Any], game_steps: int) -> list[Stage]:
@@ -155,14 +156,11 @@ def stages_of(wrapping: Mapping[str, Any], game_steps: int) -> list[Stage]:
 
 def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
     """Make the callbacks of the key ``callback``."""
-    callbacks = []
-    for kind, arguments in named(wrapping.get("callback"), "callback"):
+    callbacks: list[BaseCallback] = []
+    for kind, make in _named(wrapping, "callback"):
         if not isinstance(kind, type) or not issubclass(kind, BaseCallback):
             raise ValueError(f"callback must name classes of SB3's BaseCallback, got {kind}")
-        try:
-            callbacks.append(kind(**arguments))
-        except (TypeError, AssertionError) as error:
-            raise ValueError(f"callback: {error}") from error
+        callbacks.append(make())
     return callbacks
 
 
