@@ -299,7 +299,7 @@ def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: W
     seen_by_copy.append(_bytes_of(copy.reset()[0]))
     for step, (one, other) in enumerate(zip(seen, seen_by_copy, strict=True), 1):
         if one != other:
-            return f"{step} steps later a copy differs from the game"
+            return f"{step} steps later a copy differs from the game, as where reset(seed=None) makes a new generator"
     return None
 
 
