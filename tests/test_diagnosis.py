@@ -11,8 +11,10 @@ import pytest
 
 from benchmarks import diagnosis
 from hecogrid_envs.constants import Command
-from sb3_saf.experiments.grid import RunConfig
+from sb3_saf.experiments.definitions import Level
+from sb3_saf.experiments.grid import Cell, RunConfig
 from sb3_saf.experiments.results import Results
+from sb3_saf.training.folders import write_run
 from sb3_saf.training.settings import load_settings
 
 #: A network shape other than the zoo's: the diagnosis must read the trained shape from the folder.
@@ -26,6 +28,8 @@ def save_team(folder: Path, method: str, seed: int) -> None:
     cell = folder / "cells" / "TeamSupport-c2-h3" / method / f"seed-{seed}"
     cell.mkdir(parents=True)
     model.save(cell / "model.zip")
+    description = RunConfig("small", OVERRIDES).describe(Cell(method, "TeamSupport-v0", Level.of(**level), seed))
+    write_run(cell, **description, command="")
 
 
 def test_it_looks_into_every_trained_team(

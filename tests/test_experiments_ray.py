@@ -224,5 +224,5 @@ def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys:
     monkeypatch.setitem(sys.modules, "ray", None)
     assert failed(["run", "joint", "--size", "smoke", "--ray", "-f", str(tmp_path)], capsys, cli.main) == (
         "python -m sb3_saf.experiments run: error: --ray needs Ray, which is not installed: pip install "
-        "-e '.[ray]', or leave --ray out to run in processes of this machine"
+        "'sb3-saf[ray]', or leave --ray out to run in processes of this machine"
     )

@@ -516,7 +516,7 @@ def test_a_cell_killed_after_its_model_was_saved_does_not_train_anew(tmp_path: P
         with pytest.raises(RuntimeError, match="struck"):
             run_job(killed)
     assert (killed / "result" / "model.zip").exists()
-    assert attempt(killed) < n_steps / 2
+    assert attempt(killed) <= n_steps / 2
     assert what_counts(whole / "result") == what_counts(killed / "result")
 
 

@@ -92,10 +92,10 @@ def check_places(state: Any) -> None:
 def check_views(env: HECOGridEnv, params: dict[str, Any], observations: dict[str, Any]) -> None:
     """
     Views equal those drawn from the state alone, which does not store the order of arrival in a cell; with the released
-    rules, agents' colours are those of the previous step.
+    rules, agents' colours are those of the previous step, and actions that are shown are not part of the state.
     """
     state = env.get_state()
-    if params.get("rules") == "released":
+    if params.get("rules") == "released" or params.get("agent_colours") == "action":
         return
     if len({tuple(place) for place in state["agent_pos"].tolist()}) < len(state["agent_pos"]):
         event("a shared cell: not compared")
