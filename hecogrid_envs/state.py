@@ -20,7 +20,8 @@ class StateMapping(TypedDict):
     State of one game. W x H cells, N agents; planes are indexed ``[x, y]``.
 
     ``walls`` bool (W, H), ``treasures`` uint8 (W, H) with 0 none, 1 available, 2 collected, ``keys`` bool (W, H),
-    ``agent_pos`` int (N, 2) as x, y, ``agent_dir`` int (N,), ``agent_has_key`` bool (N,).
+    ``agent_pos`` int (N, 2) as x, y, ``agent_dir`` int (N,), ``agent_has_key`` bool (N,). Last actions, which
+    ``agent_colours="action"`` shows, are not part of it: views of a state that was set show none.
     """
 
     walls: Bools

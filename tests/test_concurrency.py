@@ -6,6 +6,7 @@ import copy
 import gc
 import multiprocessing
 import pickle
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -13,6 +14,7 @@ from typing import Any, Final
 
 import numba
 import numpy as np
+import psutil
 import pytest
 import torch as th
 from stable_baselines3 import PPO
@@ -104,6 +106,26 @@ def test_games_in_worker_processes_refuse_copies_and_play_on(copied: Callable[[A
     gc.collect()
     venv.step(np.zeros(venv.num_envs, dtype=np.int64))
     venv.close()
+
+
+def test_games_in_worker_processes_end_with_a_killed_owner() -> None:
+    def own(pids: Any) -> None:
+        envs = [sb3_saf.make_team_env(LazyEnv, 2, seed=seed, n_cpus=2) for seed in (0, 1)]
+        pids.put([child.pid for child in multiprocessing.active_children()])
+        time.sleep(600)
+        del envs
+
+    context = multiprocessing.get_context("fork")
+    pids = context.SimpleQueue()
+    owner = context.Process(target=own, args=(pids,))
+    owner.start()
+    workers = [psutil.Process(pid) for pid in pids.get()]
+    owner.kill()
+    owner.join()
+    _, left = psutil.wait_procs(workers, timeout=10)
+    for worker in left:
+        worker.kill()
+    assert len(workers) == 4 and not left
 
 
 @MAKERS

@@ -51,6 +51,7 @@ class GameProcess(gymnasium.Env[Any, Any]):
     def __init__(self, make_games: Callable[[], TeamConcatVecEnv]) -> None:
         self._make_games = make_games
         self._games: TeamConcatVecEnv | None = None
+        threading.Thread(target=_end_with_owner, daemon=True).start()
 
     def run(self, payload: bytes) -> bytes:
         """Call a method of the games: pickled name and arguments to pickled result or :class:`Failure`."""
@@ -166,6 +167,18 @@ class _Watch(threading.Thread):
             f"worker process {number} ({self._names[number]}, pid {process.pid}) ended with exit code {code}"
         )
         _kill(self._processes)
+
+
+def _end_with_owner() -> None:
+    """
+    End this process when the one that started it has ended, killed ones included.
+
+    Pipes would not report it: processes that were forked later hold copies of them. They end first, the last one first.
+    """
+    owner = multiprocessing.parent_process()
+    assert owner is not None
+    owner.join()
+    os._exit(1)
 
 
 def _named(group: range) -> str:
