@@ -25,6 +25,7 @@ import json
 import multiprocessing as mp
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -322,6 +323,8 @@ def kill_command(name: str, kills: int, seed: int) -> tuple[int, int]:
             raise RuntimeError(f"{name} failed with exit code {process.returncode}")
         print(f"{name}, undisturbed: {begun - began:.1f} s until it writes, {time.monotonic() - begun:.1f} s after it")
         seconds, result = time.monotonic() - begun, _results(whole)
+        if not result:
+            raise RuntimeError(f"{name} left no finished run in {whole}")
         while done < kills:
             process, folder = _start_command(name, Path(root, "killed"))
             when = rng.uniform(0, seconds)
@@ -367,19 +370,29 @@ def _wait_for_children(session: int, seconds: float = 30) -> None:
 
 
 def _results(folder: Path) -> dict[str, Any]:
-    """Return weights, evaluations, episodes and test returns of a command, by file."""
+    """
+    Return weights, evaluations, episodes and test returns of all finished runs in a folder, by file.
+
+    A command that was killed before its first checkpoint, or after its end, begins another run, in another folder with
+    the next number. Numbers are left out of the names, so that all of these runs must be equal.
+    """
     results: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
-        name = str(path.relative_to(folder))
+        content: Any = None
         if path.suffix == ".zip":
-            results[name] = {key: value.numpy().tobytes() for key, value in read_weights(path).items()}
+            content = {key: value.numpy().tobytes() for key, value in read_weights(path).items()}
         elif path.name == "evaluations.npz":
             with np.load(path) as arrays:
-                results[name] = {key: arrays[key].tobytes() for key in arrays.files}
+                content = {key: arrays[key].tobytes() for key in arrays.files}
         elif path.name == "monitor.csv":
-            results[name] = _episodes(path.parent)
+            content = _episodes(path.parent)
         elif path.parent.name == "tests":
-            results[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "wall_seconds"}
+            content = json.loads(path.read_text())
+            for play in content["plays"]:
+                del play["wall_seconds"]
+        if content is not None and any((parent / "finished.json").exists() for parent in path.parents):
+            name = re.sub(r"_\d+(?=/)", "", str(path.relative_to(folder)))
+            results[name] = content if results.get(name, content) == content else "runs differ"
     return results
 
 
