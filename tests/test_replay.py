@@ -119,10 +119,12 @@ def test_exported_actors_and_models_side_by_side(kind: str, model: Any, tmp_path
     assert "<b>actor" not in page.read_text()
 
 
-def test_other_games_are_shown_by_their_pictures(tmp_path: Path) -> None:
+def test_other_games_are_shown_by_their_pictures_and_names(tmp_path: Path) -> None:
     env = sb3_saf.make_team_env(CounterEnv, n_envs=1, seed=0, render_mode="rgb_array")
     other = PPO("MAPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
-    (run,) = data_of(replay(other, env, tmp_path / "page.html"))["runs"]
+    data = data_of(replay(other, env, tmp_path / "page.html"))
+    (run,) = data["runs"]
+    assert data["agents"] == CounterEnv().possible_agents
     assert len(run["frames"]) == run["steps"] and run["frames"][0].startswith("data:image/png;base64,")
 
 

@@ -358,6 +358,7 @@ def failed(
         (["--env-kwargs", "coordination:9"], ("coordination must be an integer from 1 to 4", "got 9")),
         (["--env-kwargs", "coordination"], ("expects key:value", "coordination:2")),
         (["--env-kwargs", "coordination:{"], ("not valid YAML",)),
+        (["-params", "policy_kwargs:{n_slots:2}"], ("write a space after the colon of 'n_slots:2'",)),
         (["--eval-env-kwargs", "n_agents:5"], ("evaluation needs the 4 agents of training",)),
         (["-params", "clip_range_vf:-1"], ("clip_range_vf", "positive")),
         (["-params", "algorithm:MaskablePPO"], ("TeamTogether-v0 has no action masks",)),

@@ -401,10 +401,10 @@ function build() {
   });
   for (const agent of range(data.n_agents)) {
     const button = document.createElement("button");
-    button.textContent = agent;
+    button.textContent = data.agents[agent];
     button.dataset.agent = agent;
     button.style.borderBottom = `4px solid ${colourOf(agent)}`;
-    button.setAttribute("aria-label", `Agent ${agent}`);
+    button.setAttribute("aria-label", `Agent ${data.agents[agent]}`);
     button.addEventListener("click", () => choose(agent));
     $("agents").append(button);
   }

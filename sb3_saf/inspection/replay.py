@@ -30,7 +30,7 @@ from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, rec
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY, EPISODE_START_KEY, OBS_KEY, TeamSpaces
-from sb3_saf.teams.vec_env import layers, require_n_agents
+from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
 MAX_STEPS: Final = 2000
@@ -120,13 +120,15 @@ def replay(
     n_actions = int(env.action_space.n) if isinstance(env.action_space, spaces.Discrete) else 0
     names = env.get_attr("action_names", indices=[0])[0] if env.has_attr("action_names") else range(n_actions)
     cut = any(run["steps"] == MAX_STEPS for run in runs)
+    note = "Point at an agent, or choose its number." if has_grid else "Choose an agent by button or number key."
     data = {
         "n_agents": n_agents,
+        "agents": [str(agent) for agent in range(n_agents)] if has_grid else agent_names(env),
         "grid": grid,
         "tiles": None if atlas is None else _packed(atlas, "u1"),
         "actions": [str(name) for name in names],
         "runs": runs,
-        "note": f"Cut after {MAX_STEPS:,} game steps." if cut else "Point at an agent, or choose its number.",
+        "note": f"Cut after {MAX_STEPS:,} game steps." if cut else note,
     }
     kinds = {
         "exported actor"

@@ -27,9 +27,14 @@ MERGED: Final = ("env_kwargs", "policy_kwargs")
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without duplicate keys, of which it would silently use the last."""
+    """PyYAML's safe loader without keys that it misreads: duplicates, and ``key:value`` in braces without a space."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        for key, value in node.value if node.flow_style else ():
+            if isinstance(key, yaml.ScalarNode) and key.style is None and ":" in key.value and value.value == "":
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"write a space after the colon of {key.value!r}", key.start_mark
+                )
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         for key in keys:
             if keys.count(key) > 1:
