@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from tests.toy_envs import BOX, ZEROS, Game
 from tests.toy_teams import ToyTeams
 
 Array = npt.NDArray[Any]
@@ -67,3 +69,56 @@ class MaskedTeams(ToyTeams):
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         return list(getattr(self, method_name)(*args, **kwargs))
+
+
+class MaskedGame(Game):
+    """
+    Two agents; the test ends at an illegal action.
+
+    :param where: of masks: a key of observations, "info:KEY", or "method"
+    :param others: further entries of observations
+    :param actions: action space
+    :param mask: the mask, or a function of the step
+    :param given: steps at which infos have the mask
+    """
+
+    render_mode = "rgb_array"
+
+    def __init__(
+        self,
+        where: str,
+        others: dict[str, Any] | None = None,
+        actions: spaces.Space[Any] | None = None,
+        mask: Any = (0, 1, 0),
+        given: Callable[[int], bool] = lambda step: True,
+    ) -> None:
+        self.in_row = where != "method" and not where.startswith("info:")
+        self.where, self.key = where, where.removeprefix("info:")
+        self.others = {"observation": BOX} if others is None else others
+        self.actions_space = spaces.Discrete(3) if actions is None else actions
+        self.mask = mask if callable(mask) else lambda step: np.array(mask, np.int8)
+        self.given = given
+        if where == "method":
+            self.action_masks = lambda: {agent: self.mask(self.t).astype(bool) for agent in self.agents}
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return self.actions_space
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        return spaces.Dict({**self.others, self.key: spaces.MultiBinary(len(self.mask(0)))}) if self.in_row else BOX
+
+    def see(self, agent: Any) -> Any:
+        own = {name: np.zeros(space.shape, space.dtype) for name, space in self.others.items()}
+        return {**own, self.key: self.mask(self.t)} if self.in_row else ZEROS
+
+    def info(self, agent: Any) -> dict[str, Any]:
+        return {self.key: self.mask(self.t)} if self.where.startswith("info:") and self.given(self.t) else {}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        for action in actions.values() if self.given(self.t) else ():
+            mask = self.mask(self.t)[np.newaxis] != 0
+            assert is_allowed(self.actions_space, np.asarray(action)[np.newaxis], mask).all(), f"illegal: {action}"
+        return super().step(actions)
+
+    def render(self) -> Array:
+        return np.zeros((4, 4, 3), np.uint8)

@@ -73,11 +73,9 @@ class Probe(ParallelEnv[str, Any, Any], ABC):
         return np.array(list(product((-1.0, 1.0), repeat=shape[0] * shape[1]))).reshape(-1, *shape)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the same space for all agents."""
         return self._observation_space
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the same space for all agents."""
         return self._action_space
 
     def reset(
@@ -122,7 +120,6 @@ class ConstantReward(Probe):
         return np.zeros((len(bits), *(self._observation_space.shape or ())), dtype=np.float32)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return np.ones(len(bits))
 
 
@@ -133,7 +130,6 @@ class DelayedReward(Probe):
     """
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return bits[:, 0] * (time == self.length - 1)
 
 
@@ -141,7 +137,6 @@ class OwnAction(Probe):
     """Reward 1 for action 1 if the agent sees 1 and for action 0 if it sees -1, else 0."""
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return (actions == (bits[:, 0] > 0)).astype(np.float64)
 
 
@@ -158,7 +153,6 @@ class JointAction(Probe):
     noise: ClassVar[float] = 10.0
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         solved = float((actions == (bits[:, 0] > 0)).all())
         return np.full(len(bits), solved + self.noise * bits[:, 1].sum())
 
@@ -173,7 +167,6 @@ class ZoneAction(Probe):
     n_bits: ClassVar[int] = 2
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return (actions == (bits.prod(axis=1) > 0)).astype(np.float64)
 
 
@@ -193,7 +186,6 @@ class Message(Probe):
         return np.concatenate([super().observe(bits, time), np.eye(len(bits), dtype=np.float32)], axis=1)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return np.roll(bits[:, 0], -1)
 
 
@@ -231,7 +223,6 @@ class MatrixGame(Probe):
         return np.eye(2, dtype=np.float32)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return np.full(2, self.payoffs[tuple(actions)] / 2)
 
 
@@ -254,7 +245,6 @@ class TwoStates(MatrixGame):
         return np.eye(2, dtype=np.float32)[[self.state_now] * 2]
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         paid = super().rewards(bits, actions, time) * self.state_now
         self.state_now = int(self.state_now and not actions.all())
         return paid
@@ -270,7 +260,6 @@ class Buttons(Probe):
         return np.ones((len(bits), *(self._observation_space.shape or ())), dtype=np.float32)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         return (actions == np.arange(len(bits))).astype(np.float64)
 
 
@@ -296,6 +285,5 @@ class Arms(Probe):
         return np.eye(len(bits), dtype=np.float32)
 
     def rewards(self, bits: Floats, actions: npt.NDArray[np.int64], time: int) -> Floats:
-        """See the class."""
         paid = self.scales * (actions == np.arange(len(bits)))
         return np.full(len(bits), paid.sum()) if self.shared else paid

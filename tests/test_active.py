@@ -114,51 +114,37 @@ def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
     assert set(make_team_env(TellingEnv, action_masks=True, masks="info").reset()) == {*names, "active", "action_mask"}
 
 
+def rows_with(**entries: spaces.Space[Any]) -> TeamSpaces:
+    return TeamSpaces.of_rows(spaces.Dict(obs=spaces.Discrete(3), **entries), spaces.Discrete(2), 2)
+
+
+def policy_of(kind: Any, n_actions: int = 4, state: Any = None, **kwargs: Any) -> Any:
+    return kind(telling_spaces(state=state), spaces.Discrete(n_actions), lambda _: 0.0, **kwargs)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: make_team_env(CounterEnv, state=True),
-            r"state=True needs an environment with state\(\) and a state_space .* leave state out",
-        ),
+        (lambda: make_team_env(CounterEnv, state=True), r"state=True needs .*state\(\)"),
         (
             lambda: make_team_env(CounterEnv, action_masks=True).reset(),
-            r"'action_mask' in the info of agent_0 in game 0 at step 0: .* 4 zeros and ones .* got None",
+            "'action_mask' .*agent_0 .*got None",
         ),
-        (
-            lambda: make_team_env(DictEnv, action_masks=True),
-            r"action masks are for Discrete, .* got Box\(.*pass action_masks=False",
-        ),
-        (
-            lambda: telling_env(stuck=0).reset(),
-            "at least one legal action .* got none at step 0 for agent 0 of game 0; give agents that have to wait",
-        ),
+        (lambda: make_team_env(DictEnv, action_masks=True), r"got Box\(.*pass action_masks=False"),
+        (lambda: telling_env(stuck=0).reset(), "legal action .* at step 0 for agent 0 of game 0"),
         (lambda: make_team_env("TeamTogether", state=True), "state=True needs"),
         (lambda: make_team_env("TeamTogether", active=True), "active=True"),
+        (lambda: rows_with(active=spaces.Discrete(3)), r"'active' .*Discrete\(2\), got Discrete\(3\)"),
         (
-            lambda: TeamSpaces.of_rows(
-                spaces.Dict(obs=spaces.Discrete(3), active=spaces.Discrete(3)), spaces.Discrete(2), 2
-            ),
-            r"expected 'active' of a row to be Discrete\(2\), got Discrete\(3\)",
+            lambda: rows_with(action_mask=spaces.MultiBinary(3)),
+            r"'action_mask' .*got MultiBinary\(3\)",
         ),
         (
-            lambda: TeamSpaces.of_rows(
-                spaces.Dict(obs=spaces.Discrete(3), action_mask=spaces.MultiBinary(3)), spaces.Discrete(2), 2
-            ),
-            r"expected 'action_mask' to be MultiBinary\(A\), .* got MultiBinary\(3\) for Discrete\(2\)",
+            lambda: policy_of(MAPPOPolicy, critic_input="state"),
+            r"critic_input='state' .*state=True\)",
         ),
-        (
-            lambda: MAPPOPolicy(telling_spaces(state=None), spaces.Discrete(4), lambda _: 0.0, critic_input="state"),
-            r"critic_input='state' needs observations with 'state'.*make_team_env\(..., state=True\)",
-        ),
-        (
-            lambda: SAFPolicy(telling_spaces(), spaces.Discrete(4), lambda _: 0.0, critic_input="state"),
-            "critic_input must be one of 'own', 'team', got 'state'",
-        ),
-        (
-            lambda: IPPOPolicy(telling_spaces(), spaces.Discrete(5), lambda _: 0.0),
-            r"expected 'action_mask' to be MultiBinary\(A\), .* got MultiBinary\(4\)",
-        ),
+        (lambda: policy_of(SAFPolicy, critic_input="state"), "critic_input .*'own', 'team', got 'state'"),
+        (lambda: policy_of(IPPOPolicy, n_actions=5), r"'action_mask' .*got MultiBinary\(4\)"),
     ],
 )
 def test_wrong_calls(make: Callable[[], Any], message: str) -> None:

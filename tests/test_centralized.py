@@ -117,15 +117,6 @@ class TestEverySpace:
         assert parts.own_shape == parts.own.shape
 
 
-def test_spaces_are_passed_on_as_the_same_objects() -> None:
-    for own in (VECTOR, AtlasSpace((7, 7), 200), AtlasSpace((7, 7, 3), 256), spaces.Discrete(4)):
-        env = CentralizedValueWrapper(TeamVenv(own_space=own))
-        assert isinstance(env.observation_space, spaces.Dict)
-        assert env.observation_space["obs"] is own
-        assert env.observation_space["team"].shape == (3, *(own.shape or ()))
-        assert env.observation_space["team"].dtype == own.dtype
-
-
 @pytest.mark.parametrize(
     ("own", "low", "high"),
     [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -42,15 +41,13 @@ def lively_env(env: Any = TellingEnv, **kwargs: Any) -> CentralizedValueWrapper:
     return make_team_env(env, 2, seed=0, **{**LIVES, **kwargs})
 
 
-def small_policy(**kwargs: Any) -> dict[str, Any]:
-    return {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8}, **kwargs}
-
-
-def learn(model: Any, n_rows: int) -> Any:
-    """Train with idle rows in minibatches: the buffers of sb3-contrib keep them."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "The minibatch has rows of agents that take no part")
-        return model.learn(n_rows)
+def make_model(algorithm: Any, policy: str, env: Any, **policy_kwargs: Any) -> Any:
+    """Create a small model; rollouts have 10 steps of 6 rows."""
+    networks = {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8}, **policy_kwargs}
+    settings: dict[str, Any] = {"n_steps": 10, "batch_size": 30, "n_epochs": 1, "seed": 0, "device": "cpu"}
+    if algorithm is PPO:
+        settings["rollout_buffer_class"] = TeamRolloutBuffer
+    return algorithm(policy, env, policy_kwargs=networks, **settings)
 
 
 def active_rows(obs: Any) -> Any:
@@ -59,17 +56,7 @@ def active_rows(obs: Any) -> Any:
 
 def test_an_action_must_be_allowed_by_both_masks() -> None:
     env = lively_env(TwiceMaskedEnv, masks="observation", deaths={}, joins={})
-    model = MaskablePPO(
-        "SAFMaskablePolicy",
-        env,
-        n_steps=10,
-        batch_size=30,
-        n_epochs=1,
-        seed=0,
-        device="cpu",
-        policy_kwargs=small_policy(),
-    )
-    model.learn(60)
+    model = make_model(MaskablePPO, "SAFMaskablePolicy", env).learn(60)
     buffer = model.rollout_buffer
     taken = buffer.actions.reshape(-1).astype(int)
     assert (taken >= 2).all(), "the environment's action_masks() forbid 0 and 1"
@@ -91,18 +78,7 @@ def test_an_action_must_be_allowed_by_both_masks() -> None:
 
 def test_values_are_normalised_by_the_returns_of_those_who_take_part() -> None:
     """The mean would differ if idle rows, whose returns are 0, were counted."""
-    model = PPO(
-        "MAPPOPolicy",
-        lively_env(),
-        n_steps=10,
-        batch_size=30,
-        n_epochs=1,
-        seed=0,
-        device="cpu",
-        rollout_buffer_class=TeamRolloutBuffer,
-        policy_kwargs=small_policy(normalize_values=True),
-    )
-    model.learn(60)
+    model = make_model(PPO, "MAPPOPolicy", lively_env(), normalize_values=True).learn(60)
     buffer: Any = model.rollout_buffer
     is_active = buffer.active.reshape(10, 6) == 1
     returns = buffer.returns[is_active].astype(np.float64)
@@ -122,14 +98,7 @@ def test_values_are_normalised_by_the_returns_of_those_who_take_part() -> None:
 )
 def test_normalised_values_with_every_critic_and_agents_that_die(policy_kwargs: dict[str, Any]) -> None:
     env = lively_env(state=True, time_limit="bootstrap")
-    settings: dict[str, Any] = {"n_steps": 10, "batch_size": 30, "n_epochs": 2, "seed": 0, "device": "cpu"}
-    model = PPO(
-        "MAPPOPolicy",
-        env,
-        rollout_buffer_class=TeamRolloutBuffer,
-        policy_kwargs=small_policy(normalize_values=True, **policy_kwargs),
-        **settings,
-    ).learn(120)
+    model = make_model(PPO, "MAPPOPolicy", env, normalize_values=True, **policy_kwargs).learn(120)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     assert isinstance(model.action_space, spaces.Discrete)
 
@@ -141,7 +110,6 @@ def test_maskable_ppo_finds_the_masks_that_observations_show(masks: str) -> None
     assert is_masking_supported(env)
     obs: Any = env.reset()
     np.testing.assert_array_equal(get_action_masks(env), obs["action_mask"] == 1)
-    settings: dict[str, Any] = {"n_steps": 10, "batch_size": 30, "n_epochs": 1, "seed": 0, "device": "cpu"}
-    model = MaskablePPO("MAPPOMaskablePolicy", env, policy_kwargs=small_policy(), **settings).learn(60)
+    model = make_model(MaskablePPO, "MAPPOMaskablePolicy", env).learn(60)
     assert evaluate_team(model, lively_env(ShownMasksEnv, masks=masks, deaths={}, joins={}), 2).lengths == [5, 5]
     assert not is_masking_supported(lively_env(ShownMasksEnv, masks=None))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import csv
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_saf
@@ -126,17 +124,6 @@ def test_agents_that_see_the_same_act_differently_only_with_actor_identity(name:
         th.testing.assert_close(by_agent, by_agent[:1].expand(4, 3), rtol=0, atol=1e-6)
         differences = (by_agent[0] - by_agent[0].roll(1)).abs()
         assert (differences > 1e-4).all() if identity else (differences < 1e-6).all()
-
-
-def test_game_steps_are_logged(tmp_path: Path) -> None:
-    model = make_model("IPPOMaskablePolicy")
-    model.set_logger(configure(str(tmp_path), ["csv"]))
-    model.learn(192, sb3_saf.GameStepsCallback())
-    model.logger.close()
-    with open(tmp_path / "progress.csv") as file:
-        rows = list(csv.DictReader(file))
-    # With 3 agents, 96 rows are 32 game steps.
-    assert [row["time/game_steps"] for row in rows] == ["32", "64"]
 
 
 # --- TRPO -------------------------------------------------------------------------------------------------------------

@@ -182,6 +182,7 @@ def test_masks_are_passed_by_agent() -> None:
     ("kind", "observation", "message"),
     [
         ("vectors", {"b": np.zeros(5, np.float32)}, r"observation of b: .* of shape \(3,\), got .* \(5,\)"),
+        ("vectors", {"b": {"place": np.zeros(3)}}, r"observation of b: .* of shape \(3,\)"),
         ("vectors", {"d": np.zeros(3, np.float32)}, r"'agent', 'b', 'c', .* got 'd'"),
         ("equal, start", {"b": 2}, "observation of b: expected values from 3 to 6 .* got 2"),
         ("nested", {"agent": {"z": 4}}, r"observation of agent: .* the parts \['z', 'a'\], got \['z'\]"),

@@ -35,34 +35,6 @@ def test_runs_of_one_seed_end_with_equal_weights_on_both_backends() -> None:
     assert not th.equal(weights(first), weights(untrained))
 
 
-@pytest.mark.parametrize(
-    ("task", "policy", "observation"),
-    [
-        ("TeamTogether", "IPPOPolicy", "tiles"),
-        ("TeamSupport", "MAPPOPolicy", "rgb"),
-        ("KeyForTreasure", "SAFPolicy", "rgb"),
-        ("KeyForTreasure", "SAFPolicy", "tiles"),
-    ],
-)
-def test_every_policy_and_task_trains(task: str, policy: str, observation: str) -> None:
-    env = sb3_saf.make_team_env(task, n_envs=4, seed=0, observation=observation, **SMALL)
-    kwargs = {} if observation == "rgb" else LIGHT
-    model = PPO(
-        policy,
-        env,
-        n_steps=25,
-        batch_size=150,
-        n_epochs=1,
-        rollout_buffer_class=sb3_saf.TeamRolloutBuffer,
-        policy_kwargs=kwargs,
-        seed=0,
-    )
-    before = weights(model)
-    model.learn(2 * 25 * env.num_envs)
-    assert not th.equal(before, weights(model))
-    assert len(model.ep_info_buffer or []) == 4, "one entry per team episode"
-
-
 def test_it_learns() -> None:
     """After 6,400 game steps three agents collect more than 10 of 12 treasures; a random team collects 4."""
     level = {**SMALL, "grid_size": 8, "clutter_density": 0.0}

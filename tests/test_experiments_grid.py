@@ -113,13 +113,6 @@ def test_experiments_share_cells() -> None:
     assert set(shared.tests) == {at(1, 1), at(2, 1), at(3, 1)}
 
 
-def test_unknown_names() -> None:
-    with pytest.raises(ValueError, match=r"unknown experiment 'coordinaton' \(did you mean 'coordination'\?\)"):
-        find_experiment("coordinaton")
-    with pytest.raises(ValueError, match=r"unknown method 'mapo' \(did you mean 'mappo'\?\)"):
-        Selection((0,), ("mapo",))
-
-
 def test_shards_are_a_partition_and_have_all_methods() -> None:
     cells = grid_of("coordination").cells
     for count in (1, 2, 7, 200):

@@ -32,7 +32,6 @@ from sb3_saf import (
     inspect_team,
     make_team_env,
 )
-from sb3_saf.inspection import figures
 from sb3_saf.inspection.recording import EpisodeRecording, lambda_returns, record_episodes, zones_by_attribute
 from sb3_saf.inspection.scalars import calibrate, critic_scalars, message_scalars, pool_scalars
 from sb3_saf.inspection.tensorboard import Line, line_of
@@ -402,12 +401,3 @@ def test_environments_that_do_not_fit() -> None:
     for training, evaluation, message in cases:
         with pytest.raises(ValueError, match=message):
             learn(None, InspectionCallback(evaluation), env=training)
-
-
-def test_a_strip_has_six_moments_in_two_rows() -> None:
-    frames = [np.full((40, 30, 3), shade, dtype=np.uint8) for shade in range(50)]
-    strip = figures.strip(frames)
-    assert strip.shape == (2 * 40 + 6, 3 * 30 + 2 * 6, 3)
-    assert strip[0, ::36, 0].tolist() == [0, 10, 20]
-    assert strip[46, ::36, 0].tolist() == [29, 39, 49]
-    assert figures.strip(frames[:2]).shape == (40, 2 * 30 + 6, 3)

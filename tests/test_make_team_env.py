@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -21,43 +20,6 @@ from tests.team_venv import Array, TeamVenv
 from tests.toy_envs import CounterEnv
 
 SMALL: dict[str, Any] = {"n_agents": 3, "grid_size": 10, "n_treasures": 12, "max_cycles": 6, "view_size": 5}
-
-
-def episode(env: CentralizedValueWrapper, n_steps: int = 13) -> list[Array]:
-    """Return all numbers of some steps with fixed actions."""
-    rng = np.random.default_rng(0)
-    obs = env.reset()
-    numbers = [*obs.values()]
-    for _ in range(n_steps):
-        obs, rewards, dones, infos = env.step(rng.integers(0, 4, size=env.num_envs))  # type: ignore[assignment]
-        last = [info["terminal_observation"]["team"] for info in infos if "terminal_observation" in info]
-        numbers += [*obs.values(), rewards, dones, np.array(last)]
-    env.close()
-    return numbers
-
-
-def assert_equal(one: list[Array], other: list[Array]) -> None:
-    assert len(one) == len(other)
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a, b, strict=True)
-
-
-def test_a_task_and_its_ids_are_the_same_environment() -> None:
-    plain = episode(make_team_env("TeamSupport", n_envs=2, seed=3, **SMALL))
-    for name in ("TeamSupport-v0", "hecogrid/TeamSupport-v0", "hecogrid/TeamSupport"):
-        assert_equal(plain, episode(make_team_env(name, n_envs=2, seed=3, **SMALL)))
-    assert sum(int(rewards.sum()) for rewards in plain[6::6]) > 0, "an episode without events would show nothing"
-
-
-def test_hecogrid_gives_tiles_that_draw_the_pixels_of_rgb() -> None:
-    tiles = make_team_env("TeamTogether", n_envs=2, seed=0, **SMALL)
-    rgb = make_team_env("TeamTogether", n_envs=2, seed=0, observation="rgb", **SMALL)
-    own = tiles.team_spaces.own
-    assert isinstance(own, spaces.Box)
-    assert own.shape == (5, 5)
-    assert rgb.team_spaces.own == spaces.Box(0, 255, (3, 20, 20), np.uint8)
-    pictures = own.pixels(tiles.reset()["team"])  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(np.moveaxis(pictures, -1, -3), rgb.reset()["team"])
 
 
 def test_the_chain() -> None:

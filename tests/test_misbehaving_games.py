@@ -168,6 +168,9 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"at_reset": lambda env, result: result[0].clear()}, "an observation for agent_0, which takes part, at the reset"),
     ({"at_reset": lambda env, result: result[1].update(agent_0="new")}, "a dict as the info of agent_0 at the reset"),
     ({"setup": set_to("reset", lambda: None)}, "expected counter_v0 to have reset(seed=None, options=None)"),
+    ({"setup": set_to("possible_agents", ["a", "b", "a"])}, "got 'a' more than once in ['a', 'b', 'a']"),
+    ({"setup": set_to("possible_agents", [])}, "expected counter_v0 to list its agents in possible_agents"),
+    ({"setup": set_to("observation_space", {})}, "expected observation_space(agent) to be a method"),
     ({"at_step": lambda env, result: env.possible_agents.pop() and None}, "removes agents from both: write"),
     ({"space": spaces.Box(0, 1, (0,))}, "expected an observation space with at least one entry"),
     ({"action_space": spaces.Box(0, 1, (2, 0))}, "expected an action space with at least one entry"),
@@ -219,19 +222,6 @@ def test_faults_after_the_trial_are_named(fault: dict[str, Any], message: str, n
             env.step(np.zeros(env.num_envs, dtype=int))
     finally:
         env.close()
-
-
-@pytest.mark.parametrize(
-    ("setup", "message"),
-    [
-        (set_to("possible_agents", ["a", "b", "a"]), "got 'a' more than once in ['a', 'b', 'a']"),
-        (set_to("possible_agents", []), "expected counter_v0 to list its agents in possible_agents"),
-        (set_to("observation_space", {}), "expected observation_space(agent) to be a method"),
-    ],
-)
-def test_games_without_agents_or_spaces(setup: Callable[[Any], None], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        make_team_env(MisbehavingEnv, setup=setup)
 
 
 def test_the_trial_disturbs_no_game_and_no_generator() -> None:

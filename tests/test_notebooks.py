@@ -11,7 +11,7 @@ import pytest
 from nbformat import NotebookNode
 
 from notebooks.execute import PARAMETERS, QUICK, NotebookError, code_cells, execute, source_files, tidied
-from tests.test_docs import LINK, exists
+from tests.test_docs import LINK
 
 FILES = source_files()
 EVERY_NOTEBOOK = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -21,11 +21,6 @@ LARGEST = 1_500_000
 
 def read(path: Path) -> NotebookNode:
     return nbformat.read(path, as_version=4)
-
-
-def python_of(cell: NotebookNode) -> str:
-    """Return a cell without notebook syntax: magics and shell commands."""
-    return re.sub(r"^[%!].*$", "pass", cell.source, flags=re.MULTILINE)
 
 
 def written_by(cell: NotebookNode) -> str:
@@ -68,17 +63,6 @@ def test_quick_numbers_replace_ones_that_are_there(path: Path) -> None:
     lines = [node for node in ast.parse(cell.source).body if isinstance(node, ast.Assign)]
     there = {ast.unparse(node.targets[0]): type(ast.literal_eval(node.value)) for node in lines}
     assert {name: type(value) for name, value in QUICK[path.name].items()}.items() <= there.items()
-
-
-@EVERY_NOTEBOOK
-def test_names_of_ours_exist_and_are_public(path: Path) -> None:
-    for cell in code_cells(read(path)):
-        for node in ast.walk(ast.parse(python_of(cell))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(("sb3_saf", "hecogrid_envs")):
-                assert all(exists(f"{node.module}.{alias.name}") for alias in node.names), ast.unparse(node)
-                assert not any(alias.name.startswith("_") for alias in node.names), ast.unparse(node)
-        for name in re.findall(r"(?<![\w/.])(?:sb3_saf|hecogrid_envs)(?:\.[A-Za-z_]\w*)+", cell.source):
-            assert exists(name) and "._" not in name, name
 
 
 @EVERY_NOTEBOOK

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
@@ -25,52 +24,8 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.training.wrappers import wrap_game
-
-BOX = spaces.Box(-1, 1, (2,), np.float32)
-ZEROS = np.zeros(2, np.float32)
-
-
-class Game(ParallelEnv[str, Any, Any]):
-    """Two agents, four steps, reward 1 for each agent and step; subclasses change what a step returns."""
-
-    metadata: ClassVar[dict[str, Any]] = {"name": "game"}
-    possible_agents: Any = ["a", "b"]
-    length = 4
-
-    def observation_space(self, agent: Any) -> spaces.Space[Any]:
-        return BOX
-
-    def action_space(self, agent: Any) -> spaces.Space[Any]:
-        return spaces.Discrete(3)
-
-    def see(self, agent: Any) -> Any:
-        return ZEROS
-
-    def info(self, agent: Any) -> dict[str, Any]:
-        return {}
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        self.agents, self.t = list(self.possible_agents), 0
-        return {a: self.see(a) for a in self.agents}, {a: self.info(a) for a in self.agents}
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        self.t += 1
-        self.actions = actions
-        over, team = self.t == self.length, list(self.agents)
-        out: list[Any] = [
-            {a: self.see(a) for a in team},
-            dict.fromkeys(team, 1.0),
-            dict.fromkeys(team, False),
-            dict.fromkeys(team, over),
-            {a: self.info(a) for a in team},
-        ]
-        self.change(out)
-        if over:
-            self.agents = []
-        return tuple(out)
-
-    def change(self, out: list[Any]) -> None:
-        pass
+from tests.contrib_teams import MaskedGame
+from tests.toy_envs import BOX, ZEROS, Game
 
 
 def ppo(env: Any, **kwargs: Any) -> PPO:
@@ -82,75 +37,20 @@ def ppo(env: Any, **kwargs: Any) -> PPO:
 # --- action masks -----------------------------------------------------------------------------------------------------
 
 
-class MaskedGame(Game):
-    """
-    Raises at illegal actions.
-
-    :param key: where observations have masks; "info:KEY" for infos
-    :param others: further entries of observations
-    :param actions: action space
-    :param mask: the mask
-    :param given: steps at which infos have the mask
-    """
-
-    def __init__(
-        self,
-        key: str,
-        others: dict[str, Any] | None = None,
-        actions: Any = None,
-        mask: Any = (0, 1, 0),
-        given: Callable[[int], bool] = lambda step: True,
-    ) -> None:
-        self.in_info = key.startswith("info:")
-        self.key = key.removeprefix("info:")
-        self.others = {"observation": BOX} if others is None else others
-        self.actions_space = spaces.Discrete(3) if actions is None else actions
-        self.mask = np.array(mask, np.int8)
-        self.given = given
-
-    def action_space(self, agent: Any) -> spaces.Space[Any]:
-        return self.actions_space
-
-    def observation_space(self, agent: Any) -> spaces.Space[Any]:
-        if self.in_info:
-            return BOX
-        return spaces.Dict({**self.others, self.key: spaces.MultiBinary(len(self.mask))})
-
-    def see(self, agent: Any) -> Any:
-        if self.in_info:
-            return ZEROS
-        return {name: np.zeros(space.shape, space.dtype) for name, space in self.others.items()} | {self.key: self.mask}
-
-    def info(self, agent: Any) -> dict[str, Any]:
-        return {self.key: self.mask} if self.in_info and self.given(self.t) else {}
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        if self.given(self.t):
-            for action in actions.values():
-                choices = np.atleast_1d(action) + np.concatenate([[0], np.cumsum(self._sizes)[:-1]]).astype(int)
-                assert self.mask[choices].all(), f"illegal action {action}"
-        return super().step(actions)
-
-    @property
-    def _sizes(self) -> Any:
-        space = self.actions_space
-        return space.nvec if isinstance(space, spaces.MultiDiscrete) else [space.n]
-
-
 MULTI = {"actions": spaces.MultiDiscrete([2, 3]), "mask": (0, 1, 1, 0, 0)}
 
 
 @pytest.mark.parametrize(
     "game",
     [
-        {"key": "action_mask"},
-        {"key": "action_mask", "others": {"observations": BOX}},
-        {"key": "action_mask", "others": {"real_obs": BOX, "step": spaces.Discrete(5)}},
-        {"key": "avail_actions", "others": {"obs": BOX}},
-        {"key": "action_mask", **MULTI},
-        {"key": "info:action_mask"},
-        {"key": "info:avail_actions"},
-        {"key": "info:action_mask", **MULTI},
+        {"where": "action_mask"},
+        {"where": "action_mask", "others": {"observations": BOX}},
+        {"where": "action_mask", "others": {"real_obs": BOX, "step": spaces.Discrete(5)}},
+        {"where": "avail_actions", "others": {"obs": BOX}},
+        {"where": "action_mask", **MULTI},
+        {"where": "info:action_mask"},
+        {"where": "info:avail_actions"},
+        {"where": "info:action_mask", **MULTI},
     ],
     ids=str,
 )
@@ -165,9 +65,9 @@ def test_masks_are_used_wherever_they_are(game: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("game", "message"),
     [
-        ({"key": "info:action_mask", "given": lambda step: step != 1}, "'action_mask' is in some infos"),
-        ({"key": "info:legal_moves"}, "'legal_moves'"),
-        ({"key": "legal_actions", "mask": (1, 1)}, "'legal_actions'.* does not fit"),
+        ({"where": "info:action_mask", "given": lambda step: step != 1}, "'action_mask' is in some infos"),
+        ({"where": "info:legal_moves"}, "'legal_moves'"),
+        ({"where": "legal_actions", "mask": (1, 1)}, "'legal_actions'.* does not fit"),
     ],
 )
 def test_masks_that_are_not_always_used_are_named(game: dict[str, Any], message: str) -> None:

@@ -48,9 +48,7 @@ def test_sb3s_own_policy_warns_that_it_sees_the_team() -> None:
         PPO("MlpPolicy", env)
     settings: dict[str, Any] = {"n_steps": 2, "batch_size": 8, "n_epochs": 1, "device": "cpu"}
     model = PPO("MultiInputPolicy", env, **settings)
-    with pytest.warns(
-        UserWarning, match=r"its actor sees 'team', .*: IPPOPolicy, MAPPOPolicy, SAFPolicy, as in PPO\('SAFPolicy'"
-    ):
+    with pytest.warns(UserWarning, match=r"actor sees 'team', .*SAFPolicy, as in PPO\('SAFPolicy'"):
         model.learn(8, GameStepsCallback())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -122,21 +120,6 @@ def test_settings_are_those_of_the_method() -> None:
         ppo_settings(env, "qplex")
 
 
-@pytest.mark.parametrize("policy", ["SAFPolicy", "MAPPOPolicy"])
-def test_observations_by_agent_give_actions_by_agent(policy: str) -> None:
-    model = PPO(policy, make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
-    observations, _ = CounterEnv().reset(seed=0)
-    actions, state = model.predict(observations, deterministic=True)
-    assert state is None
-    stacked, _ = model.predict(np.stack(list(observations.values())), deterministic=True)
-    assert actions == dict(zip(observations, stacked, strict=True))
-    assert model.predict({"agent_1": observations["agent_1"]}, deterministic=True)[0] == {"agent_1": stacked[1]}
-    with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a misspelt key is not a dict of agents
-        model.predict({"obs": observations["agent_1"], "team_view": observations["agent_1"]})
-    with pytest.raises(ValueError, match=r"the agents of the training environment, got 'agent_2'"):
-        model.predict({**observations, "agent_2": observations["agent_1"]})
-
-
 def test_actors_that_read_who_acts_are_told_by_name_or_index() -> None:
     env = make_team_env(CounterEnv, n_envs=2, seed=0)
     model = PPO("IPPOPolicy", env, policy_kwargs={"actor_identity": True}, device="cpu")
@@ -150,6 +133,8 @@ def test_actors_that_read_who_acts_are_told_by_name_or_index() -> None:
         model.predict({"agent_9": observations["agent_1"]})
     with pytest.raises(ValueError, match=r"expected the observation to have 'agent'"):
         model.predict(observations["agent_1"])
+    with pytest.raises(ValueError, match=r"got 'team_view'$"):  # a row with a misspelt key is not a dict of agents
+        model.predict({"obs": observations["agent_1"], "team_view": observations["agent_1"]})
 
 
 @pytest.mark.parametrize("is_saved", [False, True])
@@ -191,17 +176,6 @@ def test_qplex_explores_legal_actions_by_agent() -> None:
     for _ in range(20):
         actions, _ = model.predict(observations)
         assert all(observations[agent]["action_mask"][action] == 1 for agent, action in actions.items())
-
-
-def test_observations_that_rows_convert_are_refused_with_the_way_to_act() -> None:
-    model: Any = PPO("IPPOPolicy", make_team_env(CounterEnv, n_envs=2, seed=0), device="cpu")
-    seen = CounterEnv().reset(seed=0)[0]["agent_0"]
-    for observations, message in (
-        ({"agent_0": {"pos": seen}, "agent_1": {"pos": seen}}, r"observation of agent_0: .* of shape \(3,\)"),
-        ({"agent_0": seen, "agent_1": seen[:-1]}, r"observation of agent_1: .* of shape \(3,\), got .* \(2,\)"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            model.predict(observations)
 
 
 def test_masks_in_pettingzoos_form_are_understood() -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from gymnasium.utils.env_checker import check_reset_return_type, check_space_limit
 from pettingzoo.test import (
     api_test,
     max_cycles_test,
@@ -156,24 +154,6 @@ def test_state_is_a_copy(task: str) -> None:
     state["agent_pos"][:] = 1
     state["walls"][:] = True
     assert not np.array_equal(env.get_state()["walls"], state["walls"])
-
-
-def test_gymnasium_checks(task: str) -> None:
-    env = hecogrid_envs.parallel_env(task, **SMALL)
-    for agent in env.possible_agents:
-        check_space_limit(env.observation_space(agent), "observation")
-        assert isinstance(env.action_space(agent), gymnasium.spaces.Discrete)
-
-    class OneAgent(gymnasium.Env[Any, Any]):
-        observation_space = env.observation_space("agent_0")
-
-        def reset(
-            self, *, seed: int | None = None, options: dict[str, Any] | None = None
-        ) -> tuple[Any, dict[str, Any]]:
-            observations, infos = env.reset(seed=seed, options=options)
-            return observations["agent_0"], infos["agent_0"]
-
-    check_reset_return_type(OneAgent())
 
 
 def test_documentation_page(task: str) -> None:

@@ -77,13 +77,6 @@ def test_keys_are_translated_for_the_zone(key: str, command: int) -> None:
     assert game.actions[-1][1] == ZONE_1[command]
 
 
-def test_raw_keys_are_not_translated() -> None:
-    session, game = noted_session(raw=True, heterogeneity=2)
-    session.press("tab")
-    session.press("p")
-    assert game.actions[-1][1] == 3
-
-
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("action", range(7))
 def test_numbers_are_never_translated(action: int, raw: bool) -> None:

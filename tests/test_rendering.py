@@ -15,7 +15,7 @@ from hecogrid_envs import rendering
 from hecogrid_envs.constants import zone_colour
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.play import HumanWindow
-from hecogrid_envs.rendering import Scene, fit_tile_size, header_height, render_scene
+from hecogrid_envs.rendering import Scene, header_height, render_scene
 from hecogrid_envs.task import TaskName
 
 pytest.importorskip("PIL")
@@ -90,13 +90,6 @@ def test_usual_tile_size_is_24_and_smaller_for_large_maps() -> None:
     assert render_scene(make_scene(grid_size=120)).shape[1] == 120 * 12
 
 
-@pytest.mark.parametrize(
-    ("grid_size", "max_pixels", "tile"), [(30, 960, 32), (5, 960, 32), (40, 960, 24), (1000, 960, 4)]
-)
-def test_fit_tile_size(grid_size: int, max_pixels: int, tile: int) -> None:
-    assert fit_tile_size(grid_size, max_pixels) == tile
-
-
 @pytest.mark.parametrize("tile", [3, 129, 12.0])
 def test_wrong_tile_size(tile: Any) -> None:
     with pytest.raises(ValueError, match=f"tile_size .*got {tile}"):
@@ -156,13 +149,6 @@ def test_gems_have_the_colour_of_the_task(task: TaskName, brightest: int) -> Non
     scene.state["treasures"][2, 2] = 1
     body = cell_of(scene, 2, 2)[12, 12]
     assert body.argmax() == brightest
-
-
-def test_keys_are_golden() -> None:
-    scene = make_scene()
-    scene.state["keys"][2, 2] = True
-    assert golden(cell_of(scene, 2, 2)) > 20
-    assert golden(cell_of(scene, 3, 2)) == 0
 
 
 # --- agents
@@ -254,19 +240,6 @@ def test_step_score_and_treasures_are_in_the_header() -> None:
     assert len(pages) == 4
     scene.state["treasures"][2, 2] = 2
     assert draw(scene._replace(step=3, collected=1))[0].tobytes() not in pages
-
-
-@pytest.mark.parametrize(("grid_size", "tile"), [(6, 24), (8, 12), (30, 24)])
-def test_words_stay_inside_the_header(grid_size: int, tile: int) -> None:
-    """Nothing is cut off on the right, also with the largest numbers of a game."""
-    n_treasures = min(100, (grid_size - 2) ** 2)
-    params = HECOGridParams(n_agents=2, grid_size=grid_size, n_treasures=n_treasures, n_keys=0, max_cycles=500)
-    state = make_state([(1, 1, 0, False)] * 2, grid_size)
-    state["treasures"].reshape(-1)[:n_treasures] = 2
-    head = draw(Scene("KeyForTreasure", params, state, 0, n_treasures), tile)[0]
-    background = head[0, 0]
-    assert (head[:-4] != background).any(), "words"
-    assert (head[:-4, -2:] == background).all()
 
 
 @pytest.mark.parametrize(("step", "share"), [(0, 0.0), (25, 0.5), (50, 1.0)])

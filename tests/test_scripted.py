@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks import scripted
-from benchmarks.scripted_teams import PATIENCE, TEAMS, cost_to_go
+from benchmarks.scripted_teams import TEAMS
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.constants import Command, Direction
+from hecogrid_envs.constants import Direction
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.state import StateMapping
 
@@ -58,17 +58,6 @@ ALONE = level(
     "######",
     agents=[(2, 3, WEST)],
 )
-
-
-def test_costs_count_turns_steps_and_the_target() -> None:
-    """Near a wall: from (2, 3) facing west one turn, one step, one turn, two steps, one turn, one step."""
-    costs = np.full((6, 6), np.inf)
-    costs[4, 3] = 0.5
-    field = cost_to_go(~ALONE["walls"], costs)
-    assert field[4, 3].tolist() == [0.5] * 4
-    assert field[2, 3, WEST] == 7.5
-    assert field[2, 3, NORTH] == 6.5
-    assert np.isinf(field[3, 3]).all()
 
 
 @pytest.mark.parametrize("heterogeneity", [1, 3])
@@ -120,20 +109,6 @@ def test_agents_meet_at_a_treasure(
 def test_a_key_comes_first(name: str) -> None:
     """Two turns to the key, pickup, two turns back, one step; views reach one row behind the agent."""
     assert first_return(name, "KeyForTreasure", beside_a_treasure([], key="K")) == 6
-
-
-def test_views_do_not_wait_for_ever() -> None:
-    """Alone on a treasure that needs two, an agent leaves after some steps; with full sight it would stay."""
-    state = level("#####", "#   #", "# T #", "#   #", "#####", agents=[(2, 2, EAST)])
-    batch = GameBatch("TeamSupport", HECOGridParams(2, 5, 2, n_treasures=0, clutter_density=0.0))
-    batch.reset(seeds=[0])
-    state["agent_pos"], state["agent_dir"] = np.array([(2, 2), (1, 1)]), np.array([EAST, NORTH])
-    state["agent_has_key"] = np.zeros(2, dtype=np.bool_)
-    batch.set_state(state)
-    team = TEAMS["7 x 7 views"](batch.params, np.random.default_rng(0))
-    commands = [int(team(batch)[0]) for _ in range(20)]
-    assert commands[: PATIENCE + 1] == [Command.PICKUP] * (PATIENCE + 1)
-    assert Command.FORWARD in commands
 
 
 def test_the_command_writes_its_table(

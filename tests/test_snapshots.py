@@ -40,10 +40,6 @@ def test_games_of_a_snapshot_are_those_that_were_played(task: str, rules: Rules)
     batch = played(task, rules)
     fresh = GameBatch(task, batch.params, N_GAMES)
     fresh.restore(batch.snapshot())
-    assert batch._games.crowd.max() > 1
-    for name, array in batch._games._asdict().items():
-        if not name.startswith("sight"):  # computed again on demand
-            np.testing.assert_array_equal(getattr(fresh._games, name), array, err_msg=name)
     rng = np.random.default_rng(1)
     for _ in range(40):
         actions = rng.integers(7, size=(N_GAMES, 6))

@@ -25,7 +25,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_saf import game_seeds
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
@@ -86,22 +86,6 @@ def draws(observations: Any) -> npt.NDArray[Any]:
     return np.asarray(observations)[:, 2]
 
 
-# ---- the order of rows
-
-
-@one_and_two_cpus
-def test_rows_are_game_major_then_agent(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(lambda: CounterEnv(3), n_games=2, seed=5, n_cpus=n_cpus)
-    assert (venv.num_envs, venv.n_games, venv.n_agents) == (6, 2, 3)
-    observations = venv.reset()
-    assert isinstance(observations, np.ndarray)
-    assert observations[:, 1].tolist() == [0, 1, 2, 0, 1, 2]
-    observations, rewards, dones, _ = venv.step(np.array([0, 1, 2, 3, 0, 0]))
-    assert [np.asarray(array).dtype.name for array in (observations, rewards, dones)] == ["float32", "float32", "bool"]
-    assert rewards.tolist() == [10 + 0 + 0, 10 + 1 + 1, 10 + 2 + 2, 10 + 0 + 3, 10 + 1 + 0, 10 + 2 + 0]
-    assert venv.get_attr("last_actions", indices=3) == [{"agent_0": 3, "agent_1": 0, "agent_2": 0}]
-
-
 # ---- trap: seeds and options
 
 
@@ -136,9 +120,11 @@ def test_games_play_as_if_each_was_alone(bridge: Bridge, n_cpus: int, n_games: i
     observations = venv.reset()
     rng = np.random.default_rng(0)
     for _ in range(8):
+        assert np.asarray(observations).dtype == np.float32
         assert np.array_equal(np.asarray(observations), [game[agent] for game in expected for agent in game])
         actions = rng.integers(0, 4, venv.num_envs)
         observations, rewards, dones, _ = venv.step(actions)
+        assert (rewards.dtype, dones.dtype) == (np.float32, np.bool_)
         rows = iter(range(venv.num_envs))
         for game, env in enumerate(alone):
             stepped, reward, _, truncations, _ = env.step({a: actions[next(rows)] for a in env.agents})
@@ -177,12 +163,6 @@ def test_seed_counts_at_the_next_reset_and_once(bridge: Bridge, n_cpus: int) -> 
     assert same(venv.reset(), first)
     unseeded = [venv.seed(None), venv.seed(None)]
     assert unseeded[0] != unseeded[1]
-
-
-@pytest.mark.parametrize("seed", [-1, 0.5, "0", True])
-def test_wrong_seed(bridge: Bridge, seed: Any) -> None:
-    with pytest.raises(ValueError, match=f"seed must be an integer of at least 0, or None, got {seed!r}"):
-        bridge(CounterEnv, n_games=1, seed=seed)
 
 
 @one_and_two_cpus
@@ -387,6 +367,7 @@ def test_processes(bridge: Bridge, n_cpus: int) -> None:
     pids = bridge(CounterEnv, n_games=4, n_cpus=n_cpus).get_attr("pid")
     assert len(set(pids)) == n_cpus
     assert (os.getpid() in pids) == (n_cpus == 1)
+    assert len(set(bridge(CounterEnv, n_games=n_cpus, n_cpus=8).get_attr("pid"))) == n_cpus
 
 
 @one_and_two_cpus
@@ -400,23 +381,6 @@ def test_methods_by_row_and_by_game(bridge: Bridge, n_cpus: int) -> None:
     assert venv.env_method("apply", lambda level: level + 1, indices=0) == [2]
     with pytest.raises(ValueError, match="there is no game 3: expected 0 to 2"):
         venv.game_method("poke", games=3)
-
-
-@one_and_two_cpus
-def test_questions_do_not_disturb_the_episode(bridge: Bridge, n_cpus: int) -> None:
-    quiet, asked = (bridge(CounterEnv, n_games=2, seed=3, n_cpus=n_cpus) for _ in range(2))
-    quiet.reset()
-    observations = asked.reset()
-    for _ in range(7):
-        before = np.copy(np.asarray(observations))
-        asked.get_attr("level")
-        asked.env_method("poke")
-        asked.has_attr("nothing")
-        assert np.array_equal(np.asarray(observations), before)
-        expected = quiet.step(zeros(quiet))
-        observations, rewards, dones, infos = asked.step(zeros(asked))
-        assert same(expected, (observations, rewards, dones, infos))
-        assert same(quiet.reset_infos, asked.reset_infos)
 
 
 @one_and_two_cpus
@@ -537,18 +501,6 @@ def test_death_of_an_agent(bridge: Bridge, n_cpus: int) -> None:
 
 
 @one_and_two_cpus
-def test_agent_that_joins_late(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(LateEnv, n_games=1, n_cpus=n_cpus)
-    observations = np.asarray(venv.reset())
-    assert observations[1].tolist() == [0, 0, 0]
-    assert venv.reset_infos[1] == {"active": False}
-    step = venv.step(zeros(venv))
-    assert step[3] == [{"step": 1}, {"active": False}]
-    assert np.asarray(step[0])[1, :2].tolist() == [1, 1]
-    assert venv.step(zeros(venv))[3] == [{"step": 2}, {"step": 2}]
-
-
-@one_and_two_cpus
 def test_bare_game(bridge: Bridge, n_cpus: int) -> None:
     """No metadata, no render_mode, no infos, ended agents stay in ``agents``: still a team episode."""
     with pytest.raises(AttributeError):
@@ -617,23 +569,6 @@ def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -
         assert any(info.get("active") is False for part in one[5::5] for info in part)
 
 
-@one_and_two_cpus
-def test_sb3_wrappers_on_top(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(lambda: CounterEnv(2, max_cycles=3, deaths={1: 2}), n_games=2, n_cpus=n_cpus)
-    wrapped = VecNormalize(VecMonitor(VecCheckNan(venv, raise_exception=True)), gamma=0.9)
-    assert (wrapped.n_agents, wrapped.n_games) == (2, 2)
-    assert wrapped.get_attr("level") == [1] * 4
-    wrapped.seed(4)
-    wrapped.reset()
-    assert wrapped.get_attr("last_seed")[::2] == game_seeds(4, 2)
-    for _ in range(3):
-        _, _, dones, infos = wrapped.step(zeros(wrapped))
-    assert dones.all()
-    # VecMonitor counts rows: every agent is an episode, including the one that ended early.
-    assert [info["episode"]["r"] for info in infos] == [60, 32] * 2
-    assert [info["episode"]["l"] for info in infos] == [3] * 4
-
-
 # ---- bad input
 
 
@@ -669,9 +604,7 @@ def test_what_cannot_be_pickled_stays_in_this_process(bridge: Bridge) -> None:
         assert len(set(draws.tolist())) == 3, "each game has its own generator"
         assert venv.step(zeros(venv))[1].tolist() == [10, 11] * 3
         venv.close()
-        with pytest.raises(
-            ValueError, match=r"n_cpus=2 sends .* to worker processes, but pickling it failed .* or use n_cpus=1"
-        ):
+        with pytest.raises(ValueError, match=r"n_cpus=2 .* pickling it failed .* use n_cpus=1"):
             bridge(make, n_games=2, n_cpus=2)
 
 
@@ -682,18 +615,6 @@ class OddSpacesEnv(CounterEnv):
         super().__init__()
         self._observation_space = observation_space or self._observation_space
         self._action_space = action_space or self._action_space
-
-
-@pytest.mark.parametrize("name", ["n_games", "n_cpus"])
-@pytest.mark.parametrize("value", [0, -1, 1.0, True, None])
-def test_wrong_counts(bridge: Bridge, name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1, got {value!r}"):
-        bridge(CounterEnv, **{"n_games": 1, name: value})
-
-
-def test_more_cpus_than_games(bridge: Bridge) -> None:
-    venv = bridge(CounterEnv, n_games=2, seed=0, n_cpus=8)
-    assert len(set(venv.get_attr("pid"))) == 2
 
 
 box = spaces.Box(-1.0, np.array([1.0, 0.7], np.float32), (2,), np.float32)

@@ -206,15 +206,8 @@ def other_dtype(obs: dict[str, Array]) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (
-            swap_rows,
-            r"expected rows game-major, then agent, with 'agent' 0 to 2 in each team, got \[1, 0, 2, 0, 1, 2\] ...; no "
-            r"wrapper above CentralizedValueWrapper may reorder rows",
-        ),
-        (
-            swap_games,
-            "expected 'team' to hold the 'obs' of the team's own rows.* below CentralizedValueWrapper only",
-        ),
+        (swap_rows, r"'agent' 0 to 2 in each team, got \[1, 0, 2, 0, 1, 2\] .*CentralizedValueWrapper"),
+        (swap_games, "'team' to hold the 'obs' .* below CentralizedValueWrapper only"),
         (larger_team, r"'team' to hold the 'obs' .* got another one of shape \(12, 4, 4\)"),
         (fewer_rows, r"expected 'obs' of shape \(12, 4\) and dtype float32, got \(11, 4\) and float32"),
         (other_dtype, r"got \(12, 4\) and complex64"),
@@ -230,10 +223,7 @@ def test_rows_that_are_no_whole_teams_are_refused(spoil: Callable[[dict[str, Arr
 
 def test_what_cannot_be_buffered() -> None:
     env = make_env()
-    with pytest.raises(
-        ValueError,
-        match=r"expected rows of whole teams, a multiple of n_agents=3, got 11 rows .* give the buffer the rows",
-    ):
+    with pytest.raises(ValueError, match="whole teams, a multiple of n_agents=3, got 11 rows"):
         make_buffer(env, n_envs=11)
     with pytest.raises(ValueError, match="expected the Dict observation space of CentralizedValueWrapper"):
         TeamRolloutBuffer(5, VECTOR, env.action_space)  # type: ignore[arg-type]

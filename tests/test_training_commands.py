@@ -17,7 +17,6 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hecogrid_envs.play import main as play_main
@@ -71,19 +70,6 @@ def test_the_command_trains_what_settings_train(by_hand: dict[str, th.Tensor], t
     assert equal(by_hand, weights(PPO.load(run / f"{ENV}.zip")))
 
 
-class Interrupt(BaseCallback):
-    """Raise an error after a number of agent steps."""
-
-    def __init__(self, after: int, error: type[BaseException]) -> None:
-        super().__init__()
-        self._limit, self._error = after, error  # settings, under their own names, would make it another run
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= self._limit:
-            raise self._error
-        return True
-
-
 def test_options_do_not_change_what_is_learned(
     settings: Settings, by_hand: dict[str, th.Tensor], tmp_path: Path
 ) -> None:
@@ -96,17 +82,6 @@ def test_options_do_not_change_what_is_learned(
         path.name for path in folder.iterdir()
     }
     assert not (folder / "checkpoints").exists()
-
-
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_an_interrupted_run_goes_on(
-    error: type[BaseException], settings: Settings, by_hand: dict[str, th.Tensor], tmp_path: Path
-) -> None:
-    options = RunOptions(checkpoint_freq=1)
-    with pytest.raises(error):
-        train_settings(settings, 3, tmp_path, options, [Interrupt(900, error)])
-    assert (tmp_path / "model.zip").is_file() == (error is KeyboardInterrupt)
-    assert equal(by_hand, weights(train_settings(settings, 3, tmp_path, options, [Interrupt(10**9, error)])))
 
 
 @pytest.mark.parametrize("algo", ["saf", "qplex"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -149,36 +147,6 @@ def test_differences_are_drawn_at_their_values_by_level() -> None:
     dots, _, (bars,) = drawn["ippo"]
     assert dots.get_xydata().tolist() == [[2.0, 0.0], [0.5, 2.0]]
     assert bars.get_segments()[0].tolist() == [[1.0, 0.0], [4.0, 0.0]]
-
-
-def test_pooled_differences_are_diamonds_and_what_does_not_matter_is_grey() -> None:
-    rows = [("ippo", "c=1", 2.0, False), ("ippo-separate", "c=1", 3.0, False), ("ippo", "all", 2.5, True)]
-    table = pd.DataFrame(rows, columns=["method", "level", "value", "pooled"]).assign(low=np.nan, high=np.nan)
-    (axes,) = draw_differences(table, names={"ippo": "IPPO, shared"}, band=2).axes
-    containers: list[Any] = list(axes.containers)
-    marks = [(each.get_label(), each.lines[0].get_marker()) for each in containers]
-    assert marks[0] == ("IPPO, shared", "o") and marks[2] == ("ippo-separate", "s")
-    assert marks[1][1] == "D" and containers[1].lines[0].get_xydata().tolist() == [[2.5, 2.0]]
-    band: Any = axes.patches[0]
-    assert (band.get_x(), band.get_width()) == (-2, 4)
-
-
-def test_the_largest_possible_return_is_a_line() -> None:
-    bars = pd.DataFrame({"method": "saf", "seed": 0, "c": [1, 2], "score": 1.0})
-    (axes,) = draw_levels(bars, "c", names={"saf": "SAF"}, maximum=25).axes
-    lines: dict[Any, Any] = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
-    assert list(lines["largest possible"]) == [25, 25]
-    assert "SAF" in [container.get_label() for container in axes.containers]
-
-
-def test_panels_have_their_own_levels() -> None:
-    rows = [("saf", 0, 1, 2.0, "a"), ("saf", 0, 2, 3.0, "a"), ("saf", 0, 5, 1.0, "b")]
-    table = pd.DataFrame(rows, columns=["method", "seed", "coordination", "score", "task"])
-    ticks = [
-        [label.get_text() for label in axes.get_xticklabels()]
-        for axes in draw_levels(table, "coordination", None, "task").axes
-    ]
-    assert ticks == [["1", "2"], ["5"]]
 
 
 def test_methods_keep_their_styles_and_none_looks_like_another() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch as th
@@ -90,40 +88,3 @@ def test_without_a_search_every_row_is_encoded(once: bool, device: str) -> None:
     encoder = RowEncoder(counter, once)
     assert encoder.rows(x).of_rows().shape == (3, 2) and counter.calls[0] is x
     assert [len(part) for part in encoder.find(x)] == [3, 3]
-
-
-#: Three rows of two teams that see 1, 2 and 3, 1; and the team of each row.
-JOINT, AGENT = th.tensor([[[1], [2]], [[1], [2]], [[3], [1]]]), th.tensor([0, 1, 0])
-
-
-@pytest.mark.parametrize(
-    ("seen", "once", "calls"),
-    [
-        ([[1], [1], [1]], True, [[[1]], [[2], [3]]]),
-        ([[3], [2], [1]], True, [[[3], [2], [1]]]),
-        ([[1], [1], [1]], False, [[[1], [1], [1]], [[1], [2], [1], [2], [3], [1]]]),
-    ],
-    ids=["some known", "all known", "every row"],
-)
-def test_joint_rows_encode_only_what_is_not_known_yet(seen: list[list[int]], once: bool, calls: Any) -> None:
-    counter = Counter()
-    encoder = RowEncoder(counter, once)
-    teams = encoder.joint_rows(JOINT, AGENT, encoder.rows(th.tensor(seen)))
-    assert [call.tolist() for call in counter.calls] == calls
-    assert th.equal(teams.features[teams.members], 2.0 * (JOINT if not once else JOINT[[0, 2]]))
-    assert teams.of_rows(teams.features[teams.members]).tolist() == [[2.0], [4.0], [6.0]]
-
-
-def test_heads_are_applied_once_per_observation_and_agent() -> None:
-    calls: list[list[float]] = []
-
-    def head(features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
-        values = features[:, 0] if agent is None else features[:, 0] + 100 * agent
-        calls.append(values.tolist())
-        return values
-
-    encoder = RowEncoder(Counter())
-    own = encoder.rows(th.tensor([[1], [1], [1], [3]]))
-    assert encoder.apply(head, own, None).tolist() == [2, 2, 2, 6]
-    assert encoder.apply(head, own, th.tensor([0, 1, 0, 0])).tolist() == [2, 102, 2, 6]
-    assert calls == [[2, 6], [2, 102, 6]]

@@ -14,6 +14,52 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
+BOX = spaces.Box(-1, 1, (2,), np.float32)
+ZEROS = np.zeros(2, np.float32)
+
+
+class Game(ParallelEnv[str, Any, Any]):
+    """Two agents, four steps, reward 1 for each agent and step; subclasses change what a step returns."""
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "game"}
+    possible_agents: Any = ["a", "b"]
+    length = 4
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        return BOX
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return spaces.Discrete(3)
+
+    def see(self, agent: Any) -> Any:
+        return ZEROS
+
+    def info(self, agent: Any) -> dict[str, Any]:
+        return {}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.agents, self.t = list(self.possible_agents), 0
+        return {a: self.see(a) for a in self.agents}, {a: self.info(a) for a in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        self.t += 1
+        self.actions = actions
+        over, team = self.t == self.length, list(self.agents)
+        out: list[Any] = [
+            {a: self.see(a) for a in team},
+            dict.fromkeys(team, 1.0),
+            dict.fromkeys(team, False),
+            dict.fromkeys(team, over),
+            {a: self.info(a) for a in team},
+        ]
+        self.change(out)
+        if over:
+            self.agents = []
+        return tuple(out)
+
+    def change(self, out: list[Any]) -> None:
+        pass
+
 
 class CounterEnv(ParallelEnv[str, Any, Any]):
     """
