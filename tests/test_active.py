@@ -114,7 +114,7 @@ def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
     assert set(make_team_env(TellingEnv, action_masks=True, masks="info").reset()) == {*names, "active", "action_mask"}
 
 
-def rows_with(**entries: spaces.Space[Any]) -> TeamSpaces:
+def rows_with(**entries: Any) -> TeamSpaces:
     return TeamSpaces.of_rows(spaces.Dict(obs=spaces.Discrete(3), **entries), spaces.Discrete(2), 2)
 
 

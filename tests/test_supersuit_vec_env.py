@@ -124,7 +124,7 @@ def test_games_play_as_if_each_was_alone(bridge: Bridge, n_cpus: int, n_games: i
         assert np.array_equal(np.asarray(observations), [game[agent] for game in expected for agent in game])
         actions = rng.integers(0, 4, venv.num_envs)
         observations, rewards, dones, _ = venv.step(actions)
-        assert (rewards.dtype, dones.dtype) == (np.float32, np.bool_)
+        assert (rewards.dtype.name, dones.dtype.name) == ("float32", "bool")
         rows = iter(range(venv.num_envs))
         for game, env in enumerate(alone):
             stepped, reward, _, truncations, _ = env.step({a: actions[next(rows)] for a in env.agents})
@@ -615,6 +615,12 @@ class OddSpacesEnv(CounterEnv):
         super().__init__()
         self._observation_space = observation_space or self._observation_space
         self._action_space = action_space or self._action_space
+
+
+@pytest.mark.parametrize("name", ["n_games", "n_cpus"])
+def test_wrong_counts(bridge: Bridge, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} .*got 0"):
+        bridge(CounterEnv, **{"n_games": 1, name: 0})
 
 
 box = spaces.Box(-1.0, np.array([1.0, 0.7], np.float32), (2,), np.float32)
