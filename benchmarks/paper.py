@@ -1,0 +1,301 @@
+"""
+Write tables and figures of the page of results, ``results/README.md``, from the raw data in ``results/paper``::
+
+    python -m benchmarks.paper [--add NAME FOLDER]
+
+``--add`` first adds the finished cells of an experiment's folder to the raw data. Sentences of the page are written by
+hand, outside the marks ``<!-- name -->`` and ``<!-- end -->``. Differences are in percent of the treasures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sb3_saf.experiments.comparisons import MARGIN, Difference, holm, pooled, shares
+from sb3_saf.experiments.definitions import METHODS, RANDOM
+from sb3_saf.experiments.tables import CURVES, RUNS, Frames, marl_eval, read_results
+from sb3_saf.teams.files import write_text
+from sb3_saf.training.figures import draw_curves, draw_differences
+from sb3_saf.training.statistics import Estimate
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+RAW: Final = ROOT / "results" / "paper"
+PAGES: Final = (ROOT / "results" / "README.md", RAW / "README.md")
+#: The experiments of the grid; others have settings of their own.
+GRID: Final = ("coordination", "heterogeneity", "joint")
+#: Methods of the grid; SAF is compared with the others.
+MAIN: Final = ("saf", "mappo", "ippo-separate", "ippo")
+WORDS: Final = {name: method.words for name, method in METHODS.items()}
+_COLUMNS: Final = ["task", "level"]
+
+
+class Claim(NamedTuple):
+    """
+    A claim of the paper and the test declared for it.
+
+    :param text: the claim
+    :param pair: methods, first minus second
+    :param where: the settings in words
+    :param rows: tests of these settings
+    """
+
+    text: str
+    pair: tuple[str, str]
+    where: str
+    rows: pd.DataFrame
+
+
+def read(name: str) -> Frames:
+    """Return the raw data of an experiment."""
+    return read_results(RAW, name)
+
+
+def grid() -> Frames:
+    """Return the raw data of the grid, each cell once, in the order of tasks and levels."""
+    frames = [read(name) for name in GRID]
+    tests = pd.concat([frame.tests for frame in frames]).drop_duplicates(["method", *_COLUMNS, "seed"])
+    curves = pd.concat([frame.curves for frame in frames]).drop_duplicates(["method", *_COLUMNS, "seed", "game_steps"])
+    tasks = ["TeamSupport", "TeamTogether", "KeyForTreasure"]
+    tests["task"] = pd.Categorical(tests["task"], tasks)
+    tests = tests.sort_values(["task", "coordination", "heterogeneity"], kind="stable").astype({"task": str})
+    group = np.where(tests["heterogeneity"] == 1, "coordination", "joint")
+    tests["group"] = np.where((tests["heterogeneity"] > 1) & (tests["coordination"] == 1), "heterogeneity", group)
+    return Frames(tests, curves)
+
+
+def claims(tests: pd.DataFrame, pixels: pd.DataFrame) -> list[Claim]:
+    """Return the claims that these data can test."""
+    general = 'SAF is better than {} "across different tasks and different heterogeneity and coordination levels"'
+    everywhere = "all settings"
+    hidden = "TeamSupport, h = 5, zones as pixels"
+    coordinated, zones = tests[tests["coordination"] > 1], tests[tests["heterogeneity"] > 1]
+    return [
+        Claim(general.format("MAPPO"), ("saf", "mappo"), everywhere, tests),
+        Claim(general.format("IPPO"), ("saf", "ippo-separate"), everywhere, tests),
+        Claim("high coordination favours SAF", ("saf", "mappo"), "c > 1", coordinated),
+        Claim("high heterogeneity favours SAF", ("saf", "mappo"), "h > 1", zones),
+        Claim("the same, zones as the paper's agents see them", ("saf", "mappo"), hidden, pixels),
+        Claim("the pool helps in heterogeneous maps", ("saf", "saf-no-pool"), hidden, pixels),
+        Claim("the knowledge source helps", ("saf", "saf-no-ks"), hidden, pixels),
+    ]
+
+
+def difference(rows: pd.DataFrame, first: str, second: str) -> Difference | None:
+    """Return the paired difference of two methods, over settings if there are three or more, else over seeds."""
+    return pooled(shares(rows, first, second))
+
+
+def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))
+
+
+def show(estimate: Estimate) -> str:
+    """Return a difference with its interval."""
+    value, low, high = estimate
+    return f"{value:+.1f}" if np.isnan(low) else f"{value:+.1f} [{low:.1f}, {high:.1f}]"
+
+
+def answer(tests: pd.DataFrame) -> str:
+    """Return SAF's differences from the three other methods in one sentence each."""
+    lines = []
+    for other in MAIN[1:]:
+        pairs = shares(tests, "saf", other)
+        found = pooled(pairs)
+        if found is not None:
+            more = (pairs["difference"] > 0).sum()
+            lines.append(
+                f"- SAF minus {WORDS[other]}: **{show(found.estimate)} % of the treasures** over {found.n} settings, "
+                f"{len(pairs)} pairs of runs: {found.verdict}. SAF collected more in {more} of them."
+            )
+    return "\n".join(lines)
+
+
+def methods_table(tests: pd.DataFrame) -> str:
+    """Return a row for each method: mean share of the treasures by task and group, and its cost."""
+    trained_methods = tests[tests["method"].isin(MAIN)].groupby(_COLUMNS)["method"].transform("nunique")
+    common = tests.loc[trained_methods.index[trained_methods == len(MAIN)], _COLUMNS].drop_duplicates()
+    tests = tests.merge(common, on=_COLUMNS)
+    columns = {
+        **{task: tests["task"] == task for task in dict.fromkeys(tests["task"])},
+        **{group: tests["group"] == group for group in ("heterogeneity", "joint")},
+        "all": tests["seed"] >= 0,
+    }
+    body = []
+    for method in (*MAIN, RANDOM):
+        here = tests["method"] == method
+        cells = [_mean_share(tests[here & chosen]) for chosen in columns.values()]
+        trained = tests[here & (tests["game_steps"] > 0)]
+        seconds = "" if trained.empty else f"{trained['processor_seconds'].mean():.0f}"
+        probability = "" if method in ("saf", RANDOM) else _probability(tests, method)
+        body.append([WORDS[method], *cells, probability, seconds])
+    return table(["method", *columns, "SAF is better", "processor seconds"], body)
+
+
+def _mean_share(rows: pd.DataFrame) -> str:
+    """Return the mean over settings of the mean over seeds, in percent of the treasures."""
+    by_setting = (100 * rows["return_mean"] / rows["max_return"]).groupby([rows["task"], rows["level"]]).mean()
+    return "" if by_setting.empty else f"{by_setting.mean():.1f}"
+
+
+def _probability(tests: pd.DataFrame, other: str) -> str:
+    """Return the probability that a run of SAF is better, ties half, the mean over settings."""
+    chances = []
+    for _, rows in tests.groupby(_COLUMNS):
+        ours, theirs = (rows.loc[rows["method"] == name, "return_mean"].to_numpy() for name in ("saf", other))
+        if len(ours) and len(theirs):
+            chances.append((np.sign(ours[:, None] - theirs).mean() + 1) / 2)
+    return f"{np.mean(chances):.2f}"
+
+
+def claims_table(found: Sequence[Claim]) -> str:
+    """Return a row for each claim, with p values corrected for their number (Holm)."""
+    tested = [(claim, difference(claim.rows, *claim.pair)) for claim in found]
+    shown = [(claim, test) for claim, test in tested if test is not None and not np.isnan(test.p)]
+    corrected = holm([test.p for _, test in shown])
+    body = []
+    for (claim, test), p in zip(shown, corrected, strict=True):
+        first, second = (WORDS[method] for method in claim.pair)
+        supported = p < 0.05 and test.estimate.value > 0
+        verdict = (
+            "supported" if supported else "**not supported**" + (", equivalent" if test.p_equivalent < 0.05 else "")
+        )
+        where = f"{first} minus {second}, {claim.where}, n = {test.n}"
+        body.append([claim.text, where, show(test.estimate), f"{p:.2g}", verdict])
+    return table(["the paper's claim", "test, % of the treasures", "effect", "p (Holm)", ""], body)
+
+
+def losses(tests: pd.DataFrame) -> str:
+    """Return the share of the treasures of each method at c = 1, 2, 3 (h = 1), by task."""
+    share = (100 * tests["return_mean"] / tests["max_return"]).groupby([tests["task"], tests["level"], tests["method"]])
+    levels, means, body = [f"c{c}-h1" for c in (1, 2, 3)], share.mean(), []
+    for task in dict.fromkeys(tests["task"]):
+        rows = [[means.get((task, level, method)) for level in levels] for method in MAIN]
+        body.append([task, *(", ".join("–" if mean is None else f"{mean:.0f}" for mean in row) for row in rows)])
+    return table(["task", *(WORDS[method] for method in MAIN)], body)
+
+
+def settings_table(tests: pd.DataFrame) -> str:
+    """Return the mean return in each setting, with the smallest number of seeds."""
+    body = []
+    for (task, c, h), rows in tests.groupby(["task", "coordination", "heterogeneity"], sort=False):
+        means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"] != RANDOM]
+        cells = [f"{means[method]:.1f}" if method in means else "" for method in (RANDOM, *MAIN)]
+        body.append([f"{task}, c = {c}, h = {h}", *cells, str(trained.groupby("method")["seed"].nunique().min())])
+    return table(["setting", *(WORDS[method] for method in (RANDOM, *MAIN)), "seeds"], body)
+
+
+def other_table(names: Iterable[str]) -> str:
+    """Return the mean return of each method of experiments with settings of their own."""
+    body = []
+    for name in names:
+        trained = read(name).tests.query("game_steps > 0")
+        for (task, level, method), rows in trained.groupby(["task", "level", "method"], sort=False):
+            mean = f"{rows['return_mean'].mean():.1f}"
+            body.append([name, f"{task}, {level}", WORDS.get(method, method), str(len(rows)), mean])
+    return table(["experiment", "setting", "method", "seeds", "return of 100"], body)
+
+
+def costs(names: Iterable[str]) -> str:
+    """Return processor hours of training and tests, commits, and processors of all raw data."""
+    tests = pd.concat([read(name).tests for name in names])
+    tests = tests.drop_duplicates(["cell", "processor_seconds"])
+    hours = [tests[column].sum() / 3600 for column in ("processor_seconds", "wall_seconds_test")]
+    commits, processors = (", ".join(sorted(set(tests[column]))) for column in ("commit", "processor"))
+    return f"{hours[0]:.1f} core-hours of training, {hours[1]:.1f} of tests, commit {commits}, {processors}."
+
+
+def forest(tests: pd.DataFrame) -> pd.DataFrame:
+    """Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group."""
+    rows = []
+    for group, of_group in tests.groupby("group", sort=False):
+        for name, here in [*of_group.groupby(_COLUMNS, sort=False), (None, of_group)]:
+            for other in MAIN[1:3]:
+                found = pooled(shares(here, "saf", other))
+                if found is not None:
+                    label = "together" if name is None else f"{name[0]}, {name[1].replace('-', ', ')}"
+                    rows.append((group, label, other, *found.estimate, name is None))
+    return pd.DataFrame(rows, columns=["group", "level", "method", "value", "low", "high", "pooled"])
+
+
+def curves(frames: Frames) -> pd.DataFrame:
+    """Return the evaluations of the settings with most seeds."""
+    parts = [("TeamSupport", "c2-h1", "TeamSupport, c = 2"), ("TeamSupport", "c1-h5", "TeamSupport, h = 5")]
+    here = frames.curves[frames.curves["method"].isin(MAIN)]
+    return pd.concat(
+        [here[(here["task"] == task) & (here["level"] == level)].assign(panel=name) for task, level, name in parts]
+    )
+
+
+def fill(text: str, blocks: dict[str, str]) -> str:
+    """Return a page with the blocks between its marks."""
+
+    def block(mark: re.Match[str]) -> str:
+        if mark["name"] not in blocks:
+            raise ValueError(f"expected marks of {', '.join(blocks)}, got <!-- {mark['name']} -->")
+        return f"<!-- {mark['name']} -->\n\n{blocks[mark['name']]}\n\n<!-- end -->"
+
+    return re.sub(r"<!-- (?P<name>\w+) -->.*?<!-- end -->", block, text, flags=re.DOTALL)
+
+
+def pages() -> dict[Path, str]:
+    """Return the pages with their blocks made of the raw data."""
+    names = sorted(path.parent.name for path in RAW.glob(f"*/{RUNS}"))
+    others = [name for name in names if name not in GRID]
+    tests = grid().tests
+    pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
+    blocks = {
+        "answer": answer(tests),
+        "methods": methods_table(tests),
+        "claims": claims_table(claims(tests, pixels)),
+        "losses": losses(tests),
+        "settings": settings_table(tests),
+        "others": other_table(others),
+        "costs": costs(names),
+    }
+    return {page: fill(page.read_text(encoding="utf-8"), blocks) for page in PAGES}
+
+
+def add(name: str, folder: Path) -> None:
+    """Add the finished cells of an experiment's folder, ``RESULTS/EXPERIMENT``, to the raw data."""
+    frames = [read_results(folder.parent, folder.name)]
+    if (RAW / name).is_dir():
+        frames.insert(0, read(name))
+    tests = pd.concat([frame.tests for frame in frames]).drop_duplicates(["cell", "level"])
+    together = pd.concat([frame.curves for frame in frames]).drop_duplicates(
+        ["method", *_COLUMNS, "seed", "game_steps"]
+    )
+    (RAW / name).mkdir(parents=True, exist_ok=True)
+    for file, frame in ((RUNS, tests), (CURVES, together)):
+        write_text(RAW / name / file, frame.to_csv(index=False, lineterminator="\n"))
+    write_text(RAW / name / "marl_eval.json", json.dumps(marl_eval(Frames(tests, together), "hecogrid")))
+
+
+def main() -> None:
+    """Add data and write pages and figures."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.paper", description=(__doc__ or "").split("::")[0])
+    parser.add_argument(
+        "--add", nargs=2, action="append", default=[], metavar=("NAME", "FOLDER"), help="finished cells"
+    )
+    for name, folder in parser.parse_args().add:
+        add(name, Path(folder))
+    for page, text in pages().items():
+        write_text(page, text)
+    frames, band = grid(), 100 * MARGIN
+    figure = draw_differences(
+        forest(frames.tests), panel="group", x_label="SAF minus other, % of the treasures", names=WORDS, band=band
+    )
+    figure.savefig(RAW / "forest.png", dpi=120)
+    draw_curves(curves(frames), panel="panel", names=WORDS).savefig(RAW / "curves.png", dpi=120)
+
+
+if __name__ == "__main__":
+    main()
