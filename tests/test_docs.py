@@ -90,6 +90,15 @@ def test_code_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.Monk
     exec(compile(code, page, "exec"), names)
 
 
+@pytest.mark.parametrize("page", FIRST_PAGES)
+def test_no_block_of_the_first_pages_is_left_out(page: str) -> None:
+    """Blocks of other languages, or indented, would be run by neither this file nor tests/test_first_pages.py."""
+    languages = re.findall(r"```(\w+)", (ROOT / page).read_text(encoding="utf-8"))
+    assert set(languages) <= {"sh", "python", "pycon"}
+    assert len(languages) == sum(len(blocks(ROOT / page, language)) for language in set(languages))
+    assert "python" not in languages or page in RUN
+
+
 @EVERY_PAGE
 def test_links_inside_the_repository_resolve(page: Path) -> None:
     for link in LINK.findall(text_of(page)):

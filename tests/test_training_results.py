@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -134,6 +135,14 @@ def test_mistakes_in_enjoy_are_one_line(
 ) -> None:
     quiet = [] if "--gif" in options else ["--no-render"]
     assert words in failed(["-f", str(logs), *quiet, *options], capsys, zoo_enjoy.main)
+
+
+def test_the_error_without_a_run_prints_a_command_that_trains(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = failed(["--no-render", "-f", str(tmp_path)], capsys, zoo_enjoy.main)
+    options = zoo_train.make_parser().parse_args(shlex.split(line.partition("-m sb3_saf.train ")[2]))
+    assert options.log_folder == tmp_path
 
 
 def test_a_reader_may_leave(logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
