@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch as th
 from torch import nn
 
-from sb3_saf.networks import attention
+from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.distributions import LeanCategorical
 from sb3_saf.networks.layers import mlp, side_by_side
 from sb3_saf.networks.tanh import Tanh
@@ -75,17 +75,17 @@ def test_compiled_attention_is_attention(queries: th.Tensor, masked: bool, of_we
     if active is not None:
         active[2] = False
 
-    def of(core: Any) -> Callable[..., th.Tensor]:
-        def run(queries: th.Tensor, sources: th.Tensor) -> th.Tensor:
-            taken, weights = core(queries, sources, active)
-            return weights if of_weights else taken
+    single = Attention(16)
+    nn.init.zeros_(single.out.bias)
 
-        return run
+    def attend(queries: th.Tensor, sources: th.Tensor) -> th.Tensor:
+        module = single if queries.dtype == th.float32 else copy.deepcopy(single).double()  # double is not compiled
+        attended = module(queries, sources, active)
+        return attended.weights if of_weights else attended.values
 
-    found = gradients(of(attention._Taken.apply), queries, sources)
-    expected = gradients(of(attention._taken), queries, sources)
+    found, expected = gradients(attend, queries, sources), gradients(attend, queries.double(), sources.double())
     for one, other in zip(found, expected, strict=True):
-        th.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+        th.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-5)
     if active is not None:
         assert not found[0][2].any()
 

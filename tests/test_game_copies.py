@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,9 +73,10 @@ def test_copies_play_on_as_the_games(name: str, n_cpus: int) -> None:
         other.load_checkpoint_state(state)
         assert all(("state" in game) == (name in BY_METHODS) for game in state["games"])
         if name == "global generators" and n_cpus == 1:
-            before = game_copies._global_generators()
+            before = random.getstate(), np.random.get_state()  # noqa: NPY002
             expected = played(venv, 20)
-            game_copies._set_global_generators(before)
+            random.setstate(before[0])
+            np.random.set_state(before[1])  # noqa: NPY002
         else:
             expected = played(venv, 20)
         assert played(other, 20) == expected

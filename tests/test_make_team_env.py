@@ -11,8 +11,6 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import RandomPolicy, evaluate_team
 from sb3_saf.make import make_team_env
@@ -20,16 +18,6 @@ from tests.team_venv import Array, TeamVenv
 from tests.toy_envs import CounterEnv
 
 SMALL: dict[str, Any] = {"n_agents": 3, "grid_size": 10, "n_treasures": 12, "max_cycles": 6, "view_size": 5}
-
-
-def test_the_chain() -> None:
-    env = make_team_env("TeamTogether", n_envs=2, time_limit="bootstrap", **SMALL)
-    assert isinstance(env, CentralizedValueWrapper)
-    assert isinstance(env.venv, TeamMonitor)
-    assert env.venv.venv is env.unwrapped
-    assert (env.n_agents, env.n_games, env.num_envs, env.time_limit) == (3, 2, 6, "bootstrap")
-    assert make_team_env("TeamTogether", **SMALL).time_limit == "terminal"
-    assert make_team_env("TeamTogether", **SMALL).n_games == 1
 
 
 def test_stock_ppo_trains_on_it_and_logs_team_returns(tmp_path: Path) -> None:

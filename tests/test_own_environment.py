@@ -179,21 +179,15 @@ def test_qplex_explores_legal_actions_by_agent() -> None:
 
 
 def test_masks_in_pettingzoos_form_are_understood() -> None:
-    env = make_team_env(lambda: TellingEnv(n_agents=2), n_envs=1, seed=0)
-    model = PPO("MAPPOPolicy", env, device="cpu", seed=0)
-    observations, _ = TellingEnv(n_agents=2).reset(seed=0)
-    for agent in ("agent_0", "agent_1"):
-        given = observations[agent]
-        action, _ = model.predict(given, deterministic=True)
-        assert given["action_mask"][action] == 1
-        assert model.predict(observations, deterministic=True)[0][agent] == action
-        assert (
-            action
-            == model.predict({"obs": given["observation"], "action_mask": given["action_mask"]}, None, None, True)[0]
-        )
-    unmasked = PPO("MAPPOPolicy", make_team_env(CounterEnv, seed=0), device="cpu")
-    with pytest.raises(ValueError, match="expected no 'action_mask'"):
-        unmasked.predict(given)
+    model, unmasked = (
+        PPO("MAPPOPolicy", make_team_env(game(n_agents=2), seed=0), device="cpu", seed=0)
+        for game in (TellingEnv, CounterEnv)
+    )
+    for given in TellingEnv(n_agents=2).reset(seed=0)[0].values():
+        row = {"obs": given["observation"], "action_mask": given["action_mask"]}
+        assert model.predict(given, None, None, True)[0] == model.predict(row, deterministic=True)[0]
+        with pytest.raises(ValueError, match="expected no 'action_mask'"):
+            unmasked.predict(given)
 
 
 def test_a_random_policy_of_an_environment() -> None:

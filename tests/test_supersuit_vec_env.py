@@ -421,17 +421,13 @@ def test_what_cannot_leave_a_worker(bridge: Bridge) -> None:
 
 
 @one_and_two_cpus
-def test_maskable_ppo_runs(bridge: Bridge, n_cpus: int) -> None:
+def test_masks_by_row(bridge: Bridge, n_cpus: int) -> None:
     venv = bridge(lambda: CounterEnv(3, deaths={1: 1}), n_games=2, n_cpus=n_cpus)
     venv.reset()
     assert np.array_equal(np.stack(venv.env_method("action_masks")), np.tile(np.eye(3, 4, dtype=bool), (2, 1)))
     venv.step(zeros(venv))
     masks = venv.env_method("action_masks", indices=[3, 4])
     assert [mask.tolist() for mask in masks] == [[True, False, False, False], [True] * 4]  # agent 1 has ended
-    model = MaskablePPO("MlpPolicy", venv, n_steps=3, batch_size=18, n_epochs=1, seed=0, device="cpu").learn(18)
-    actions = model.rollout_buffer.actions.reshape(6, 3)  # by row and step
-    assert actions[[0, 2, 3, 5]].tolist() == [[0] * 3, [2] * 3] * 2
-    assert actions[[1, 4], 0].tolist() == [1, 1]
 
 
 # ---- images

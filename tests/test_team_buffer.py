@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
+from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from tests.team_venv import VECTOR, Array, TeamVenv
@@ -107,19 +107,6 @@ def test_minibatches_hold_whole_teams(batch_size: int | None, sizes: list[int]) 
         np.testing.assert_array_equal(
             obs["team"].reshape(-1, N_AGENTS, N_AGENTS, 4), np.repeat(own[:, None], N_AGENTS, 1)
         )
-
-
-def test_minibatches_say_which_teams_they_hold() -> None:
-    team, _ = make_both("vector")
-    for sample in team.get(12):
-        batch = sample.observations
-        assert isinstance(batch, TeamMinibatch)
-        assert set(batch) == {"obs", "agent", "episode_start"}, "the joint observation is made for those who ask"
-        assert batch.teams.rows is None and batch.teams.active is None
-        assert th.equal(batch.teams.observations.flatten(0, 1), batch["obs"])
-        assert set(dict(batch.items())) == {"obs", "agent", "episode_start", "team"}
-        with pytest.raises(KeyError, match="other"):
-            batch["other"]
 
 
 def test_order_is_drawn_anew_from_the_generator_that_sb3_seeds() -> None:
