@@ -217,13 +217,15 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
     """Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group."""
     rows = []
     for group, of_group in tests.groupby("group", sort=False):
-        for name, here in [*of_group.groupby(_COLUMNS, sort=False), (None, of_group)]:
+        panel = "coordination" if group == "coordination" else "heterogeneity"
+        settings = of_group.groupby(["task", "coordination", "heterogeneity"], sort=False)
+        named = [(f"{task}, c = {c}, h = {h}", here) for (task, c, h), here in settings]
+        for label, here in [*named, (f"{group}, together", of_group)]:
             for other in MAIN[1:3]:
                 found = pooled(shares(here, "saf", other))
                 if found is not None:
-                    label = "together" if name is None else f"{name[0]}, {name[1].replace('-', ', ')}"
-                    rows.append((group, label, other, *found.estimate, name is None))
-    return pd.DataFrame(rows, columns=["group", "level", "method", "value", "low", "high", "pooled"])
+                    rows.append((panel, label, other, *found.estimate, here is of_group))
+    return pd.DataFrame(rows, columns=["panel", "level", "method", "value", "low", "high", "pooled"])
 
 
 def curves(frames: Frames) -> pd.DataFrame:
@@ -291,7 +293,7 @@ def main() -> None:
         write_text(page, text)
     frames, band = grid(), 100 * MARGIN
     figure = draw_differences(
-        forest(frames.tests), panel="group", x_label="SAF minus other, % of the treasures", names=WORDS, band=band
+        forest(frames.tests), panel="panel", x_label="SAF minus other, % of the treasures", names=WORDS, band=band
     )
     figure.savefig(RAW / "forest.png", dpi=120)
     draw_curves(curves(frames), panel="panel", names=WORDS).savefig(RAW / "curves.png", dpi=120)
