@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import shutil
 from pathlib import Path
@@ -14,8 +15,8 @@ from scipy import stats
 
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.definitions import EXPERIMENTS, Level, View, find_experiment, own_experiment
-from sb3_saf.experiments.grid import RunConfig, Selection
-from sb3_saf.experiments.page import losses, means
+from sb3_saf.experiments.grid import RunConfig, Selection, expand
+from sb3_saf.experiments.page import Content, known, losses, means
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.experiments.tables import Frames, complete, marl_eval, read_results
@@ -249,6 +250,17 @@ def test_aggregates_compare_like_with_like() -> None:
     assert list(kept.itertuples(index=False, name=None)) == [rows[0], rows[1], rows[5], rows[6]]
     apart = pd.DataFrame([("saf", 0, "a"), ("ippo", 0, "b")], columns=["method", "seed", "stratum"])
     assert complete(apart).empty
+
+
+def test_results_stand_beside_what_is_known_of_the_same_games(tmp_path: Path) -> None:
+    experiment, results = find_experiment("coordination"), Results(tmp_path)
+    config, cells = RunConfig("small"), expand(experiment, Selection((0,), ("saf",)), RunConfig("small")).cells
+    rows = [("TeamSupport", "saf", "c2-h1", "c2-h1", math.nan, 17.0, 200_000)]
+    names = ["task", "method", "train_level", "level", "success_rate", "return_mean", "game_steps"]
+    frames = Frames(pd.DataFrame(rows, columns=names), pd.DataFrame())
+    text = known(Content(experiment, config, results, cells, [], [], frames, []))
+    line = "TeamSupport, c=2, h=1, SAF: return, sum over agents: 17; random 1.38; script that sees 7 x 7 tiles 17.03"
+    assert [part[2:] for part in text.splitlines()[2:]] == [line]
 
 
 def test_another_experiment_runs_and_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from sb3_saf.experiments.definitions import EXPERIMENTS, PROGRAM, RANDOM, Experi
 from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.tables import Frames, complete, of_view, strata
+from sb3_saf.suites.references import standing
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.statistics import (
     Estimate,
@@ -62,6 +63,7 @@ def page(content: Content) -> str:
         _missing(content),
         _pictures(content, "levels-", "differences-", "aggregates"),
         *(means(table, view) for view in views),
+        known(content),
         *(losses(table, view) for view in views if table["max_return"].notna().all()),  # levels of HECOGrid get harder
         aggregates(content.experiment, table),
         *(_comparisons(table, view) for view in views),
@@ -164,6 +166,24 @@ def means(table: pd.DataFrame, view: View) -> str:
 
 def _mean(values: pd.Series) -> str:
     return _NOTHING if values.empty else _show(mean_over_seeds(values.to_numpy()))
+
+
+def known(content: Content) -> str:
+    """Return mean results beside what is known of the same games, see ``sb3_saf.suites.references``."""
+    lines = []
+    keys = ["task", "method", "train_level", "level"]
+    means = content.frames.tests.groupby(keys)[["success_rate", "return_mean", "game_steps"]].mean()
+    cells = {(cell.task, cell.method, cell.level.slug): cell for cell in content.cells if cell.is_trained}
+    for key, cell in cells.items():
+        for level in cell.tests:
+            if (*key, level.slug) in means.index:
+                won, score, game_steps = means.loc[(*key, level.slug)]
+                settings = content.config.settings(cell, level)
+                scores = {"return": score} if pd.isna(won) else {"won": won, "return": score}
+                beside = standing(settings.environment, settings.env_kwargs, scores, int(game_steps))
+                if beside is not None:
+                    lines.append(f"- {_text(cell.task)}, {_text(level)}, {_name(cell.method)}: {beside.text}")
+    return "\n".join(["## Beside known results", "", *lines]) if lines else ""
 
 
 def losses(table: pd.DataFrame, view: View) -> str:
