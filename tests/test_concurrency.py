@@ -21,6 +21,7 @@ from stable_baselines3 import PPO
 
 import sb3_saf
 from sb3_saf import make_vec_env
+from tests.test_game_copies import played
 from tests.toy_envs import LazyEnv
 
 LEVEL: Final[dict[str, Any]] = {
@@ -41,17 +42,6 @@ def supersuit(seed: int) -> Any:
 
 
 MAKERS: Final = pytest.mark.parametrize("make", [native, supersuit])
-
-
-def played(venv: Any, n_steps: int = 20) -> list[bytes]:
-    """Return observations and rewards of fixed actions."""
-    rng = np.random.default_rng(0)
-    seen = []
-    for _ in range(n_steps):
-        observations, rewards, dones, _ = venv.step(rng.integers(0, 4, venv.num_envs))
-        parts = observations.values() if isinstance(observations, dict) else [observations]
-        seen += [np.asarray(part).tobytes() for part in (*parts, rewards, dones)]
-    return seen
 
 
 def begun(make: Callable[[int], Any], seed: int = 0) -> Any:

@@ -50,7 +50,8 @@ GAMES: dict[str, Any] = {
 BY_METHODS = {"its own methods"}
 
 
-def played(venv: SuperSuitVecEnv, n_steps: int) -> list[bytes]:
+def played(venv: Any, n_steps: int = 20) -> list[bytes]:
+    """Return observations, rewards and dones of fixed actions."""
     rng = np.random.default_rng(0)
     n_choices, shape = getattr(venv.action_space, "n", 2), (venv.num_envs, *(venv.action_space.shape or ()))
     steps = [venv.step(rng.integers(0, n_choices, shape)) for _ in range(n_steps)]

@@ -107,6 +107,8 @@ def test_minibatches_hold_whole_teams(batch_size: int | None, sizes: list[int]) 
         np.testing.assert_array_equal(
             obs["team"].reshape(-1, N_AGENTS, N_AGENTS, 4), np.repeat(own[:, None], N_AGENTS, 1)
         )
+    with pytest.raises(KeyError, match="other"):
+        samples[0].observations["other"]
 
 
 def test_order_is_drawn_anew_from_the_generator_that_sb3_seeds() -> None:
