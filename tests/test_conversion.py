@@ -138,7 +138,7 @@ def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: P
                 alone, _ = model.predict({agent: observations[agent]}, deterministic=True)
                 np.testing.assert_allclose(alone[agent], action, atol=1e-6)
                 if kind == "ambiguous" and agent != "c":
-                    with pytest.raises(ValueError, match=r"name the agent: predict\(\{'agent': observation\}\)"):
+                    with pytest.raises(ValueError, match=r"name the agent: \{'agent': observation\}"):
                         model.predict(observations[agent])
                     continue
                 nameless, _ = model.predict(observations[agent], deterministic=True)

@@ -19,9 +19,9 @@ from __future__ import annotations
 
 import argparse
 import base64
-import copy
 import json
 from collections.abc import Mapping
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -30,21 +30,19 @@ import numpy as np
 import numpy.typing as npt
 
 # export_actors writes this code in place of its import.
-from sb3_saf.teams.conversion import AgentConversion, pixels_to_codes
+from sb3_saf.teams.conversion import CLASSIC, AgentConversion, Given, RowForm, given_by_game, pixels_to_codes
 
 Array: TypeAlias = npt.NDArray[Any]
 
 
 class Memory:
     """
-    Memory of an actor in an episode: its states (K, ...) by name, zeros at first; :meth:`Actor.act` updates them.
-
-    Make a new one for each episode. Observations by agent have a memory each, in ``agents``.
+    Memory of an actor in an episode: its states (K, ...) by name, or those of each agent by the agent's name; zeros at
+    first, updated by :meth:`Actor.act`. Make a new one for each episode.
     """
 
     def __init__(self) -> None:
-        self.states: dict[str, Array] = {}
-        self.agents: dict[Any, Memory] = {}
+        self.states: dict[Any, Any] = {}
 
 
 class Actor:
@@ -148,59 +146,53 @@ class Actor:
         :raises ValueError: for observations with a shape or dtype other than the observation space's, or not finite,
             and for invalid masks or memories
         """
-        team = self._by_agent(observation, action_mask)
-        if team is not None:
-            generator = None if deterministic else self._generator(rng)
-            memories = None if memory is None else memory.agents
-            return {
-                agent: self._of(agent).act(
-                    own,
-                    deterministic,
-                    generator,
-                    mask,
-                    None if memories is None else memories.setdefault(agent, Memory()),
-                )
-                for agent, (own, mask) in team.items()
-            }
-        inputs, is_batch, conversion = self._inputs(observation, action_mask, memory)
+        rows, given = self._rows(observation, action_mask)
+        by_agent = given is not None and given.agents is not None
+        states = self._states(memory, by_agent)
         is_drawn = not deterministic and not self.description["greedy"]
-        names = ["drawn" if is_drawn else "most_likely", *(f"next_{name}" for name in self.description["states"])]
-        actions, *states = self._run(names, inputs, self._generator(rng) if is_drawn else None)
+        predict = partial(self._predict, generator=self._generator(rng) if is_drawn else None)
+        if given is None:
+            actions, after = predict(rows, states)
+        else:
+            actions, after = given.act(predict, states, None, deterministic)
         if memory is not None:
-            memory.states = dict(zip(self.description["states"], states, strict=True))
-        if conversion is not None:
-            return conversion.game_action(actions[0])
-        return actions if is_batch else actions.squeeze(axis=0)
+            memory.states.update(after if by_agent else zip(self.description["states"], after, strict=True))
+        return actions
 
-    def _by_agent(self, observation: Any, action_mask: Any) -> dict[Any, tuple[Any, Any]] | None:
-        """Return observation and mask by agent; None for the observations of one agent."""
-        infos: Mapping[Any, Any] = {}
-        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], Mapping):
-            observation, infos = observation
-        names = self.description["agents"]
-        if names is None or not isinstance(observation, Mapping) or not observation or set(observation) - set(names):
-            return None
-        masks = {agent: (infos.get(agent) or {}).get("action_mask") for agent in observation}
-        masks |= {} if action_mask is None else dict(action_mask)
-        return {agent: (own, masks[agent]) for agent, own in observation.items()}
+    def _predict(
+        self,
+        rows: Mapping[str, Any],
+        states: Any,
+        *_: Any,
+        action_masks: Any = None,
+        generator: np.random.Generator | None = None,
+    ) -> tuple[Any, Any]:
+        """Return actions for rows, drawn if there is a generator, and the states after them."""
+        inputs, is_batch = self._inputs({"action_mask": action_masks, **rows}, states)
+        names = ["most_likely" if generator is None else "drawn"]
+        actions, *after = self._run(
+            [*names, *(f"next_{name}" for name in self.description["states"])], inputs, generator
+        )
+        return (actions if is_batch else actions.squeeze(axis=0)), after or None
 
-    def _of(self, agent: object) -> Actor:
-        """Return the actor of another agent of the team."""
-        other = copy.copy(self)
-        other.agent = _index_of(agent, self.description)
-        return other
-
-    def _conversion_of(self, observation: Any) -> AgentConversion | None:
-        """Return the conversion of an observation from the form of the game; None for rows."""
-        if self._conversions is None:
-            return None
-        known = self._conversions if self.agent is None else [self._conversions[self.agent]]
-        fitting = [one for one in known if one.fits(observation)]
-        if not fitting or all(one == fitting[0] for one in fitting):
-            return fitting[0] if fitting else None
-        if np.shape(observation) == tuple(self.description["observation"]["shape"]):
-            return None
-        raise ValueError("expected agent= of Actor.load: several kinds of agents have observations of this form")
+    def _rows(self, observation: Any, action_mask: Any) -> tuple[dict[str, Any], Given | None]:
+        """Return rows, and what the game gives, if the observation is none of rows."""
+        description = self.description
+        form = RowForm(
+            self.n_agents,
+            description["agents"],
+            self._conversions,
+            tuple(description["observation"]["shape"]),
+            description["action_mask"] == "required",
+        )
+        takes_masks = description["action_mask"] != "none"
+        given = given_by_game(form, observation, action_mask, takes_masks, self.agent)
+        if given is not None:
+            return {"action_mask": given.action_masks if takes_masks else action_mask, **given.rows}, given
+        if isinstance(observation, Mapping) and set(observation) == CLASSIC:
+            action_mask = observation["action_mask"] if action_mask is None else action_mask
+            observation = observation["observation"]
+        return {"obs": observation, "action_mask": action_mask}, None
 
     def probabilities(self, observation: Any, action_mask: Any = None, memory: Memory | None = None) -> Array:
         """
@@ -208,7 +200,7 @@ class Actor:
 
         Arguments as in :meth:`act`; the memory is not updated.
         """
-        inputs, is_batch, _ = self._inputs(observation, action_mask, memory)
+        inputs, is_batch = self._checked(observation, action_mask, memory)
         self._check_is_drawn()
         if "log_probs" not in {output.name for output in self.session.get_outputs()}:
             raise ValueError("only Discrete actions have a list of probabilities: use log_prob")
@@ -221,7 +213,7 @@ class Actor:
 
         Arguments as in :meth:`act`; the memory is not updated.
         """
-        inputs, is_batch, _ = self._inputs(observation, action_mask, memory)
+        inputs, is_batch = self._checked(observation, action_mask, memory)
         self._check_is_drawn()
         actions, choices = np.asarray(action), np.asarray(self.description["choices"])
         actions = actions.reshape(len(inputs["observation"]), -1)
@@ -265,29 +257,31 @@ class Actor:
         outputs: list[Array] = self.session.run(names, feeds)
         return outputs
 
-    def _inputs(
-        self, observation: Any, action_mask: Any, memory: Memory | None
-    ) -> tuple[dict[str, Array], bool, AgentConversion | None]:
-        """Return the checked inputs of the graph by name, whether they are a batch, and their conversion, if any."""
-        conversion, mask_of_observation = self._conversion_of(observation), None
-        if conversion is not None:
-            observation, mask_of_observation = conversion.split(observation)
-            observation = conversion.own(observation)
-        elif isinstance(observation, Mapping) and set(observation) == {"observation", "action_mask"}:
-            observation, mask_of_observation = observation["observation"], observation["action_mask"]
-        action_mask = mask_of_observation if action_mask is None else action_mask
-        if conversion is not None and (action_mask is not None or self.description["action_mask"] == "required"):
-            action_mask = conversion.mask(action_mask)
-        batch, is_batch = self._batch(observation)
-        inputs = {"observation": batch, **self._states(memory, len(batch))}
-        mask = self._mask(action_mask, len(batch))
+    def _checked(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[dict[str, Array], bool]:
+        """Return the inputs of the graph for an observation of any form, and whether they are a batch."""
+        rows, given = self._rows(observation, action_mask)
+        inputs, is_batch = self._inputs(rows, self._states(memory))
+        return inputs, is_batch and (given is None or given.agents is not None)
+
+    def _inputs(self, rows: Mapping[str, Any], states: Any) -> tuple[dict[str, Array], bool]:
+        """Return the checked inputs of the graph by name, and whether they are a batch."""
+        batch, is_batch = self._batch(rows["obs"])
+        inputs = {"observation": batch, **dict(zip(self.description["states"], states or (), strict=False))}
+        for state in states or ():
+            if len(state) != len(batch):
+                raise ValueError(
+                    f"expected memory of {len(batch)} observations at once, got one of {len(state)}; give each agent "
+                    "and each game a memory of its own, and make a new one for each episode"
+                )
+        mask = self._mask(rows["action_mask"], len(batch))
         if mask is not None:
             inputs["action_mask"] = mask
         if self.reads_agent:
-            if self.agent is None:
+            agent = rows.get("agent", self.agent)
+            if agent is None:
                 raise ValueError(f"this actor needs agent= of Actor.load, 0 to {self.n_agents - 1}: it reads who acts")
-            inputs["agent"] = np.full(len(batch), self.agent)
-        return inputs, is_batch, conversion
+            inputs["agent"] = np.broadcast_to(agent, len(batch))
+        return inputs, is_batch
 
     def _batch(self, observation: Any) -> tuple[Array, bool]:
         """Return own observations (K, *shape) of the space's dtype, and whether they were a batch."""
@@ -337,27 +331,17 @@ class Actor:
             raise ValueError(f"expected at least one legal action in each action_mask, got {mask.astype(int).tolist()}")
         return mask
 
-    def _states(self, memory: Memory | None, n_rows: int) -> dict[str, Array]:
-        """Return the states (K, ...) of a memory, zeros if it is new."""
-        if not self.has_memory and memory is not None:
-            self.new_memory()  # raises an error: the actor has no memory
+    def _states(self, memory: Memory | None, by_agent: bool = False) -> Any:
+        """Return the states of a memory, (K, ...) each, or those of agents by name; None if it is new."""
         if self.has_memory and not isinstance(memory, Memory):
             raise ValueError(
                 f"this actor needs memory = actor.new_memory() at the start of each episode, got memory={memory!r}"
             )
-        shapes: Mapping[str, list[int]] = self.description["states"]
-        states = (
-            memory.states
-            if memory is not None and memory.states
-            else {name: np.zeros((n_rows, *shape), np.float32) for name, shape in shapes.items()}
-        )
-        for state in states.values():
-            if len(state) != n_rows:
-                raise ValueError(
-                    f"expected memory of {n_rows} observations at once, got one of {len(state)}; give each agent and "
-                    "each game a memory of its own, and make a new one for each episode"
-                )
-        return states
+        if memory is None:
+            return None
+        if not self.has_memory:
+            self.new_memory()  # raises an error: the actor has no memory
+        return (memory.states if by_agent else tuple(memory.states.values())) or None
 
 
 def _index_of(agent: object, description: Mapping[str, Any]) -> int | None:

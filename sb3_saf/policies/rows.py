@@ -17,12 +17,13 @@ from torch import nn
 from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.networks.encoders import encoded
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
-from sb3_saf.policies.from_game import CLASSIC, Given, given_by_game, own_observations
 from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.conversion import CLASSIC, Given, RowForm, given_by_game, pixels_to_codes
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
     AGENT_KEY,
+    ALL_KEYS,
     EPISODE_START_KEY,
     OBS_KEY,
     STATE_KEY,
@@ -61,7 +62,6 @@ class TeamRowsPolicy(BasePolicy):
 
         :param observation_space: Dict of ``obs``, ``team``, ``agent``, and optionally ``active``, ``action_mask``,
             ``state``
-        :param action_space: one agent's action space
         :param encode_once: whether equal observations are encoded once; None for True with integer observations
         :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for
             convolved pictures, whose intermediate results should fit the cache
@@ -146,8 +146,11 @@ class TeamRowsPolicy(BasePolicy):
 
     def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
         """Convert what a game gives to rows (see :meth:`predict`); None for rows."""
-        takes_masks = self.team_spaces.action_mask is not None or isinstance(self, MaskableActorCriticPolicy)
-        return given_by_game(self.team_spaces, observation, action_masks, takes_masks)
+        team = self.team_spaces
+        has_masks = team.action_mask is not None
+        form = RowForm(team.n_agents, team.names, team.conversions, team.own_shape, has_masks, ALL_KEYS)
+        takes_masks = has_masks or isinstance(self, MaskableActorCriticPolicy)
+        return given_by_game(form, observation, action_masks, takes_masks)
 
     def _predict_rows(
         self, rows: Any, state: Any, episode_start: np.ndarray | None, deterministic: bool, **kwargs: Any
@@ -263,7 +266,6 @@ class TeamRowsPolicy(BasePolicy):
         Whole teams (minibatches of TeamRolloutBuffer, rows of a step) are used directly. In SB3's shuffled minibatches,
         teams are found by their joint observation.
 
-        :param obs: rows
         :param of_step: whether rows in the order of whole teams are those of a step of the environment, which are whole
             teams by construction; otherwise, their joint observations are compared
         """
@@ -307,19 +309,34 @@ class TeamRowsPolicy(BasePolicy):
         self, module: Callable[[Any], th.Tensor], observations: th.Tensor, space: spaces.Space[Any]
     ) -> th.Tensor:
         """Return outputs (K, ...) of a module for observations (K, *shape), as SB3 preprocesses them."""
-        size = self._chunk_size_of(module, len(observations)) if observations.device.type == "cpu" else None
-        if size is None or len(observations) <= size:
+        size = _CHUNK_OF_CONVOLUTIONS if self.chunk_size == "auto" else self.chunk_size
+        is_cut = observations.device.type == "cpu" and size is not None and len(observations) > size
+        if is_cut and self.chunk_size == "auto":
+            is_cut = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
+        if size is None or not is_cut:
             return encoded(module, observations, space, self.normalize_images)
         parts = th.split(observations, size)
         return th.cat([encoded(module, part, space, self.normalize_images) for part in parts])
 
-    def _chunk_size_of(self, module: object, n_observations: int) -> int | None:
-        if self.chunk_size != "auto":
-            return self.chunk_size
-        if n_observations <= _CHUNK_OF_CONVOLUTIONS:
-            return None
-        has_convolutions = isinstance(module, nn.Module) and any(isinstance(one, nn.Conv2d) for one in module.modules())
-        return _CHUNK_OF_CONVOLUTIONS if has_convolutions else None
+
+def own_observations(observation: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
+    """
+    Return own observations for ``predict``; a model trained on tile codes also takes the game's pixels.
+
+    :raises ValueError: for NaN, and for tile codes that the atlas lacks
+    """
+    atlas = getattr(space, "atlas", None)
+    if atlas is not None:
+        height, width = (cells * atlas.shape[1] for cells in space.shape or ())
+        if observation.shape[-3:] in ((height, width, atlas.shape[3]), (atlas.shape[3], height, width)):
+            observation = pixels_to_codes(observation, atlas).astype(space.dtype)
+    if observation.dtype.kind == "f" and not np.isfinite(observation).all():
+        raise ValueError(f"{OBS_KEY!r} must be finite, got {observation[~np.isfinite(observation)][0]}")
+    if atlas is not None and observation.shape[-2:] == space.shape:
+        largest = observation.max(initial=0)
+        if observation.min(initial=0) < 0 or largest >= len(atlas):
+            raise ValueError(f"{OBS_KEY!r} must be tile codes in 0..{len(atlas) - 1}, got {largest}")
+    return observation
 
 
 def entry_of(obs: PyTorchObs, key: str, reader: str) -> th.Tensor:

@@ -8,11 +8,11 @@ that models act on what the game itself gives. To use one needs NumPy only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import prod
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 Array: TypeAlias = npt.NDArray[Any]
 Key: TypeAlias = str | int
 
-_ACTION_MASK = "action_mask"
+#: Entries of rows, as in ``sb3_saf.teams.rows``, which needs more than NumPy.
+OBS, AGENT, ACTION_MASK = "obs", "agent", "action_mask"
+#: Keys of PettingZoo's observations with masks.
+CLASSIC = frozenset({"observation", ACTION_MASK})
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,8 @@ class Leaf:
     """
     One array of a game's observation, or its action.
 
-    :param space: description of its space, for messages
-    :param shape: shape in the game
     :param dtype: NumPy's name of the type in the game
     :param low: lowest values of all entries, or one value for all
-    :param high: highest values
     :param path: keys and indices that lead to it through Dicts and Tuples
     :param choices: numbers of choices of all entries of Discrete and MultiDiscrete, 2 for MultiBinary; else empty
     :param is_one_hot: whether it is Discrete or MultiDiscrete, which vectors hold one-hot and rows count from 0
@@ -94,7 +94,6 @@ class Leaf:
 
         Integers outside the bounds, which index tables, are refused.
 
-        :param observation: as the game gives it
         :raises ValueError: if it is missing, of another shape or type, or out of bounds
         """
         for depth, key in enumerate(self.path):
@@ -192,9 +191,6 @@ class AgentConversion:
     :param leaves: arrays of its observation in the game, in the order in which rows have them
     :param is_flat: whether rows have them as one vector
     :param shape: shape of a row's own observation; smaller ones are padded with zeros at the end of each axis
-    :param dtype: its type
-    :param action: the agent's action in the game
-    :param row_action: the action of a row
     :param channels_last: whether the game's pictures have channels last, and rows have them first
     :param mask_key: key of the mask in observations of the game that have one
     :param needs_mask: whether the game itself gives the agent action masks
@@ -259,7 +255,7 @@ class AgentConversion:
 
     def split(self, observation: Any) -> tuple[Any, Any]:
         """Return an observation of the game without its mask, and the mask; None if it has none."""
-        key = _ACTION_MASK if self.mask_key is None else self.mask_key
+        key = ACTION_MASK if self.mask_key is None else self.mask_key
         if (
             not isinstance(observation, Mapping)
             or key not in observation
@@ -312,7 +308,6 @@ class AgentConversion:
         """
         Convert a row's action to that of the game.
 
-        :param action: of a row
         :raises ValueError: for choices that the agent lacks
         """
         leaf, array = self.action, np.asarray(action).reshape(-1)[: prod(self.action.shape)]
@@ -347,6 +342,170 @@ def _with_tuples(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _with_tuples(item) for key, item in value.items()}
     return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+class RowForm(NamedTuple):
+    """
+    What is known of rows.
+
+    :param names: of the agents in index order, if they are known
+    :param conversions: of the agents, in index order; None if rows are the game's
+    :param own_shape: shape of one agent's own observation
+    :param has_masks: whether rows have action masks
+    :param keys: of rows, which are no agents
+    """
+
+    n_agents: int
+    names: Sequence[Any] | None
+    conversions: Sequence[AgentConversion] | None
+    own_shape: tuple[int, ...]
+    has_masks: bool
+    keys: frozenset[str] = frozenset()
+
+
+class Given(NamedTuple):
+    """
+    What a game gives some agents, as rows.
+
+    :param rows: entries of the rows
+    :param action_masks: (B, M), masks of policies of MaskablePPO whose rows have none
+    :param conversions: of the rows' agents; None if rows are the game's
+    :param agents: their names; None for one agent without name
+    """
+
+    rows: dict[str, Array]
+    action_masks: Array | None
+    conversions: Sequence[AgentConversion] | None
+    agents: list[Any] | None
+
+    def act(
+        self, predict: Callable[..., tuple[Any, Any]], state: Any, episode_start: Any, deterministic: bool
+    ) -> tuple[Any, Any]:
+        """
+        Act in the game; of observations by agent, actions and state are by agent, too.
+
+        :param predict: acts on rows, as SB3's ``predict``, whose arguments the others are
+        """
+        agents, memory, starts = self.agents, state, episode_start
+        if agents is not None and state:
+            blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
+            memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
+            starts = np.array([agent not in state for agent in agents])
+            if episode_start is not None:
+                starts |= np.asarray(episode_start).astype(bool)
+        masks = {} if self.action_masks is None else {"action_masks": self.action_masks}
+        actions, after = predict(self.rows, memory, starts, deterministic, **masks)
+        of_game = list(actions)
+        if self.conversions is not None:
+            of_game = [one.game_action(action) for one, action in zip(self.conversions, actions, strict=True)]
+        if agents is None:
+            return of_game[0], after
+        if after is not None:
+            after = dict(zip(agents, zip(*after, strict=True), strict=True))
+        return dict(zip(agents, of_game, strict=True)), after
+
+
+def given_by_game(
+    team: RowForm, observation: Any, action_masks: Any, takes_masks: bool, agent: int | None = None
+) -> Given | None:
+    """
+    Convert what a game gives to rows; see :meth:`sb3_saf.policies.rows.TeamRowsPolicy.predict`.
+
+    :param observation: rows, or observations of the game
+    :param action_masks: masks in the form of the observation; None for those in observations and infos
+    :param agent: index of the agent whose observation it is, if that is known
+    :return: None for rows
+    :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
+    """
+    infos: Mapping[Any, Any] = {}
+    if isinstance(observation, tuple) and len(observation) == 2 and all(isinstance(x, Mapping) for x in observation):
+        observation, infos = observation
+    names, conversions = team.names, team.conversions
+    agents = _agents_in(team, observation)
+    if agents is not None:
+        masks = [(infos.get(name) or {}).get(ACTION_MASK) for name in agents]
+        if isinstance(action_masks, Mapping):
+            masks = [action_masks[name] for name in agents]
+        indices = list(range(len(agents))) if names is None else [names.index(name) for name in agents]
+        known = indices if names is not None or len(agents) == team.n_agents else None
+        kinds = None if conversions is None else [conversions[index] for index in indices]
+        return _given(team, [observation[name] for name in agents], masks, kinds, known, agents, takes_masks)
+    if conversions is None:
+        return None
+    fitting = [i for i, one in enumerate(conversions) if agent in (None, i) and one.fits(observation)]
+    if not fitting:
+        return None
+    kind = conversions[fitting[0]]
+    if any(conversions[index] != kind for index in fitting):
+        if isinstance(observation, np.ndarray) and observation.shape == team.own_shape:
+            return None
+        name = 0 if names is None else names[fitting[0]]
+        raise ValueError(
+            f"expected to know whose observation this is, which several kinds of agents have; name the agent: "
+            f"{{{name!r}: observation}}"
+        )
+    index = fitting if len(fitting) == 1 else None
+    return _given(team, [observation], [action_masks], [kind], index, None, takes_masks)
+
+
+def _agents_in(team: RowForm, observation: object) -> list[Any] | None:
+    """Return the agents of ``{agent: observation}``; None for any other observation."""
+    if not isinstance(observation, Mapping) or not observation:
+        return None
+    agents, names = list(observation), team.names
+    unknown = [] if names is None else [agent for agent in agents if agent not in names]
+    if names is not None and not unknown:
+        return agents
+    has_keys = not team.keys.union(CLASSIC).isdisjoint(observation)
+    if has_keys or any(one.fits(observation) for one in team.conversions or ()):
+        return None
+    if names is None:
+        if len(agents) > team.n_agents:
+            raise ValueError(f"expected observations of at most {team.n_agents} agents, got {len(agents)}")
+        return agents
+    raise ValueError(
+        f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, got "
+        f"{unknown[0]!r}"
+    )
+
+
+def _given(
+    team: RowForm,
+    entries: list[Any],
+    masks: list[Any],
+    conversions: Sequence[AgentConversion] | None,
+    indices: list[int] | None,
+    agents: list[Any] | None,
+    takes_masks: bool,
+) -> Given:
+    """Convert observations and masks of some agents; without ``conversions`` they have the form of rows."""
+    own: list[Array] = []
+    legal: list[Any] = []
+    for number, (entry, mask) in enumerate(zip(entries, masks, strict=True)):
+        try:
+            if conversions is None:
+                has_mask = isinstance(entry, Mapping) and set(entry) == CLASSIC
+                own.append(np.asarray(entry["observation"] if has_mask else entry))
+                legal.append(entry[ACTION_MASK] if has_mask and mask is None else mask)
+                continue
+            conversion = conversions[number]
+            observation, mask_of_entry = conversion.split(entry)
+            own.append(conversion.own(observation))
+            if mask_of_entry is not None and conversion.mask_key is None and not takes_masks:
+                raise ValueError(f"expected no {ACTION_MASK!r}, because this policy was trained without masks")
+            legal.append(mask_of_entry if mask is None else mask)
+            if team.has_masks or (takes_masks and legal[-1] is not None):
+                legal[-1] = conversion.mask(legal[-1])
+        except ValueError as error:
+            raise ValueError(f"observation of {'the agent' if agents is None else agents[number]}: {error}") from None
+    if len(shapes := {array.shape for array in own}) > 1:
+        raise ValueError(f"expected observations of one shape, that of rows, {team.own_shape}, got {sorted(shapes)}")
+    rows = {OBS: np.stack(own)} | ({} if indices is None else {AGENT: np.array(indices)})
+    has_masks = takes_masks and all(mask is not None for mask in legal)
+    action_masks = np.stack([np.asarray(mask) for mask in legal]) if has_masks else None
+    if action_masks is not None and team.has_masks:
+        rows, action_masks = {**rows, ACTION_MASK: action_masks}, None
+    return Given(rows, action_masks, conversions, agents)
 
 
 def pixels_to_codes(pictures: Array, atlas: Array) -> Array:
