@@ -44,10 +44,6 @@ def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) 
     Make an array that shares no cache line with another array.
 
     If games divide evenly between threads, no two threads write to the same line (no false sharing).
-
-    :param shape: of the array
-    :param dtype: of the array
-    :param value: fill value
     """
     n_bytes = math.prod((shape,) if isinstance(shape, int) else shape) * np.dtype(dtype).itemsize
     memory = np.empty(n_bytes + 2 * _CACHE_LINE, dtype=np.uint8)
@@ -58,12 +54,7 @@ def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) 
 
 
 def world_of(task: TaskName, params: HECOGridParams) -> World:
-    """
-    Return the data that all games of a batch share.
-
-    :param task: of all games
-    :param params: of all games
-    """
+    """Return the data that all games of a batch share."""
     view, offset = params.view_size, params.view_offset
     pad = max(view - 1 - offset, offset, view // 2)
     stride = params.grid_size + 2 * pad
@@ -179,9 +170,6 @@ def check_snapshot(snapshot: Snapshot, example: Snapshot, params: HECOGridParams
     """
     Check that the kernels can index with a snapshot, whose values they do not check.
 
-    :param snapshot: to be restored
-    :param example: snapshot of the games that it is for
-    :param params: of these games
     :raises ValueError: naming the first array that differs in shape or dtype, or a value out of range
     """
     for name, array in example.items():

@@ -198,15 +198,11 @@ class GameBatch:
         self._take(actions)
 
     def _take(self, actions: npt.NDArray[np.integer[Any]]) -> None:
-        if not self._begun:
-            self._check_begun()
-        self._buffers.actions[...] = actions.reshape(-1)
-
-    def _check_begun(self) -> None:
-        if not self._seeded.all():
+        if not self._begun and not self._seeded.all():
             game = int(np.flatnonzero(~self._seeded)[0])
             raise ValueError(f"game {game} has not begun: call reset() before a step")
         self._begun = True
+        self._buffers.actions[...] = actions.reshape(-1)
 
     def _array_for_views(self, name: str, given: U8 | None) -> U8:
         shape = (self.n_games, *self._view_shape)

@@ -74,11 +74,16 @@ class HECOGridParams:
 
     def __post_init__(self) -> None:
         self._check_integers()
-        self._check_density()
-        self._check_choice("rules", get_args(Rules))
-        self._check_choice("agent_order", get_args(AgentOrder))
-        self._check_choice("observation", get_args(Observation))
-        self._check_choice("agent_colours", get_args(AgentColours))
+        density = self.clutter_density
+        if isinstance(density, (bool, np.bool_)) or not isinstance(density, Real) or not 0 <= density < 1:
+            raise ValueError(f"clutter_density must be a number from 0 (included) to 1 (excluded), got {density!r}")
+        object.__setattr__(self, "clutter_density", float(density))
+        choices = {"rules": Rules, "agent_order": AgentOrder, "observation": Observation, "agent_colours": AgentColours}
+        for name, allowed in choices.items():
+            value, known = getattr(self, name), get_args(allowed)
+            if value not in known:
+                expected = " or ".join(map(repr, known))
+                raise ValueError(f"{name} must be {expected}, got {value!r}{did_you_mean(value, list(known))}")
         if self.observation == "tiles" and self.view_tile_size > MAX_CODED_TILE_SIZE:
             raise ValueError(
                 f"observation='tiles' needs a view_tile_size from 1 to {MAX_CODED_TILE_SIZE}, got "
@@ -122,18 +127,6 @@ class HECOGridParams:
         if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
             raise ValueError(f"{name} must be an integer from {low} to {high}{note}, got {value!r}")
         object.__setattr__(self, name, int(value))
-
-    def _check_density(self) -> None:
-        value = self.clutter_density
-        if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real) or not 0 <= value < 1:
-            raise ValueError(f"clutter_density must be a number from 0 (included) to 1 (excluded), got {value!r}")
-        object.__setattr__(self, "clutter_density", float(value))
-
-    def _check_choice(self, name: str, allowed: tuple[str, ...]) -> None:
-        value = getattr(self, name)
-        if value not in allowed:
-            choices = " or ".join(repr(choice) for choice in allowed)
-            raise ValueError(f"{name} must be {choices}, got {value!r}{did_you_mean(value, list(allowed))}")
 
     def check_fits(self, task: TaskName) -> None:
         """

@@ -64,7 +64,6 @@ class Session:
     """
     One person's game: turns keys into joint actions and says what happened.
 
-    :param env: the game
     :param seed: seed of the first game; later games continue its randomness
     :param raw: send each key's zone 0 integer instead of translating it for the agent's zone
     :param others: behaviour of the agents that are not selected
@@ -114,7 +113,11 @@ class Session:
         if self.over:
             self.message = "the game is over; r starts a new one, q quits"
             return
-        actions = [self._other_action(agent) for agent in range(len(self.env.possible_agents))]
+        agents = range(len(self.env.possible_agents))
+        if self.others == "random":
+            actions = [int(self._rng.integers(N_ACTIONS)) for _ in agents]
+        else:
+            actions = [self._action(agent, Command.DONE) for agent in agents]
         action = self.action_for(key)
         actions[self.selected] = action
         command = Command(int(self._command_of[self._zone(self.selected), action]))
@@ -130,11 +133,6 @@ class Session:
         if key in RAW_ACTIONS:
             return int(key)
         return int(COMMANDS[key]) if self.raw else self._action(self.selected, COMMANDS[key])
-
-    def _other_action(self, agent: int) -> int:
-        if self.others == "random":
-            return int(self._rng.integers(N_ACTIONS))
-        return self._action(agent, Command.DONE)
 
     def _action(self, agent: int, command: Command) -> int:
         """Return the action integer that triggers ``command`` where the agent stands."""
@@ -158,7 +156,6 @@ class HumanWindow:
 
     After the person has closed it, pictures are dropped silently, so that the program continues.
 
-    :param title: text of the title bar
     :param fps: maximum pictures per second, :meth:`show` waits if necessary; None never waits
     """
 
@@ -264,7 +261,6 @@ def play_window(session: Session, tile_size: int | None = None) -> None:
     """
     Play in a window until the person leaves; the status is printed after every key.
 
-    :param session: the game
     :param tile_size: pixels per cell; by default as many as fit the screen of a laptop
     """
     env, tile = session.env, tile_size or fit_tile_size(session.env.params.grid_size, 840)

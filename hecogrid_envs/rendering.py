@@ -58,8 +58,6 @@ class Scene(NamedTuple):
     """
     Content of a picture.
 
-    :param task: name of the task
-    :param params: parameters of the world
     :param state: state mapping (``walls``, ``treasures``, ``keys``, ``agent_pos``, ``agent_dir``, ``agent_has_key``)
     :param step: game steps so far in this episode
     :param collected: treasures collected so far in this episode, the team's return
@@ -80,7 +78,6 @@ def render_scene(scene: Scene, tile_size: int | None = None) -> Picture:
     """
     Draw a scene.
 
-    :param scene: what to draw
     :param tile_size: pixels per cell, from 4 to 128; by default 24, and less for maps of more than 60 cells
     :return: (height, width, 3); the size depends on the task, the parameters and ``tile_size`` only
     :raises ValueError: if the tile size is out of range or the picture exceeds :data:`MAX_PIXELS`
@@ -116,8 +113,6 @@ def fit_tile_size(grid_size: int, max_pixels: int = 960) -> int:
     """
     Return the largest tile size, at most 32, whose map fits into a square window.
 
-    :param grid_size: cells per side
-    :param max_pixels: side of the window
     :return: pixels per cell, at least 4
     """
     return int(np.clip(max_pixels // grid_size, MIN_TILE, 32))

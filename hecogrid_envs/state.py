@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple, TypedDict
+from typing import Any, Final, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -32,12 +32,6 @@ class StateMapping(TypedDict):
     agent_has_key: Bools
 
 
-class _Entry(NamedTuple):
-    shape: tuple[int, ...]
-    kind: str
-    high: int
-
-
 #: Planes of the central view, the last axis of ``state()``.
 STATE_PLANES: Final = (
     "wall",
@@ -57,22 +51,43 @@ def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
     """
     Check a state mapping and convert its arrays to their types.
 
-    :param mapping: see :class:`StateMapping`
     :raises ValueError: naming the first fault
     """
     if not isinstance(mapping, Mapping):
         raise ValueError(f"a state must be a mapping of arrays, got {type(mapping).__name__}")
-    entries = _entries(params)
+    plane, n = (params.grid_size, params.grid_size), params.n_agents
+    #: Shape, dtype and largest value.
+    entries: dict[str, tuple[tuple[int, ...], str, int]] = {
+        "walls": (plane, "bool", 1),
+        "treasures": (plane, "uint8", max(TreasureState)),
+        "keys": (plane, "bool", 1),
+        "agent_pos": ((n, 2), "int64", params.grid_size - 1),
+        "agent_dir": ((n,), "int64", 3),
+        "agent_has_key": ((n,), "bool", 1),
+    }
     missing = [name for name in entries if name not in mapping]
     if missing:
         raise ValueError(f"state lacks {missing[0]!r}; it needs {', '.join(entries)}")
     unknown = [name for name in mapping if name not in entries]
     if unknown:
         raise ValueError(f"state has an unknown entry {unknown[0]!r}; it needs just {', '.join(entries)}")
-    arrays: Any = {name: _check_array(name, mapping[name], entry) for name, entry in entries.items()}
+    arrays: Any = {name: _check_array(name, mapping[name], *entry) for name, entry in entries.items()}
     state: StateMapping = arrays
-    _check_board(state)
-    _check_agents(state)
+    walls, treasures, keys = state["walls"], state["treasures"] != TreasureState.NONE, state["keys"]
+    ring = np.ones_like(walls)
+    ring[1:-1, 1:-1] = False
+    for fault, where in (
+        ("the outer ring must be wall, but there is none", ring & ~walls),
+        ("a treasure lies in a wall", treasures & walls),
+        ("a key lies in a wall", keys & walls),
+        ("a key and a treasure share a cell", keys & treasures),
+    ):
+        if where.any():
+            raise ValueError(f"inconsistent state: {fault} at (x, y) = {_first(where)}")
+    for agent, (x, y) in enumerate(state["agent_pos"]):
+        for thing, occupied in (("in a wall", walls), ("on a key", keys)):
+            if occupied[x, y]:
+                raise ValueError(f"inconsistent state: agent {agent} stands {thing} at (x, y) = ({x}, {y})")
     return state
 
 
@@ -114,59 +129,25 @@ def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> S
     return check_state(options["state"], params)
 
 
-def _entries(params: HECOGridParams) -> dict[str, _Entry]:
-    plane, n = (params.grid_size, params.grid_size), params.n_agents
-    return {
-        "walls": _Entry(plane, "bool", 1),
-        "treasures": _Entry(plane, "uint8", max(TreasureState)),
-        "keys": _Entry(plane, "bool", 1),
-        "agent_pos": _Entry((n, 2), "int64", params.grid_size - 1),
-        "agent_dir": _Entry((n,), "int64", 3),
-        "agent_has_key": _Entry((n,), "bool", 1),
-    }
-
-
-def _check_array(name: str, value: object, entry: _Entry) -> npt.NDArray[Any]:
+def _check_array(name: str, value: object, shape: tuple[int, ...], kind: str, high: int) -> npt.NDArray[Any]:
     try:
         array = np.asarray(value)
     except ValueError as error:
         raise ValueError(f"state entry {name!r} is no array: {error}") from error
-    if array.shape != entry.shape:
-        raise ValueError(f"state entry {name!r} must have shape {entry.shape}, got {array.shape}")
+    if array.shape != shape:
+        raise ValueError(f"state entry {name!r} must have shape {shape}, got {array.shape}")
     if array.dtype.kind not in "bui":
-        raise ValueError(f"state entry {name!r} must be {entry.kind}, got {array.dtype}")
-    wrong = (array < 0) | (array > entry.high)
+        raise ValueError(f"state entry {name!r} must be {kind}, got {array.dtype}")
+    wrong = (array < 0) | (array > high)
     if wrong.any():
         raise ValueError(
-            f"state entry {name!r} must hold values from 0 to {entry.high}, "
-            f"got {array[wrong][0]} at index {_first(wrong)}"
+            f"state entry {name!r} must hold values from 0 to {high}, got {array[wrong][0]} at index {_first(wrong)}"
         )
-    return array.astype(entry.kind)
+    return array.astype(kind)
 
 
 def _first(where: Bools) -> tuple[int, ...]:
     return tuple(int(i) for i in np.argwhere(where)[0])
-
-
-def _check_board(state: StateMapping) -> None:
-    walls, treasures, keys = state["walls"], state["treasures"] != TreasureState.NONE, state["keys"]
-    ring = np.ones_like(walls)
-    ring[1:-1, 1:-1] = False
-    for fault, where in (
-        ("the outer ring must be wall, but there is none", ring & ~walls),
-        ("a treasure lies in a wall", treasures & walls),
-        ("a key lies in a wall", keys & walls),
-        ("a key and a treasure share a cell", keys & treasures),
-    ):
-        if where.any():
-            raise ValueError(f"inconsistent state: {fault} at (x, y) = {_first(where)}")
-
-
-def _check_agents(state: StateMapping) -> None:
-    for agent, (x, y) in enumerate(state["agent_pos"]):
-        for thing, plane in (("in a wall", state["walls"]), ("on a key", state["keys"])):
-            if plane[x, y]:
-                raise ValueError(f"inconsistent state: agent {agent} stands {thing} at (x, y) = ({x}, {y})")
 
 
 def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:

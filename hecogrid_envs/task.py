@@ -23,7 +23,6 @@ class Task(NamedTuple):
     """
     Declaration of a task: everything in which tasks differ.
 
-    :param name: its name
     :param condition: decides whether an agent collects a treasure
     :param has_keys: whether ``n_keys`` keys lie on the map
     :param treasure: colour of treasures in observations

@@ -67,10 +67,8 @@ def render_text(
     """
     Write a state as text.
 
-    :param state: state mapping
     :param zones: (W,) zone of each column, written above the map as digits and letters
     :param step: game steps so far
-    :param collected: treasures collected so far
     :param legend: end with a line that explains the characters
     :return: lines, without a final newline; :func:`parse_level` reads them back
     """

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -47,21 +47,6 @@ N_CODES: Final = FIRST_AGENT + N_GROUNDS * len(AGENT_PALETTE) * 4
 _SUPERSAMPLING: Final = 3
 
 
-class TreasureColours(NamedTuple):
-    """Colours of a treasure before and after it is collected."""
-
-    available: Colour
-    collected: Colour
-
-
-def treasure_colours(task: TaskName, rules: Rules) -> TreasureColours:
-    """Return the colours of a task's treasures in observations."""
-    declared = DECLARED[task]
-    return TreasureColours(
-        declared.treasure, declared.collected_released if rules == "released" else declared.collected
-    )
-
-
 def quarter_turns(facing: int) -> int:
     """Count the counterclockwise quarter turns from the map, north up, to the view of a viewer facing ``facing``."""
     return (facing + 1) % 4
@@ -80,38 +65,32 @@ def tile_atlas(task: TaskName, rules: Rules, tile_size: int) -> Image:
     return turned_atlases(task, rules, tile_size)[Direction.NORTH]
 
 
+@lru_cache(maxsize=64)
 def turned_atlases(task: TaskName, rules: Rules, tile_size: int) -> Image:
     """
     Draw every tile code for viewers facing each direction.
 
     :return: (4, n_codes, t, t, 3) uint8, read-only; the four are equal up to :data:`MAX_CODED_TILE_SIZE`
     """
-    return _atlases(treasure_colours(task, rules), tile_size)
-
-
-@lru_cache(maxsize=64)
-def _atlases(colours: TreasureColours, size: int) -> Image:
-    plain = _plain_tiles(colours, size)
-    atlases = np.stack([_with_grid_lines(plain, quarter_turns(facing)) for facing in Direction])
-    atlases.flags.writeable = False
-    return atlases
-
-
-def _plain_tiles(colours: TreasureColours, size: int) -> Image:
-    """Draw the tiles without grid lines, (n_codes, t, t, 3)."""
+    size, declared = tile_size, DECLARED[task]
+    available, collected = declared.treasure, declared.collected
+    if rules == "released":
+        collected = declared.collected_released
     tiles = np.empty((N_CODES, size, size, 3), dtype=np.uint8)
     tiles[INVISIBLE] = _solid(INVISIBLE_COLOUR, size)
-    solids = (EMPTY_COLOUR, WALL_COLOUR, colours.available, colours.collected)
+    solids = (EMPTY_COLOUR, WALL_COLOUR, available, collected)
     tiles[FIRST_TERRAIN:FIRST_KEY] = [_solid(colour, size) for colour in solids]
     tiles[FIRST_KEY:FIRST_AGENT] = [np.rot90(_key(size), turns) for turns in range(4)]
     code = FIRST_AGENT
-    for ground in (None, colours.available, colours.collected):
+    for ground in (None, available, collected):
         for colour in AGENT_PALETTE:
             for direction in range(4):
                 agent = _drawn(_turned(_agent_shape, direction), colour, size)
                 tiles[code] = agent if ground is None else _blend(_solid(ground, size), agent)
                 code += 1
-    return tiles
+    atlases = np.stack([_with_grid_lines(tiles, quarter_turns(facing)) for facing in Direction])
+    atlases.flags.writeable = False
+    return atlases
 
 
 def _solid(colour: Colour, size: int) -> Image:

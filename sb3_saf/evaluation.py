@@ -31,12 +31,7 @@ Act = Callable[[Any, npt.NDArray[np.bool_]], Array]
 
 
 class Interval(NamedTuple):
-    """
-    A confidence interval.
-
-    :param low: lower end
-    :param high: upper end
-    """
+    """A confidence interval."""
 
     low: float
     high: float
@@ -252,9 +247,7 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
     Episodes are divided evenly over the games beforehand, as in SB3: taking the first to finish would favour short
     ones. Episodes that were cut short (``make_team_env(..., stagger=True)``) are not counted.
 
-    :param env: vector environment of teams, which is reset
     :param act: returns the actions (B, ...) of all rows, from their observations and whether an episode starts, (B,)
-    :param n_episodes: team episodes to play
     """
     n_agents = _team_size(env)
     n_games = env.num_envs // n_agents
@@ -277,7 +270,6 @@ def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False)
     Return the function for :func:`play` by which a model acts, with memory, and with the games' action masks.
 
     :param model: any object with SB3's ``predict``; masks are passed if ``predict`` has ``action_masks``
-    :param env: the games
     :param deterministic: whether the model takes its most likely actions
     """
     check_trained_on(model, env)
@@ -300,8 +292,6 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
     Check that a model was trained on games like these.
 
     :param model: an algorithm or a policy; anything else passes
-    :param env: the games
-    :param name: of the model, for the message
     :param same_size: whether the number of agents must be equal, too: critics depend on it, actors do not, unless they
         read the agent's index
     :raises ValueError: if observations, actions or, where it matters, the number of agents differ

@@ -48,11 +48,7 @@ def count(module: nn.Module) -> int:
 
 
 def paper_policy(declaration: Declaration) -> TeamPolicy:
-    """
-    Make a policy as in the paper's table.
-
-    :param declaration: declaration of an algorithm in the table
-    """
+    """Make a policy as in the paper's table."""
     assert declaration.paper_table is not None
     rows = TeamSpaces(spaces.Box(0, 255, (3, 28, 28), np.uint8), N_AGENTS).to_dict_space()
     policy_class: Any = declaration.policies[PPO][0]

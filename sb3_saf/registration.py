@@ -45,13 +45,7 @@ def _names(declaration: Declaration) -> Iterator[tuple[type[BaseAlgorithm], str,
 
 
 def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:
-    """
-    Register a policy with an algorithm by name. A name of another policy is not replaced, with a warning.
-
-    :param algorithm: class with ``policy_aliases``
-    :param name: name for users
-    :param policy: the policy class
-    """
+    """Register a policy with an algorithm by name. A name of another policy is not replaced, with a warning."""
     known = algorithm.policy_aliases.setdefault(name, policy)
     if (known.__module__, known.__qualname__) == (policy.__module__, policy.__qualname__):
         algorithm.policy_aliases[name] = policy  # also after a reload of the module

@@ -25,13 +25,13 @@ def test_paired_differences_are_tested_over_common_seeds() -> None:
     first, second = runs([3.0, 3.5, 3.1, 9.0]), runs([1.0, 1.1, 1.3])
     found = compare(first, second)
     assert found is not None
-    assert (found.seeds, found.verdict) == ([0, 1, 2], "higher")
+    assert (found.seeds, found.test.verdict) == ([0, 1, 2], "higher")
     assert found.test.p == pytest.approx(stats.ttest_rel([3.0, 3.5, 3.1], [1.0, 1.1, 1.3]).pvalue)
     low, high = stats.t.interval(0.95, 2, *(np.mean([2.0, 2.4, 1.8]), stats.sem([2.0, 2.4, 1.8])))
-    assert found.difference == pytest.approx((np.mean([2.0, 2.4, 1.8]), low, high))
+    assert found.test.estimate == pytest.approx((np.mean([2.0, 2.4, 1.8]), low, high))
     swapped, few = compare(second, first), compare(runs([1.0, 1.0]), runs([2.0, 2.0]))
-    assert swapped is not None and swapped.verdict == "lower"
-    assert few is not None and few.verdict == "fewer than 3 pairs" and few.first == Estimate(1.0, 1.0, 1.0)
+    assert swapped is not None and swapped.test.verdict == "lower"
+    assert few is not None and few.test.verdict == "fewer than 3 pairs" and few.first == Estimate(1.0, 1.0, 1.0)
     assert compare(runs([1.0]), runs([1.0]).assign(seed=5)) is None
 
 
@@ -39,9 +39,9 @@ def test_a_small_spread_by_chance_is_not_below_the_noise_of_the_tests() -> None:
     """Differences of 1 that agree to the last digit, from 16 episodes with a standard deviation of 8."""
     first, second = (runs(values, return_sd=8.0, episodes=16) for values in ([3.0, 3.0, 3.0], [2.0, 2.0, 2.0]))
     found = compare(first, second)
-    assert found is not None and found.verdict == "open"
+    assert found is not None and found.test.verdict == "open"
     half = stats.t.ppf(0.975, 2) * np.sqrt(2 * 8**2 / 16) / np.sqrt(3)
-    assert found.difference == pytest.approx((1, 1 - half, 1 + half))
+    assert found.test.estimate == pytest.approx((1, 1 - half, 1 + half))
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,6 @@ class Sequences(NamedTuple):
     """
     Order in time of the G steps of a sample: ``n`` sequences of ``length`` steps, one after the other.
 
-    :param n: number of sequences
     :param length: steps of each sequence, burn-in included
     :param last_actions: (G, N) the agents' actions one step earlier; -1 where an episode starts
     :param resets: (G,) bool, steps before which the memory is reset

@@ -44,7 +44,6 @@ class RolloutReturns:
     Returns of one rollout, for policies that normalise values.
 
     :param returns: all returns used for training
-    :param agents: their agents, in the same shape
     :param known: the conversion of values, once it was asked for
     """
 
@@ -53,11 +52,7 @@ class RolloutReturns:
     known: Rescaling | None = None
 
     def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
-        """
-        Return the conversion of values to the new statistics; the first call updates the statistics with the returns.
-
-        :param normalizer: normaliser of the trained policy
-        """
+        """Return the conversion of values to the new statistics, which the first call updates with the returns."""
         if self.known is None:
             self.known = normalizer.update(self.returns, self.agents)
         return self.known
@@ -98,7 +93,6 @@ class TeamMinibatch(dict[str, th.Tensor]):
     The dict of SB3's buffer, except that ``"team"``, N times as large as the rest, is only made on access: policies of
     this package read :attr:`teams`.
 
-    :param teams: the teams
     :param entries: all other entries of the rows' observations, ``"obs"`` among them
     :param returns: returns of the rows' rollout
     :param old_values: (B,) old values of the rows, a copy that may be modified
@@ -116,8 +110,6 @@ class TeamMinibatch(dict[str, th.Tensor]):
         """
         Update the statistics with the rollout's returns, and convert the minibatch's old values to them, so that they
         equal the values of the unchanged critic, as PPO's ``clip_range_vf`` expects. Call it once per minibatch.
-
-        :param normalizer: normaliser of the trained policy
         """
         scale, shift = self._returns.rescaling(normalizer)
         if self._old_values is not None:
@@ -146,8 +138,6 @@ def check_rows(obs: Mapping[str, Array], team: TeamSpaces, agents: Array) -> Arr
     """
     Return the own observations of rows, (B, *shape).
 
-    :param obs: Dict observation of B rows
-    :param team: form of the rows
     :param agents: (B,) agents of the rows of whole teams in index order
     :raises ValueError: for rows of another form, or in another order
     """

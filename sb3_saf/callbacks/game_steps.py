@@ -46,8 +46,6 @@ def check_training(model: BaseAlgorithm) -> None:
 
     Warns about SB3's own ``"MultiInputPolicy"``: it reads all entries of a row, the joint observation included, so that
     execution is not decentralised. It is allowed as a centralised policy.
-
-    :param model: any algorithm on any environment
     """
     entries = getattr(model.observation_space, "spaces", {})
     extractor = getattr(model.policy, "features_extractor", None)
@@ -67,12 +65,7 @@ def check_training(model: BaseAlgorithm) -> None:
 
 
 class GameStepsBoard(TensorBoardOutputFormat):
-    """
-    A run's TensorBoard file with game steps on the x-axis instead of SB3's agent steps.
-
-    :param board: output format opened by SB3
-    :param n_agents: N
-    """
+    """A run's TensorBoard file with game steps on the x-axis instead of SB3's agent steps."""
 
     def __init__(self, board: TensorBoardOutputFormat, n_agents: int) -> None:
         # Not the base class's constructor, which would open a second file.

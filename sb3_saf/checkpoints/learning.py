@@ -171,7 +171,6 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
 
     :param at_rollout: whether the first signal stops it only at the start of the next rollout, where its state can be
         copied; a second one always stops it now
-    :param again: advice on how to continue
     """
     waits = at_rollout
 

@@ -77,8 +77,6 @@ def check_description(found: Tree, own: dict[str, Tree]) -> None:
     """
     Compare a run with the run of a checkpoint.
 
-    :param found: result of :func:`description` in the checkpoint
-    :param own: that of the run that is to continue
     :raises CheckpointError: naming the first differences
     """
     if different := differences(found, own):

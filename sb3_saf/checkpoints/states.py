@@ -20,7 +20,6 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_saf.callbacks.evaluation import TeamEvalCallback
-from sb3_saf.envs.joint_observation import DictRows
 from sb3_saf.envs.monitor import SharedReward
 from sb3_saf.teams.errors import CheckpointError
 from sb3_saf.teams.rows import OBS_KEY
@@ -28,7 +27,7 @@ from sb3_saf.teams.trees import Tree
 from sb3_saf.teams.vec_env import layers
 
 #: Wrappers that remember nothing from step to step.
-_WITHOUT_STATE: Final = (VecTransposeImage, DictRows, SharedReward)
+_WITHOUT_STATE: Final = (VecTransposeImage, SharedReward)
 _STATISTICS: Final = ("mean", "var", "count")
 #: Counters of callbacks, the only attributes that a checkpoint sets.
 _COUNTERS: Final[dict[Any, tuple[str, ...]]] = {

@@ -52,7 +52,6 @@ class CheckpointFolder:
 
         A run killed here leaves the previous checkpoints and perhaps a temporary file, which the next write removes.
 
-        :param content: writes the content to a file
         :param game_steps: game steps, for the file's name
         :raises CheckpointError: if it cannot be written, for instance because the disk is full
         """

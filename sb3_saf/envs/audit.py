@@ -64,7 +64,6 @@ class Trial:
 
     Errors of the game itself end the trial, so that they are raised where the game is used.
 
-    :param env: the game, which is played
     :raises ValueError: if agents have spaces that cannot be in rows
     """
 
@@ -357,9 +356,7 @@ def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
     """
     Return an agent's space.
 
-    :param env: the game
     :param kind: ``"observation"`` or ``"action"``
-    :param agent: its name
     :raises ValueError: if it cannot be in rows
     """
     method = getattr(env, f"{kind}_space")

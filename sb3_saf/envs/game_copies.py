@@ -66,7 +66,6 @@ class _Pickler(cloudpickle.Pickler):
     """
     Pickler that also stores the state of :class:`gymnasium.utils.EzPickle`, which stores constructor arguments only.
 
-    :param file: to write to
     :param left_out: objects, by id, that are taken from the game into which the state is loaded
     """
 
@@ -90,12 +89,7 @@ def _set_attributes(obj: object, attributes: dict[str, Any]) -> None:
 
 
 class _Unpickler(pickle.Unpickler):
-    """
-    Unpickler for the output of :class:`_Pickler`.
-
-    :param data: output of the pickler
-    :param game: provides the objects that were left out
-    """
+    """Unpickler for the output of :class:`_Pickler`."""
 
     def __init__(self, data: bytes, game: Any) -> None:
         super().__init__(BytesIO(data))
@@ -120,12 +114,7 @@ def pickled(game: Any) -> npt.NDArray[np.uint8]:
 
 
 def unpickled(data: npt.NDArray[np.uint8], game: Any) -> Any:
-    """
-    Unpickle a game and restore the global random generators; only for signed data.
-
-    :param data: result of :func:`pickled`
-    :param game: made in the same way
-    """
+    """Unpickle a game and restore the global random generators; only for signed data."""
     found, generators = _Unpickler(data.tobytes(), game).load()
     _set_global_generators(generators)
     return found
@@ -253,7 +242,6 @@ def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
 
     A new game plays some steps and is copied; both then play the same actions and begin another episode.
 
-    :param make_game: makes a game for the trial
     :raises CheckpointError: if there is no such way, with the difference found
     """
     reasons = []
@@ -309,7 +297,6 @@ def _play(
     """
     Play random legal actions, the same in each call.
 
-    :param rows: present observations
     :param n_steps: steps to play
     :param seconds: time limit, after which playing stops early
     :return: the last observations, and the serialised result of each step

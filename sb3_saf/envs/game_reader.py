@@ -40,7 +40,6 @@ class GameReader:
     """
     Reader of a game: what its agents observe and what masks their actions becomes rows of one form.
 
-    :param trial: trial episode of the game
     :param active: whether rows have ``"active"``
     :param action_masks: ``"auto"`` for masks if any, True to require them, False for none
     :param state: whether rows have the game's state
@@ -122,9 +121,6 @@ class GameReader:
         """
         Return the N rows of a game: own observations, or a dict of the parts of rows.
 
-        :param env: the game
-        :param observations: by agent
-        :param infos: by agent
         :param shown: agents whose observations are shown; rows of others are zeros, or with ``"active"`` copies
         :param active: agents that take part, and must have an observation
         :param place: game and step, for messages
@@ -248,7 +244,6 @@ def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Sp
     start. Boxes with equal numbers of axes are padded to the largest; all others become vectors, as
     ``gymnasium.spaces.flatten_space`` makes them.
 
-    :param observed: of each agent
     :param float64: whether Boxes of float64 stay so
     """
     first = observed[0]
@@ -304,7 +299,6 @@ def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
     """
     Return the action space of rows.
 
-    :param acted: by agent
     :raises ValueError: if actions are neither all discrete nor all vectors
     """
     first, *others = every = [_counted_from_zero(space) for space in acted.values()]

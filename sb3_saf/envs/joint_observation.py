@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage, unwrap_vec_normalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.conversion import AgentConversion
@@ -92,9 +92,10 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         if conversions is not None and own is not raw.own:
             conversions = tuple(one.with_channels_first() for one in conversions)
         team = TeamSpaces(own, n_agents, raw.has_active, raw.n_masked_actions, state, names, conversions, True)
-        if _sb3_would_transpose(team):
-            venv = _protected_from_transposition(venv, n_agents)
-            raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
+        seen = [space for space in (team.own, team.team, team.state) if space is not None]
+        # The N own observations of a team in bytes, (N, width, height), look like a picture.
+        if any(is_image_space(space) and int(np.argmin(space.shape or (0,))) != 0 for space in seen):
+            venv = Untransposed(venv)
         super().__init__(venv, n_agents, team.to_dict_space())
         self.time_limit = time_limit
         self.team_spaces = team
@@ -324,45 +325,16 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return info
 
 
-class DictRows(TeamVecEnvWrapper):
-    """
-    Wrap plain own observations into Dicts with the key ``"obs"``, as in rows with signals.
+class Untransposed(VecTransposeImage):
+    """Layer below which SB3 transposes nothing that only looks like channel-last images: it adds one such layer."""
 
-    :param venv: rows of flattened teams
-    :param n_agents: N; None takes the attribute ``n_agents`` of ``venv``
-    """
+    def __init__(self, venv: VecEnv) -> None:
+        VecEnvWrapper.__init__(self, venv)  # not the base class's constructor, which looks for images
 
-    def __init__(self, venv: VecEnv, n_agents: int | None = None) -> None:
-        super().__init__(venv, n_agents, spaces.Dict({OBS_KEY: venv.observation_space}))
-
-    def reset(self) -> VecEnvObs:
-        """Start new episodes in all games (see the base class)."""
-        return {OBS_KEY: self.venv.reset()}  # type: ignore[dict-item]
+    def reset(self) -> Any:
+        """Start new episodes in all games."""
+        return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Wait for the step of all games (see the base class)."""
-        obs, rewards, dones, infos = self.venv.step_wait()
-        infos = [
-            {**info, TERMINAL_OBSERVATION: {OBS_KEY: info[TERMINAL_OBSERVATION]}}
-            if info.get(TERMINAL_OBSERVATION) is not None
-            else info
-            for info in infos
-        ]
-        return {OBS_KEY: obs}, rewards, dones, infos  # type: ignore[dict-item]
-
-
-def _protected_from_transposition(venv: VecEnv, n_agents: int | None) -> VecEnv:
-    """Prevent SB3 from transposing spaces that only resemble images, by a VecTransposeImage that skips all keys."""
-    if not isinstance(venv.observation_space, spaces.Dict):  # VecTransposeImage takes Dicts and images
-        venv = DictRows(venv, n_agents)
-    return VecTransposeImage(venv, skip=True)
-
-
-def _sb3_would_transpose(team: TeamSpaces) -> bool:
-    """
-    Return whether SB3 would mistake a part for channel-last images and transpose it.
-
-    The N own observations of a team in bytes, (N, width, height), look like an image.
-    """
-    seen = [space for space in (team.own, team.team, team.state) if space is not None]
-    return any(is_image_space(space) and int(np.argmin(space.shape or (0,))) != 0 for space in seen)
+        """Wait for the step of all games."""
+        return self.venv.step_wait()

@@ -11,7 +11,7 @@ import time
 import warnings
 import weakref
 from collections.abc import Mapping, Sequence
-from typing import IO, Any, ClassVar, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
@@ -151,11 +151,11 @@ class TeamMonitor(TeamVecEnvWrapper):
 
     def _begin_file(self) -> ResultsWriter | None:
         """Create the file at the first step, so that a run that fails earlier touches no file."""
-        path = self._path()
-        if path is None:
-            return None
-        if os.path.isfile(path):
-            _set_aside(path)
+        path, number = self._path(), 1
+        if path is not None and os.path.isfile(path):  # of another run
+            while os.path.exists(f"{path}.{number}"):
+                number += 1
+            os.rename(path, f"{path}.{number}")
         return self._open(override_existing=True)
 
     def _path(self) -> str | None:
@@ -176,6 +176,12 @@ class TeamMonitor(TeamVecEnvWrapper):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Return counters, unfinished episodes, and the size of the file."""
+        size = 0
+        if self._writer is not None:
+            file = self._writer.file_handler
+            file.flush()
+            os.fsync(file.fileno())
+            size = os.fstat(file.fileno()).st_size
         return {
             "returns": self._returns.copy(),
             "lengths": self._lengths.copy(),
@@ -183,7 +189,7 @@ class TeamMonitor(TeamVecEnvWrapper):
             "episode_count": self.episode_count,
             "t_start": self.t_start,
             "n_steps": self._n_steps,
-            "file_size": 0 if self._writer is None else _synced_size(self._writer.file_handler),
+            "file_size": size,
         }
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
@@ -228,27 +234,11 @@ class TeamMonitor(TeamVecEnvWrapper):
         super().close()
 
 
-def _set_aside(path: str) -> None:
-    """Rename the file of another run to monitor.csv.1, monitor.csv.2 ..."""
-    number = 1
-    while os.path.exists(f"{path}.{number}"):
-        number += 1
-    os.rename(path, f"{path}.{number}")
-
-
-def _synced_size(file: IO[Any]) -> int:
-    """Write a file to disk and return its size in bytes."""
-    file.flush()
-    os.fsync(file.fileno())
-    return os.fstat(file.fileno()).st_size
-
-
 class SharedReward(TeamVecEnvWrapper):
     """
     Give every agent the sum or the mean of its team's rewards. Wrap it around a TeamMonitor, which logs unchanged
     returns.
 
-    :param venv: rows of flattened teams
     :param team_reward: ``"sum"`` or ``"mean"`` over the agents of a team
     """
 

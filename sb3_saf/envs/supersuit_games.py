@@ -52,11 +52,6 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     - the last step's infos are kept: those of the next episode's reset are in ``reset_infos``;
     - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
     - rows have signals on request: active agents, action masks, the game's state.
-
-    :param env: the game
-    :param reader: reads it
-    :param index: index of the game, for messages
-    :param notes: gets warnings
     """
 
     par_env: AnyParallelEnv
@@ -92,7 +87,6 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         Begin an episode.
 
         :param seed: seed of the game, None to continue its random stream
-        :param options: options for the game
         :return: observations and infos of the N rows
         """
         observations, infos = audit.reset(self.par_env, seed, options)
@@ -228,8 +222,6 @@ def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], A
 
     It holds a pickle if possible, so that a function that returns an existing environment makes copies of it.
 
-    :param make_env: a factory or an environment
-    :param is_factory: whether ``make_env`` is a factory
     :param n_cpus: number of processes in which games will be made; with one process a factory need not be picklable
         (for instance of a local class with ``functools.lru_cache`` on its methods)
     :raises ValueError: if it cannot be copied, with a fix
@@ -269,8 +261,6 @@ class TeamConcatVecEnv(ConcatVecEnv):
     Changes to :class:`supersuit.vector.ConcatVecEnv`: each game gets its own seed and options, attributes and methods
     of games are accessible, and all games are closed even if closing one fails.
 
-    :param make_game: makes a game
-    :param reader: reads the games
     :param indices: indices of the games among all E
     :param is_worker: whether the process has no other games: it then seeds the global generators of Python and NumPy,
         from which games may draw, since processes are forked with equal ones

@@ -63,7 +63,6 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     :param make_env: a function that makes the environment, or an environment, which is copied for each game. For worker
         processes cloudpickle must be able to pickle it
-    :param n_games: E, number of games
     :param seed: seed of the games, as in :meth:`seed`
     :param n_cpus: number of worker processes; 1 keeps all games in this process
     :param active: whether rows have ``"active"``

@@ -42,8 +42,6 @@ class GameProcess(gymnasium.Env[Any, Any]):
     Only the method :meth:`run` is used: rows of a group do not fit into the scalar rewards and dones of an environment.
     Payloads are pickled by cloudpickle, which supports lambdas, and exceptions are returned, so that a game's error
     does not end the process.
-
-    :param make_games: makes the games, at the first call
     """
 
     observation_space = action_space = spaces.Discrete(1)
@@ -76,9 +74,6 @@ class WorkerGames:
     """
     Games in several processes.
 
-    :param make_game: makes a game
-    :param reader: reads the games
-    :param n_games: E
     :param n_cpus: maximum number of processes, started with the default start method of :mod:`multiprocessing`
     """
 
@@ -145,9 +140,6 @@ class _Watch(threading.Thread):
     Thread that ends all processes when one has ended.
 
     Forked processes hold copies of each other's pipes, so the pipe of a dead process would never report its end.
-
-    :param processes: all workers
-    :param names: names of their games, for the message
     """
 
     def __init__(self, processes: Sequence[BaseProcess], names: Sequence[str]) -> None:

@@ -63,9 +63,6 @@ class Job:
     Job of a worker.
 
     :param cell: cell to train, unless the folder has its model, and to test
-    :param config: configuration of the run
-    :param device: as in SB3
-    :param threads: threads of torch
     :param tensorboard: whether to keep TensorBoard logs of the training
     """
 
@@ -161,7 +158,6 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
     evaluations have them.
 
     :param model: model of the job, whose parameters are replaced; None for a random team
-    :param models: folder of the trained parameters
     :raises NonFiniteError: if a return is not finite
     """
     cell, config, settings = job.cell, job.config, job.config.settings(job.cell, level)
@@ -264,12 +260,9 @@ def _difference_of_weights(before: Path, after: Path) -> str:
         return str(error)
     if list(ours) != list(theirs):
         return "other names"
-    kinds = [name for name in ours if (ours[name].dtype, ours[name].shape) != (theirs[name].dtype, theirs[name].shape)]
-    if kinds:
-        name = kinds[0]
-        return (
-            f"{name} is {ours[name].dtype} of shape {tuple(ours[name].shape)}, now {theirs[name].dtype} of shape "
-            f"{tuple(theirs[name].shape)}"
-        )
+    for name, one in ours.items():
+        other = theirs[name]
+        if (one.dtype, one.shape) != (other.dtype, other.shape):
+            return f"{name} is {one.dtype} of {tuple(one.shape)}, now {other.dtype} of {tuple(other.shape)}"
     changed = [name for name in ours if ours[name].numpy().tobytes() != theirs[name].numpy().tobytes()]
     return f"{len(changed)} of {len(ours)} tensors differ, such as {changed[0]}" if changed else ""

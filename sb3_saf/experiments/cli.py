@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from sb3_saf.checkpoints.learning import handled
 from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, MODULE, PROGRAM, Experiment, own_experiment
@@ -58,20 +58,20 @@ def _parser() -> argparse.ArgumentParser:
     parser = OneLineParser(prog=PROGRAM, description="Grids of trainings: the paper's by name, and your own.")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=OneLineParser, metavar="COMMAND")
     commands.add_parser("list", help="the paper's experiments").set_defaults(function=_list)
-    for name, function, groups, text in (
-        (
-            "plan",
-            _plan,
-            (_add_config, _add_machine),
-            "cells, game steps and, once cells are finished, the time that is left",
-        ),
-        ("run", _run, (_add_config, _add_machine), "run what is missing"),
-        ("report", _report, (_add_report,), "figures and a page of tables, of whatever is there"),
+    for name, function, text in (
+        ("plan", _plan, "cells, game steps and, once cells are finished, the time that is left"),
+        ("run", _run, "run what is missing"),
+        ("report", _report, "figures and a page of tables, of whatever is there"),
     ):
         command = commands.add_parser(name, help=text, description=text)
         command.set_defaults(function=function)
-        for add_group in (_add_selection, *groups):
-            add_group(command)
+        _add_selection(command)
+        if function is _report:
+            text = "folders of published results to draw beside these"
+            command.add_argument("--beside", type=Path, nargs="+", default=[], help=text)
+        else:
+            _add_config(command)
+            _add_machine(command)
     check = commands.add_parser("check", help="run a finished cell again and compare the numbers")
     check.set_defaults(function=_check)
     check.add_argument(
@@ -143,63 +143,37 @@ def _add_machine(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--gpus-per-cell", type=float, default=0, help="on Ray; with 0.25 four cells share one")
 
 
-def _add_report(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--beside", type=Path, nargs="+", default=[], help="folders of published results to draw beside these"
-    )
-
-
 # Interpretation of the options
 
 
-class _Asked(NamedTuple):
-    """Subject of a command: an experiment, the folder of its results, and the selected part."""
-
-    experiment: Experiment
-    results: Results
-    selection: Selection
-
-    @classmethod
-    def of(cls, options: argparse.Namespace) -> _Asked:
-        """
-        Read the options.
-
-        :raises ValueError: for unknown names
-        """
-        name = _name(options)
-        results = Results(
-            options.folder or Path("runs", "experiments", _size(options) if name in EXPERIMENTS else name)
-        )
-        if options.env:
-            experiment = own_experiment(name, tuple(dict.fromkeys(options.env)), options.vary)
-        elif options.vary:
-            raise ValueError("--vary is for a grid of your own: give its environments with --env")
-        else:
-            experiment = results.experiment(name)
-        selection = Selection(
-            tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
-            tuple(dict.fromkeys(options.methods)),
-            tuple(dict.fromkeys(_env(task, experiment) for task in options.tasks)),
-            tuple(dict.fromkeys(options.levels)),
-        )
-        return cls(experiment, results, selection)
+def _subject(options: argparse.Namespace) -> tuple[Experiment, Results, Selection]:
+    """Return the experiment, the folder of its results, and the selected part; ValueError for unknown names."""
+    if options.name is None and len(options.env) != 1:
+        example = f"{python_command(MODULE)} {options.command} coordination, or --env mpe2.simple_spread_v3"
+        what = "several environments need a name before --env" if options.env else "name an experiment"
+        raise ValueError(f"{what}: {example}")
+    # An environment names the grid on it.
+    name = folder_name(options.env[0] if options.name is None else options.name).removesuffix("-v0")
+    results = Results(options.folder or Path("runs", "experiments", _size(options) if name in EXPERIMENTS else name))
+    if options.env:
+        experiment = own_experiment(name, tuple(dict.fromkeys(options.env)), options.vary)
+    elif options.vary:
+        raise ValueError("--vary is for a grid of your own: give its environments with --env")
+    else:
+        experiment = results.experiment(name)
+    selection = Selection(
+        tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
+        tuple(dict.fromkeys(options.methods)),
+        tuple(dict.fromkeys(_env(task, experiment) for task in options.tasks)),
+        tuple(dict.fromkeys(options.levels)),
+    )
+    return experiment, results, selection
 
 
 def _size(options: argparse.Namespace) -> Size:
     """Return the given size, that of the folder, or the default."""
     stored = None if options.folder is None else Results(options.folder).config()
     return options.size or (DEFAULT_SIZE if stored is None else stored.size)
-
-
-def _name(options: argparse.Namespace) -> str:
-    """Return the name of the experiment; ValueError if there is none."""
-    name: str | None = options.name
-    if name is None and len(options.env) != 1:
-        example = f"{python_command(MODULE)} {options.command} coordination, or --env mpe2.simple_spread_v3"
-        what = "several environments need a name before --env" if options.env else "name an experiment"
-        raise ValueError(f"{what}: {example}")
-    # An environment names the grid on it.
-    return folder_name(options.env[0] if name is None else name).removesuffix("-v0")
 
 
 def _env(task: str, experiment: Experiment) -> str:
@@ -261,7 +235,7 @@ def _list(options: argparse.Namespace) -> int:
 def _plan(options: argparse.Namespace) -> int:
     from sb3_saf.experiments.run import make_plan
 
-    experiment, results, selection = _Asked.of(options)
+    experiment, results, selection = _subject(options)
     if not experiment.is_grid:
         print(f"{experiment.name}: counts weights, trains nothing")
         return 0
@@ -270,7 +244,7 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    experiment, results, selection = _Asked.of(options)
+    experiment, results, selection = _subject(options)
     if not experiment.is_grid:
         return _print_parameters()
     require("pandas")
@@ -298,7 +272,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    experiment, results, selection = _Asked.of(options)
+    experiment, results, selection = _subject(options)
     name = experiment.name
     if not experiment.is_grid:
         return _print_parameters()

@@ -34,7 +34,6 @@ class Difference(NamedTuple):
     :param estimate: mean with its 95 % interval (Student's t), NaN for a single pair
     :param p: of the two-sided test of no difference
     :param p_equivalent: of the test that the difference is at least the margin; NaN without margin
-    :param n: pairs
     """
 
     estimate: Estimate
@@ -77,9 +76,7 @@ class Comparison(NamedTuple):
     """
     Comparison of two methods on the same seeds and the same test games.
 
-    :param seeds: common seeds
     :param first: mean return of the first, with its 95 % interval over these seeds
-    :param second: the same for the second
     :param test: mean of first - second, paired by seed
     """
 
@@ -87,16 +84,6 @@ class Comparison(NamedTuple):
     first: Estimate
     second: Estimate
     test: Difference
-
-    @property
-    def difference(self) -> Estimate:
-        """Mean of first - second with its interval."""
-        return self.test.estimate
-
-    @property
-    def verdict(self) -> str:
-        """Whether the first is higher or lower, see :class:`Difference`."""
-        return self.test.verdict
 
 
 class Compared(NamedTuple):
@@ -115,7 +102,6 @@ def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
 
     :param first: columns ``seed`` and ``return_mean``; with ``return_sd`` and ``episodes`` the noise of tests is known,
         with ``max_return`` the margin of equivalence
-    :param second: the same
     :return: None if they have no seed in common
     """
     pairs = first.merge(second, on="seed", suffixes=("", "_second")).sort_values("seed")

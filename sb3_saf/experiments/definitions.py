@@ -23,7 +23,6 @@ class Method(NamedTuple):
     A method of experiments.
 
     :param algo: algorithm, as in ``sb3_saf.train --algo``
-    :param words: name in tables and figures
     :param policy_kwargs: arguments of the policy that differ from those of ``zoo_configs``
     """
 
@@ -118,7 +117,6 @@ class View(NamedTuple):
     Levels along one parameter: the content of a bar chart.
 
     :param parameter: varied parameter; empty if there is one level only
-    :param levels: levels of the tests
     :param train: level of the training; None to train at each test level
     :param label: label of the axis; empty for the parameter's name
     """
@@ -155,11 +153,8 @@ class Experiment(NamedTuple):
     """
     A grid of methods, environments and levels.
 
-    :param name: name in the commands
-    :param question: research question
     :param envs: environments, as in ``sb3_saf.train --env``
     :param methods: algorithms, as in ``sb3_saf.train --algo``
-    :param views: levels
     """
 
     name: str
@@ -214,16 +209,16 @@ def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[A
         )
     if len(vary) > 1:
         raise ValueError(f"--vary takes one parameter, got {', '.join(vary)}; give the others with --env-kwargs")
-    views = tuple(_view(parameter, values) for parameter, values in vary.items()) or (View("", (Level(),)),)
-    return Experiment(name, f"methods on {', '.join(envs)}", tuple(envs), _METHODS, views)
-
-
-def _view(parameter: str, values: object) -> View:
-    values = values if isinstance(values, list) else [values]
-    for value in values:
-        if not isinstance(value, (bool, int, float, str)) or not _PLAIN.fullmatch(str(value)):
-            raise ValueError(f"--vary {parameter} expects numbers or words, such as {parameter}:[1,2], got {value!r}")
-    return View(parameter, tuple(Level(((parameter, value),)) for value in dict.fromkeys(values)))
+    view = View("", (Level(),))
+    for parameter, given in vary.items():
+        values = given if isinstance(given, list) else [given]
+        for value in values:
+            if not isinstance(value, (bool, int, float, str)) or not _PLAIN.fullmatch(str(value)):
+                raise ValueError(
+                    f"--vary {parameter} expects numbers or words, such as {parameter}:[1,2], got {value!r}"
+                )
+        view = View(parameter, tuple(Level(((parameter, value),)) for value in dict.fromkeys(values)))
+    return Experiment(name, f"methods on {', '.join(envs)}", tuple(envs), _METHODS, (view,))
 
 
 COORDINATION: Final = "coordination"
@@ -278,11 +273,7 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 
 
 def find_experiment(name: str, others: Collection[str] = ()) -> Experiment:
-    """
-    Return an experiment of the paper; the ValueError suggests the nearest known name.
-
-    :param others: further names to list in the error
-    """
+    """Return an experiment of the paper; the ValueError suggests the nearest known name."""
     if name not in EXPERIMENTS:
         raise unknown_name("experiment", name, [*others, *EXPERIMENTS])
     return EXPERIMENTS[name]

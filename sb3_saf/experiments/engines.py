@@ -73,8 +73,6 @@ class LocalEngine(Engine):
     """
     Engine with processes of this machine.
 
-    :param workers: maximum number of parallel processes
-    :param threads: threads of each process
     :param command: command to which the folder of a job is appended
     """
 
@@ -110,7 +108,9 @@ class LocalEngine(Engine):
         if code:
             with (folder / "log.txt").open(encoding="utf-8", errors="replace") as log:
                 text = log.read()[-_LOG_TAIL:]
-            raise CellError(text if code == 1 and text else f"{text}\nthe worker process died ({_death(code)})\n")
+            death = f"exit code {code}" if code > 0 else signal.Signals(-code).name
+            hint = "; if the machine ran out of memory, use fewer --workers" if death == "SIGKILL" else ""
+            raise CellError(text if code == 1 and text else f"{text}\nthe worker process died ({death}{hint})\n")
 
     def close(self) -> None:
         """End the processes: SIGTERM lets them write a last checkpoint."""
@@ -123,13 +123,6 @@ class LocalEngine(Engine):
             except subprocess.TimeoutExpired:
                 process.kill()
         self._waiting.shutdown()
-
-
-def _death(code: int) -> str:
-    if code >= 0:
-        return f"exit code {code}"
-    name = signal.Signals(-code).name
-    return f"{name}; if the machine ran out of memory, use fewer --workers" if name == "SIGKILL" else name
 
 
 class RayEngine(Engine):
@@ -153,8 +146,18 @@ class RayEngine(Engine):
         self.gpus = gpus
         self._ray = require_ray(is_local=address is None)
         self._is_ours = not self._ray.is_initialized()
+        self._references: list[Any] = []
         if self._is_ours:
-            self._connect(workers)
+            options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+            if address is None:
+                options |= {"num_cpus": workers, "include_dashboard": False}
+            try:
+                self._ray.init(address=address or "local", **options)
+            except ConnectionError as error:
+                raise ValueError(
+                    f"no Ray cluster at --address {address} ({_first_line(error)}); start one with `ray start "
+                    "--head`, or leave --address out to start Ray on this machine"
+                ) from None
         try:
             self._check_resources()
         except ValueError:
@@ -162,19 +165,6 @@ class RayEngine(Engine):
             raise
         # The run counts attempts, so that failures and lost nodes count alike.
         self._task = self._ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_run_on_ray)
-        self._references: list[Any] = []
-
-    def _connect(self, workers: int | None) -> None:
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-        if self.address is None:
-            options |= {"num_cpus": workers, "include_dashboard": False}
-        try:
-            self._ray.init(address=self.address or "local", **options)
-        except ConnectionError as error:
-            raise ValueError(
-                f"no Ray cluster at --address {self.address} ({_first_line(error)}); start one with `ray start "
-                "--head`, or leave --address out to start Ray on this machine"
-            ) from None
 
     def _check_resources(self) -> None:
         """Raise ValueError for jobs that fit on no node; only warn on a cluster, which may grow."""
@@ -221,19 +211,10 @@ class RayEngine(Engine):
 
     def close(self) -> None:
         """Cancel the tasks, and end a Ray that was started or connected to here."""
-        for reference in getattr(self, "_references", []):
+        for reference in self._references:
             self._ray.cancel(reference, force=True)
         if self._is_ours:
             self._ray.shutdown()
-
-
-def _pack(folder: Path) -> bytes:
-    """Return the files of a folder as one archive; models are compressed already."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-            archive.write(path, path.relative_to(folder).as_posix())
-    return buffer.getvalue()
 
 
 def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
@@ -250,7 +231,13 @@ def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
         log = stack.enter_context((folder / "log.txt").open("w", encoding="utf-8"))
         with contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             run_job(folder)
-        return None if is_shared else _pack(folder / "result")
+        if is_shared:
+            return None
+        result, buffer = folder / "result", io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:  # models are compressed already
+            for path in sorted(path for path in result.rglob("*") if path.is_file()):
+                archive.write(path, path.relative_to(result).as_posix())
+        return buffer.getvalue()
 
 
 def _first_line(error: BaseException) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -27,9 +27,6 @@ class Cell:
 
     :param method: name of the method (``definitions.METHODS``) or algorithm, or ``"random"`` for the untrained team
     :param env: the environment, as in ``sb3_saf.train --env``
-    :param level: level of the training
-    :param seed: seed of the run
-    :param tests: levels of the tests
     """
 
     method: str
@@ -99,7 +96,6 @@ class RunConfig:
         """
         Return the settings of a cell.
 
-        :param cell: cell with the method and environment
         :param level: level of a test; None for the level of the training
         :raises ValueError: for unknown names, levels that cannot be built, and ``normalize``
         """
@@ -148,7 +144,6 @@ class Selection:
     """
     Part of an experiment.
 
-    :param seeds: seeds of the runs
     :param methods: empty for the experiment's methods
     :param envs: empty for the experiment's environments
     :param levels: positions on the experiment's axes, as text; empty for all of them
@@ -189,7 +184,12 @@ def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> G
     fitting: list[tuple[str, Level, tuple[Level, ...]]] = []
     for env in selection.envs or experiment.envs:
         for level, tests in experiment.at(selection.levels).tests().items():
-            bad = dict(_misfits(env, {level, *tests}, config))
+            bad: dict[Level, str] = {}
+            for one in {level, *tests}:
+                try:
+                    config.settings(Cell(RANDOM, env, one, 0))
+                except ValueError as error:  # it cannot be built
+                    bad[one] = str(error)
             wrong = [level] if level in bad else [test for test in tests if test in bad]
             left_out += [LeftOut(env.removesuffix("-v0"), level, test, bad[test]) for test in wrong]
             if level not in bad:
@@ -209,15 +209,6 @@ def merge(cells: Iterable[Cell]) -> list[Cell]:
         known = merged.setdefault(cell.id, cell)
         merged[cell.id] = replace(known, tests=tuple(dict.fromkeys((*known.tests, *cell.tests))))
     return list(merged.values())
-
-
-def _misfits(env: str, levels: Iterable[Level], config: RunConfig) -> Iterator[tuple[Level, str]]:
-    """Yield the levels that cannot be built, with the reason."""
-    for level in levels:
-        try:
-            config.settings(Cell(RANDOM, env, level, 0))
-        except ValueError as error:
-            yield level, str(error)
 
 
 class Shard(NamedTuple):
@@ -240,12 +231,12 @@ class Shard(NamedTuple):
 
         :param cells: the whole grid, finished cells included, the same for all parts
         """
-        trained = [cell for cell in cells if cell.is_trained]
-        others = [cell for cell in cells if not cell.is_trained]
-        return [cell for group in (trained, others) for cell in group[self._stretch(len(group))]]
-
-    def _stretch(self, n: int) -> slice:
-        return slice((self.number - 1) * n // self.parts, self.number * n // self.parts)
+        part = []
+        for is_trained in (True, False):
+            group = [cell for cell in cells if cell.is_trained == is_trained]
+            first, end = ((number * len(group)) // self.parts for number in (self.number - 1, self.number))
+            part += group[first:end]
+        return part
 
     def __str__(self) -> str:
         return f"{self.number}/{self.parts}"

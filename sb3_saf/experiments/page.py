@@ -35,14 +35,9 @@ class Content(NamedTuple):
     """
     Content of a page.
 
-    :param experiment: the experiment
-    :param config: configuration of its cells
-    :param results: folder of results
     :param cells: all requested cells
-    :param missing: unfinished cells
     :param left_out: levels that do not fit the size
     :param frames: tables of tests and curves, see ``tables``
-    :param figures: file names of the figures
     """
 
     experiment: Experiment
@@ -159,13 +154,10 @@ def means(table: pd.DataFrame, view: View) -> str:
         for method, of_method in of_task.groupby("method", sort=False):
             by_level = [of_method.loc[of_method["level"] == level.slug, "return_mean"] for level in levels]
             counts = sorted({len(values) for values in by_level if len(values)})
-            body.append([_name(method), *map(_mean, by_level), " or ".join(map(str, counts))])
+            shown = [_NOTHING if values.empty else _show(mean_over_seeds(values.to_numpy())) for values in by_level]
+            body.append([_name(method), *shown, " or ".join(map(str, counts))])
         parts += [*_table([_text(task), *map(_text, levels), "seeds"], body), ""]
     return "\n".join(parts).rstrip()
-
-
-def _mean(values: pd.Series) -> str:
-    return _NOTHING if values.empty else _show(mean_over_seeds(values.to_numpy()))
 
 
 def known(content: Content) -> str:
@@ -196,8 +188,8 @@ def losses(table: pd.DataFrame, view: View) -> str:
     body = []
     for task, of_task in rows.groupby("task", sort=False):
         for method, of_method in of_task.groupby("method", sort=False):
-            easy, *hard = (_by_seed(of_method, level) for level in (first, *harder))
-            body.append([_text(task), _name(method), *(_loss(easy, each) for each in hard)])
+            by_level = of_method.pivot_table(index="seed", columns="level", values="return_mean")
+            body.append([_text(task), _name(method), *(_loss(by_level, first, level) for level in harder)])
     text = (
         f"Share of the return at {first} that is lost, in percent: mean over seeds of each seed's own loss, 95 % "
         f"interval (Student's t). {_NOTHING} where a seed has no return at {first} to lose."
@@ -205,16 +197,12 @@ def losses(table: pd.DataFrame, view: View) -> str:
     return "\n".join([f"## Loss by {view.axis}", "", text, "", *_table(["task", "", *map(_text, harder)], body)])
 
 
-def _by_seed(rows: pd.DataFrame, level: Level) -> pd.DataFrame:
-    return rows.loc[rows["level"] == level.slug, ["seed", "return_mean"]]
-
-
-def _loss(easy: pd.DataFrame, hard: pd.DataFrame) -> str:
-    pairs = easy.merge(hard, on="seed", suffixes=("_easy", "_hard"))
-    if pairs.empty or not (pairs["return_mean_easy"] > 0).all():
+def _loss(returns: pd.DataFrame, easy: Level, hard: Level) -> str:
+    """Return the loss from an easy to a hard level by the returns of each seed (rows) at each level (columns)."""
+    pairs = returns.reindex(columns=[easy.slug, hard.slug]).dropna()
+    if pairs.empty or not (pairs[easy.slug] > 0).all():
         return _NOTHING
-    share = pairs["return_mean_hard"] / pairs["return_mean_easy"]
-    return _show(mean_over_seeds((100 * (1 - share)).to_numpy()), digits=0)
+    return _show(mean_over_seeds((100 * (1 - pairs[hard.slug] / pairs[easy.slug])).to_numpy()), digits=0)
 
 
 def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
@@ -235,7 +223,12 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
     parts = ["## Aggregates", "", text, ""]
     methods = list(dict.fromkeys(common["method"]))
     for view in experiment.views:
-        columns = {_text(level): found for level in view.levels if (found := _of_level(common, view, level))}
+        columns = {}
+        for level in view.levels:
+            rows = of_view(common, view)
+            rows = rows[rows["level"] == level.slug].drop_duplicates(["method", "seed", "task"])
+            if not rows.empty:
+                columns[_text(level)] = interquartile_means(score_matrices(rows, "task"))
         if columns:
             parts += [*_estimates([f"by {view.axis}{view.suffix}", *columns], methods, columns.values()), ""]
     scores = score_matrices(common, "stratum")
@@ -245,13 +238,6 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
     return "\n".join(
         [*parts, *_estimates(head, methods, [interquartile_means(scores), optimality_gaps(scores), better])]
     )
-
-
-def _of_level(common: pd.DataFrame, view: View, level: Level) -> dict[str, Estimate]:
-    """Return interquartile means at one level; empty without results."""
-    rows = of_view(common, view)
-    rows = rows[rows["level"] == level.slug].drop_duplicates(["method", "seed", "task"])
-    return {} if rows.empty else interquartile_means(score_matrices(rows, "task"))
 
 
 def _estimates(head: Sequence[str], methods: Iterable[str], columns: Iterable[Mapping[str, Estimate]]) -> list[str]:
@@ -275,10 +261,10 @@ def _comparisons(table: pd.DataFrame, view: View) -> str:
     corrected = iter(holm([one.found.test.p for one in compared if not math.isnan(one.found.test.p)]))
     body = []
     for task, level, _, other, found in compared:
-        numbers = [_show(found.first), _show(found.second), _show(found.difference)]
+        numbers = [_show(found.first), _show(found.second), _show(found.test.estimate)]
         p = _NOTHING if math.isnan(found.test.p) else f"{next(corrected):.3f}"
         seeds = ", ".join(map(str, found.seeds))
-        body.append([_text(task), _text(level), _name(other), seeds, *numbers, p, found.verdict])
+        body.append([_text(task), _text(level), _name(other), seeds, *numbers, p, found.test.verdict])
     heading = f"## Paired comparisons by {view.axis}{view.suffix}"
     return "\n".join([heading, "", text, "", *_table(head, body)])
 
@@ -288,8 +274,8 @@ def _reproduction(content: Content) -> str:
     experiment = content.results.experiment(content.experiment.name)  # with all levels
     lines = ["## Run it again", "", "```sh"]
     for selection in content.results.selections(experiment.name):
-        words = [*PROGRAM.split(), "run", *experiment_words(experiment), *config_words(content.config)]
-        words += ["--seeds", *map(str, selection.seeds)]
+        words = [*PROGRAM.split(), "run", *experiment_words(experiment), *content.config.words()]
+        words += ["--episodes", str(content.config.episodes), "--seeds", *map(str, selection.seeds)]
         for option, values in (("methods", selection.methods), ("levels", selection.levels)):
             words += [f"--{option}", *values] if values else []
         if experiment.name in EXPERIMENTS and selection.envs:
@@ -314,11 +300,6 @@ def experiment_words(experiment: Experiment) -> list[str]:
     if view.parameter:
         words += option_words("--vary", {view.parameter: [view.position(level) for level in view.levels]})
     return words
-
-
-def config_words(config: RunConfig) -> list[str]:
-    """Return the command line options for a configuration."""
-    return [*config.words(), "--episodes", str(config.episodes)]
 
 
 def _versions(content: Content) -> str:

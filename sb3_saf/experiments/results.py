@@ -37,7 +37,7 @@ import numpy as np
 from sb3_saf.evaluation import EvaluationResult
 from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, Level, find_experiment, own_experiment
 from sb3_saf.experiments.grid import Cell, RunConfig, Selection
-from sb3_saf.teams.files import differences, plain, read_json, write_json, write_text
+from sb3_saf.teams.files import differences, plain, read_json, try_lock, write_json, write_text
 from sb3_saf.training.folders import CURVE, RUN_FILE, Run, finish_run
 
 MODEL: Final = "model.zip"
@@ -59,7 +59,6 @@ class Play:
     :param lengths: game steps of each episode
     :param successes: whether each episode was won; empty if the games do not report it
     :param agent_means: mean own return of each agent
-    :param wall_seconds: cost
     """
 
     policy: str
@@ -87,8 +86,6 @@ class LevelResult:
     """
     Tests at a level.
 
-    :param level: parameters of the level
-    :param n_agents: N
     :param max_return: the largest possible team return, if known
     :param plays: tests; the first is the primary one, of the best policy with actions as in training
     """
@@ -127,11 +124,7 @@ class _OwnExperiment:
 
 
 class Results:
-    """
-    Folder of results. Damaged files count as missing, and are recorded in :attr:`damaged`.
-
-    :param folder: created at the first write
-    """
+    """Folder of results. Damaged files count as missing, and are recorded in :attr:`damaged`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -239,14 +232,7 @@ class Results:
 
     def lock(self, cell: Cell) -> filelock.BaseFileLock | None:
         """Lock a cell against other runs; None if another run has the lock. It is released at the process's end."""
-        folder = self.folder / ".locks"
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder / f"{cell.id.replace('/', '_')}.lock")
-        try:
-            lock.acquire(timeout=0)
-        except filelock.Timeout:
-            return None
-        return lock
+        return try_lock(self.folder / ".locks" / f"{cell.id.replace('/', '_')}.lock")
 
     def publish(self, cell: Cell) -> None:
         """Move the result of an attempt to the cell's folder: a new folder, or further tests of a finished one."""
@@ -263,10 +249,6 @@ class Results:
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(target, kept)
             os.replace(result, target)
-        self.forget(cell)
-
-    def forget(self, cell: Cell) -> None:
-        """Remove the working folder of a finished cell."""
         folder = self.unfinished(cell)
         shutil.rmtree(folder, ignore_errors=True)
         for parent in folder.parents[: len(Path(cell.id).parts)]:

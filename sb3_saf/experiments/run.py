@@ -81,8 +81,6 @@ class CellOptions:
     """
     Options for running cells, which affect only the last digits of results.
 
-    :param device: as in SB3
-    :param threads: threads of torch in each worker
     :param retries: additional attempts for a failed or killed cell
     :param tensorboard: whether cells keep TensorBoard logs
     :param resume: whether killed cells continue from their last checkpoint
@@ -148,7 +146,7 @@ def run(
         for line in progress.lines():
             bar.update(progress.n_ended - bar.n)
             bar.write(line, file=sys.stdout)
-    summary = progress.summary()
+    summary = Summary(len(progress.finished), progress.failed, progress.elsewhere)
     if summary.elsewhere:
         print(f"{len(summary.elsewhere)} cells were left to another run in {results.folder}")
     write_tables(experiment, results)
@@ -164,9 +162,9 @@ class _Progress:
         self._config, self._results, self._engine, self._options = config, results, engine, options
         self._waiting = deque((cell, 1) for cell in todo)
         self._at_work: dict[Future[None], Attempt] = {}
-        self._finished: list[Cell] = []
-        self._failed: list[Cell] = []
-        self._elsewhere: list[Cell] = []
+        self.finished: list[Cell] = []
+        self.failed: list[Cell] = []
+        self.elsewhere: list[Cell] = []
         self._n_cells, self._clock = len(todo), time.monotonic()
         self._game_steps = {cell.id: config.settings(cell).game_steps for cell in todo if cell.is_trained}
 
@@ -181,11 +179,7 @@ class _Progress:
     @property
     def n_ended(self) -> int:
         """Number of cells that this run will not run again."""
-        return len(self._finished) + len(self._failed) + len(self._elsewhere)
-
-    def summary(self) -> Summary:
-        """Return the result of the run."""
-        return Summary(len(self._finished), self._failed, self._elsewhere)
+        return len(self.finished) + len(self.failed) + len(self.elsewhere)
 
     def lines(self) -> Iterator[str]:
         """Run all cells; yield a line about each attempt."""
@@ -206,7 +200,7 @@ class _Progress:
             lock = self._results.lock(cell)
             tests = () if lock is None else self._results.missing_tests(cell)
             if lock is None or not tests:  # another run has locked or finished it
-                self._elsewhere.append(cell)
+                self.elsewhere.append(cell)
                 if lock is not None:
                     lock.release()
                 continue
@@ -232,29 +226,26 @@ class _Progress:
 
     def _end(self, attempt: Attempt, error: BaseException | None) -> str:
         """Store the result or the error of an attempt; return a line about it."""
-        cell = attempt.cell
+        cell, count = attempt.cell, f"[{self.n_ended + 1}/{self._n_cells}]"
         if error is None:
             self._results.publish(cell)
-            self._finished.append(cell)
+            self.finished.append(cell)
             found = [(level, self._results.test(cell, level)) for level in cell.tests]
             returns = ", ".join(f"{test.evaluation.mean:.2f} ({level})" for level, test in found if test is not None)
-            return f"{self._count()} {cell}: return {returns}{self._rate()}"
+            return f"{count} {cell}: return {returns}{self._rate()}"
         reason = shorten(str(error).strip().splitlines()[-1], width=160, placeholder=" ...")
         if attempt.number <= self._options.retries:
             self._waiting.append((cell, attempt.number + 1))
-            return f"{self._count()} {cell}: attempt {attempt.number} failed, trying again: {reason}"
-        self._failed.append(cell)
+            return f"[{self.n_ended}/{self._n_cells}] {cell}: attempt {attempt.number} failed, trying again: {reason}"
+        self.failed.append(cell)
         path = self._results.unfinished(cell) / "error.txt"
         write_text(path, str(error))
-        return f"{self._count()} {cell}: FAILED: {reason}; see {path}"
-
-    def _count(self) -> str:
-        return f"[{self.n_ended}/{self._n_cells}]"
+        return f"{count} {cell}: FAILED: {reason}; see {path}"
 
     def _rate(self) -> str:
         """Return the rate of this run, and the remaining time at that rate."""
-        ended = {cell.id for cell in (*self._finished, *self._failed, *self._elsewhere)}
-        played = sum(self._game_steps.get(cell.id, 0) for cell in self._finished)
+        ended = {cell.id for cell in (*self.finished, *self.failed, *self.elsewhere)}
+        played = sum(self._game_steps.get(cell.id, 0) for cell in self.finished)
         left = sum(steps for cell_id, steps in self._game_steps.items() if cell_id not in ended)
         if not played or not left:
             return ""

@@ -63,7 +63,6 @@ def read_results(folder: str | Path, name: str) -> Frames:
 
     :param folder: folder of results, as in ``python -m sb3_saf.experiments run NAME -f FOLDER``; or one that has only
         ``NAME/runs.csv`` and ``NAME/curves.csv``
-    :param name: name of the experiment
     :raises ValueError: for an unknown name, or if no cell is finished
     """
     results = Results(Path(folder))
@@ -222,8 +221,6 @@ def marl_eval(frames: Frames, environment: str) -> dict[str, Any]:
 
     Its functions compare complete data only: settings and seeds that every method has, with as many evaluations.
     Absolute metrics are means over the test episodes of a run; ``score`` is normalised by the largest return.
-
-    :param environment: name of the suite
     """
     tests = frames.tests[(frames.tests["train_level"] == frames.tests["level"]) & (frames.tests["game_steps"] > 0)]
     tests = complete(tests.assign(stratum=tests["task"] + " " + tests["level"]))
@@ -248,8 +245,6 @@ def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
     Return the rows of a view, with their position on the axis in a column with the axis's name.
 
     The random team belongs to every view, since it does not depend on training levels.
-
-    :param table: table of tests
     """
     positions = {level.slug: view.position(level) for level in view.levels}
     trained_at = table["level"] if view.train is None else view.train.slug
@@ -258,11 +253,7 @@ def of_view(table: pd.DataFrame, view: View) -> pd.DataFrame:
 
 
 def strata(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
-    """
-    Return the rows of all views, each once, with a column ``stratum``, the task of aggregates.
-
-    :param table: table of tests
-    """
+    """Return the rows of all views, each once, with a column ``stratum``, the task of aggregates."""
     parts = []
     for view in experiment.views:
         shown = of_view(table, view)

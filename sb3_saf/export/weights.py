@@ -86,7 +86,6 @@ def read_weights(path: Path) -> dict[str, th.Tensor]:
     """
     Return the weights in a file of safetensors or of a saved model; only tensors are read.
 
-    :param path: the file
     :raises ExportError: if the file is missing, damaged, or has other content
     """
     if not path.is_file():

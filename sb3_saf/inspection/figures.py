@@ -167,7 +167,6 @@ def calibration(
 
     :param values: (n,)
     :param returns: (n,)
-    :param summary: their calibration
     :param unit: unit of returns
     :param n_bins: at most
     """

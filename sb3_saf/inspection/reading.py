@@ -78,8 +78,6 @@ def reader_of(policy: OurPolicy, n_rows: int, deterministic: bool = False) -> Po
     """
     Make the reader of a policy.
 
-    :param policy: policy to read
-    :param n_rows: B
     :param deterministic: whether it takes its most likely actions; value-based policies always take their best ones
     """
     if isinstance(policy, QPLEXPolicy):
@@ -91,7 +89,6 @@ class PolicyReader:
     """
     Act with an actor-critic policy and read its outputs. Its memory of the games of a training is left alone.
 
-    :param policy: policy of SAF, MAPPO or IPPO, with or without action masks or memory
     :param deterministic: whether it takes its most likely actions
     """
 
@@ -158,21 +155,17 @@ class PolicyReader:
         values_without: dict[Replacement, th.Tensor] = {}
         for name in REPLACEMENTS if len(team) > 1 else REPLACEMENTS[:1]:
             with _other_messages(self.source, name):
-                values_without[name] = self._values_with(name, obs)
+                if policy.actor_memory is None:
+                    values_without[name] = policy.predict_values(obs).flatten()
+                else:
+                    with policy.remembering(self._without[name]):
+                        values_without[name] = policy(obs, deterministic=True)[1].flatten()
         return reading._replace(
             write_attention=exchanged.write_attention[team],
             read_attention=exchanged.read_attention[team],
             message_strengths=exchanged.read[team].norm(dim=2).flatten(),
             values_without=values_without,
         )
-
-    def _values_with(self, name: Replacement, obs: Tensors) -> th.Tensor:
-        """Compute values (B,) with replaced messages."""
-        if self.policy.actor_memory is None:
-            return self.policy.predict_values(obs).flatten()
-        with self.policy.remembering(self._without[name]):
-            values: th.Tensor = self.policy(obs, deterministic=True)[1]
-            return values.flatten()
 
 
 @contextmanager
@@ -191,11 +184,7 @@ def _other_messages(source: SAFCritic, replacement: Replacement) -> Iterator[Non
 
 
 class QReader:
-    """
-    Act with a value-based policy and read its outputs. It always takes its best actions.
-
-    :param policy: policy of QPLEX, QMIX or VDN, with or without memory
-    """
+    """Act with a value-based policy and read its outputs. It always takes its best actions."""
 
     #: Values are Q_tot, of the sum of all agents' rewards.
     of_team: ClassVar[bool] = True

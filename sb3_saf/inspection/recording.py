@@ -202,12 +202,7 @@ def record_episodes(
 
     Episodes are divided over the games as in ``evaluate_team``.
 
-    :param policy: policy of this package
-    :param env: environment of teams
-    :param n_eval_episodes: team episodes to play
-    :param seed: seed of games and actions
     :param deterministic: whether the policy takes its most likely actions
-    :param gamma: discount factor of the returns
     :param zones: as in :class:`~sb3_saf.InspectionCallback`
     :param normalizer: normaliser of the critic's rewards; None for raw rewards
     :param observations: whether to record the agents' own observations
@@ -347,8 +342,6 @@ def lambda_returns(
     :param ends: (T, B)
     :param last_values: (T, B)
     :param values: (T, B)
-    :param gamma: discount factor
-    :param lam: lambda
     :return: (T, B)
     """
     targets: Doubles = np.zeros(rewards.shape)

@@ -89,7 +89,6 @@ def selection_by_group(weights: Floats, groups: Integers, n_groups: int) -> Doub
 
     :param weights: (n, U)
     :param groups: (n,) from 0; -1 for rows without a group
-    :param n_groups: K
     :return: (K, U), rows sum to 1; NaN for groups without rows
     """
     inside = groups >= 0

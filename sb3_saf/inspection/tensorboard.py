@@ -123,12 +123,7 @@ def line_of(tag: str) -> Line | None:
 
 
 class Page:
-    """
-    Writer to the formats of a model's logger, except the screen.
-
-    :param model: model in ``learn``, with its logger set up
-    :param n_agents: N
-    """
+    """Writer to the formats of a model's logger, except the screen."""
 
     def __init__(self, model: BaseAlgorithm, n_agents: int) -> None:
         formats = [each for each in model.logger.output_formats if not isinstance(each, HumanOutputFormat)]
@@ -167,7 +162,6 @@ class Page:
         """
         Write the Text page, and the layout of the custom scalars page with the charts for which this run has scalars.
 
-        :param tags: of the run's first inspection
         :param value_based: whether the run learns Q_tot
         """
         for writer in self._writers:
@@ -198,7 +192,6 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
     """
     Lay out the custom scalars page.
 
-    :param tags: of the run's first inspection
     :param value_based: whether the run learns Q_tot
     :return: for ``SummaryWriter.add_custom_scalars``
     """
@@ -236,10 +229,7 @@ def hyperparameters(
 
     TensorBoard sorts the columns by name, so the first ones have a number as prefix: ``1 task``.
 
-    :param model: the algorithm
-    :param policy: its policy
     :param more: the user's hyperparameters, such as the task and its level
-    :param scalars: scalars of the run
     """
     env = model.get_env()
     assert env is not None

@@ -52,7 +52,6 @@ class ActionHead(nn.Module):
     """
     One policy: an MLP, and for Box actions a learned standard deviation that does not depend on the observation.
 
-    :param spec: spec of the policy
     :param n_identities: N if the one-hot index of the agent stands beside the features; else 0
     """
 
@@ -83,7 +82,6 @@ class ActorNetwork(nn.Module, ABC):
     """
     Base of all networks that act.
 
-    :param spec: spec of the policy
     :param reads_agent: whether ``forward`` needs the agent's index
     :param identity: whether the network reads the agent's index as a one-hot vector beside the features
     """
@@ -155,7 +153,6 @@ class SinglePolicy(ActorNetwork):
     """
     One policy for all agents, or one for each: the actor of IPPO and MAPPO.
 
-    :param spec: spec of the policy
     :param per_agent: whether each agent has a policy of its own
     :param identity: whether a policy that all share reads the agent's index as a one-hot vector beside the features
     """
@@ -192,7 +189,6 @@ class PolicyPool(ActorNetwork):
     straight-through gradient), and likelihood and entropy are that policy's. This is the behaviour of the released
     code; two evaluations of one action may use different policies. Deterministic actions use the highest weight.
 
-    :param spec: spec of the policy
     :param n_policies: U, at least 2
     :param selection: ``"mixture"`` or ``"gumbel"``
     :param latent_dim: d, size of queries and signature keys

@@ -42,8 +42,6 @@ class Attention(nn.Module):
 
     Queries, keys and values have no bias (spec: SAF's parameter table). The projections are therefore merged to W_q^T
     W_k, applied to queries, and W_o W_v, applied to the weighted sums: sources are not projected.
-
-    :param features_dim: d
     """
 
     def __init__(self, features_dim: int):

@@ -28,7 +28,6 @@ class TeamCritic(nn.Module, ABC):
     If the policy's critic has a memory, it is between the two: values depend on what it returns for the states of
     successive steps. Subclasses make ``value_head``, with ``head_dim`` inputs.
 
-    :param spec: spec of the policy
     :param n_states: U, states of a team: N, or 1
     :param state_dim: S, size of a state
     """
@@ -75,8 +74,6 @@ class OwnValueHead(nn.Module):
     """
     Value of an agent from its own features.
 
-    :param spec: spec of the policy
-    :param features_dim: d
     :param heads: one head for all agents, or one for each
     """
 
@@ -120,7 +117,6 @@ class JointValueHead(nn.Module):
     A head shared by all agents reads the agent's one-hot index; without it, all agents of a team get the same value.
     With one head per agent the index selects the head.
 
-    :param spec: spec of the policy
     :param joint_dim: size of the joint features
     :param heads: one head for all agents, or one for each
     :param agent_identity: whether a shared head reads the agent's index

@@ -103,7 +103,6 @@ def likeliest_action(action_space: spaces.Space[Any], parameters: th.Tensor) -> 
     """
     Return the most likely action of one policy per row.
 
-    :param action_space: the action space
     :param parameters: (B, P)
     :return: (B, D)
     """

@@ -71,7 +71,6 @@ def picture_of(space: spaces.Space[Any], asked: bool = False) -> Picture | None:
     Pictures are tile codes, what SB3 takes for an image (uint8 of three axes, 0 to 255), and other Boxes of 0 to 255 or
     of floats of 0 to 1 with two axes, or with three axes of which the smallest, the channels, is first or last.
 
-    :param space: space of own observations
     :param asked: whether every Box of three axes counts as a picture
     :raises ValueError: for a wrong atlas
     """
@@ -116,8 +115,6 @@ class Part(NamedTuple):
     """
     Slice of a vector that holds one part of an observation.
 
-    :param start: first entry
-    :param stop: one after the last
     :param picture: shape of the picture, None for scalars and vectors
     """
 
@@ -132,7 +129,6 @@ class PartsSpace(spaces.Box):
     255.
 
     :param flat: the vector, from ``gymnasium.spaces.flatten_space``
-    :param parts: the slices of the vector
     """
 
     def __init__(self, flat: spaces.Box, parts: tuple[Part, ...]) -> None:
@@ -158,7 +154,6 @@ def encoded(
 
     :param module: (K, *shape), or one-hot vectors, to (K, ...)
     :param observations: (K, *shape)
-    :param space: space of one observation
     :param normalize_images: whether SB3 divides images by 255
     """
     if isinstance(module, Encoder) and hasattr(space, "atlas"):

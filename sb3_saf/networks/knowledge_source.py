@@ -30,11 +30,7 @@ class Exchanged(NamedTuple):
 
 
 class CrossAttentionBlock(nn.Module):
-    """
-    Slots attend to the agents' messages: x + attend(norm(x), norm(messages)), then x + mlp(norm(x)).
-
-    :param features_dim: d
-    """
+    """Slots attend to the agents' messages: x + attend(norm(x), norm(messages)), then x + mlp(norm(x))."""
 
     def __init__(self, features_dim: int):
         super().__init__()
@@ -59,11 +55,7 @@ class CrossAttentionBlock(nn.Module):
 
 
 class SelfAttentionBlock(nn.Module):
-    """
-    Slots attend to each other: x + attend(norm(x)), then x + mlp(norm(x)).
-
-    :param features_dim: d
-    """
+    """Slots attend to each other: x + attend(norm(x)), then x + mlp(norm(x))."""
 
     def __init__(self, features_dim: int):
         super().__init__()
@@ -91,7 +83,6 @@ class KnowledgeSource(nn.Module):
     Writing costs L x N and reading N x L: linear in the number of agents. A learned embedding marks the sender of a
     message; apart from that, the order of agents does not matter.
 
-    :param n_agents: N
     :param features_dim: d of messages, states and slots
     :param n_slots: L
     :param n_self_attention: number of self-attention blocks after writing

@@ -30,7 +30,6 @@ class NetworkSpec(NamedTuple):
     Properties of a policy from which its networks are built.
 
     :param features_dim: size of an encoded observation
-    :param n_agents: N
     :param action_space: one agent's action space
     :param actor_hidden: sizes of the hidden layers of each action head
     :param value_hidden: sizes of the hidden layers of each value head
@@ -54,11 +53,7 @@ class NetworkSpec(NamedTuple):
 
 
 class InOrder(NamedTuple):
-    """
-    Indices 0, 1, 2 ... in a shape, which need neither memory nor a copy of the selected rows.
-
-    :param shape: shape of the indices
-    """
+    """Indices 0, 1, 2 ... in a shape, which need neither memory nor a copy of the selected rows."""
 
     shape: tuple[int, ...]
 
@@ -99,8 +94,6 @@ class Linear(nn.Linear):
     """
     Linear layer with the gain of its orthogonal initialisation (see :func:`orthogonal_init`).
 
-    :param in_features: inputs
-    :param out_features: outputs
     :param gain: scale of the orthogonal weight matrix
     :param bias: whether to add a learned constant
     """
@@ -180,7 +173,6 @@ class AgentHeads(nn.Module):
     One head per agent, all of one shape.
 
     :param make_head: makes a head that maps (K, d) to (K, P)
-    :param n_agents: N
     """
 
     def __init__(self, make_head: Callable[[], nn.Module], n_agents: int):

@@ -54,7 +54,6 @@ def mixture_log_prob(
     """
     Return the exact log-likelihood of a mixture: log sum_u w_u pi_u(a).
 
-    :param action_space: the action space
     :param log_weights: (B, U)
     :param parameters: (B, U, P)
     :param actions: (B, D)
@@ -102,7 +101,6 @@ def mixture_mode(action_space: spaces.Space[Any], log_weights: th.Tensor, parame
     """
     Return a mixture's most likely action, or that of its likeliest policy if actions cannot be enumerated.
 
-    :param action_space: the action space
     :param log_weights: (B, U)
     :param parameters: (B, U, P)
     :return: (B, D)

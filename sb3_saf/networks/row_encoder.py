@@ -129,11 +129,7 @@ class Encoded(NamedTuple):
 
 
 def joined(parts: Sequence[Encoded]) -> Encoded:
-    """
-    Concatenate encoded rows.
-
-    :param parts: rows that were encoded separately
-    """
+    """Concatenate encoded rows."""
     own, teams = [part.own for part in parts], [part.teams for part in parts]
     rows = EncodedRows(
         th.cat([part.observations for part in own]),
@@ -144,11 +140,7 @@ def joined(parts: Sequence[Encoded]) -> Encoded:
 
 
 def joined_teams(parts: Sequence[EncodedTeams]) -> EncodedTeams:
-    """
-    Concatenate encoded teams.
-
-    :param parts: teams that were encoded separately
-    """
+    """Concatenate encoded teams."""
     if len(parts) == 1:
         return parts[0]
     n_agents = parts[0].members.shape[1]

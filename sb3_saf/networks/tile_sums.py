@@ -64,12 +64,6 @@ def places_of_convolution(rows: int, columns: int, tile: int, kernel: int, strid
     Return the places of a convolution without padding whose stride divides the tile, so that ways repeat across tiles.
 
     Ways are numbered as in :func:`table_of_convolution`; places row by row.
-
-    :param rows: rows of tiles
-    :param columns: columns of tiles
-    :param tile: pixels per tile
-    :param kernel: pixels per side of the kernel
-    :param stride: stride in pixels
     """
     n_rows, n_columns = ((n * tile - kernel) // stride + 1 for n in (rows, columns))
     before, per_side = (kernel - 1) // stride, _ways_per_side(tile, kernel, stride)
@@ -129,7 +123,6 @@ def rectified_sums(views: th.Tensor, table: th.Tensor, bias: th.Tensor, places: 
     :param views: (K, T) int64 on the CPU, indices of codes
     :param table: (U, S, W)
     :param bias: (W,)
-    :param places: places of the layer
     :return: (K, W) or (K, W, height, width), channels last in memory; twice differentiable in table and bias
     """
     return _Rectified.apply(table, bias, views, places)

@@ -182,12 +182,7 @@ class TeamPolicy(RememberingPolicy):
     # --- construction -----------------------------------------------------------------------------------------------
 
     def _build(self, lr_schedule: Schedule) -> None:
-        # The critic is built last: with one seed, the initial encoder and actor do not depend on the critic.
-        self._build_actor()
-        self._build_critic(lr_schedule)
-
-    def _build_actor(self) -> None:
-        spec = self._network_spec()
+        spec = of_critic = self._network_spec()
         if self.memory is not None:
             self.actor_memory = Memory(self.memory, self.features_dim, self.memory_size)
             spec = spec._replace(features_dim=self.memory_size)
@@ -197,14 +192,11 @@ class TeamPolicy(RememberingPolicy):
             orthogonal_init(self.actor)
             if self.actor_memory is not None:
                 orthogonal_init(self.actor_memory)
-
-    def _build_critic(self, lr_schedule: Schedule) -> None:
-        """Make the critic, and the optimizer of all parameters."""
+        # The critic is built last: with one seed, the initial encoder and actor do not depend on the critic.
         # TRPO identifies the critic's parameters by "value" in their name, as in all names below value_net.
-        spec = self._network_spec()
         if self.critic_memory:
-            spec = spec._replace(memory=self.memory, memory_size=self.memory_size)
-        self.value_net = self.parts.critic(spec)
+            of_critic = of_critic._replace(memory=self.memory, memory_size=self.memory_size)
+        self.value_net = self.parts.critic(of_critic)
         if self.ortho_init:
             orthogonal_init(self.value_net)
         n_scales = self.team_spaces.n_agents if self.normalize_values == "agent" else None

@@ -259,11 +259,8 @@ class RememberingPolicy(TeamRowsPolicy):
         """
         Run the memory of the actor or of the critic over the steps of a minibatch.
 
-        :param net: the memory
         :param states: (G, U, d) its inputs
-        :param obs: the minibatch
         :param active: (G, N) bool, agents that take part; None if all do
-        :param twice: whether the result must be differentiable twice
         :return: (G, U, H)
         """
         if not isinstance(obs, TeamMinibatch) or obs.teams.sequences is None:

@@ -133,11 +133,6 @@ def team_policies(policy: type[BasePolicy], maskable: type[BasePolicy]) -> Polic
 
 
 def memory_variants(spec: AlgorithmSpec, name: str) -> dict[str, AlgorithmSpec]:
-    """
-    Return the variants with memory, ``"name-gru"`` and ``"name-lstm"``.
-
-    :param spec: the algorithm without memory
-    :param name: its name on command lines
-    """
+    """Return the variants with memory, ``"name-gru"`` and ``"name-lstm"``."""
     kwargs = {kind: {**spec.policy_kwargs, "memory": kind} for kind in MEMORY_NAMES}
     return {f"{name}-{kind}": replace(spec, policy_kwargs=kwargs[kind]) for kind in MEMORY_NAMES}

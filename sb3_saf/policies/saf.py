@@ -46,7 +46,6 @@ class SAFCritic(TeamCritic):
 
     m'_i = g_theta(z_i), s_i = g_omega(z_i), slots written from m', m_i read with s_i, s_i^SAF = g_phi([s_i, m_i]).
 
-    :param spec: spec of the policy
     :param parts: ``critic_input``, ``heads``, ``agent_identity`` and sizes
     """
 

@@ -52,7 +52,6 @@ def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -
     Each unique observation is encoded once per network; those before steps come first.
 
     :param policy: the policy with its online and target networks
-    :param samples: joint transitions
     :param gamma: discount per game step
     """
     shape = samples.actions.shape
@@ -162,7 +161,6 @@ def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tens
     """
     Compute Q_tot of the greedy joint action, in which each agent takes its own best action.
 
-    :param policy: the policy
     :param obs: rows of whole teams, game-major
     :param values: (B, A) Q_i, -inf for illegal actions
     :return: (B,), equal for all rows of a team

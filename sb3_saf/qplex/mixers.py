@@ -87,7 +87,6 @@ class QMIXMixer(Mixer):
     h = ELU(sum_i |W1_i(s)| Q_i + b1(s)), Q_tot = |w2(s)| . h + b2(s). Q_tot is thus monotonic in every Q_i.
 
     :param state_dim: S
-    :param n_agents: N
     :param hidden: size of the hidden layer of b2's network
     :param embedding_dim: size of h
     """
@@ -143,7 +142,6 @@ class AttentionKernels(nn.Module):
     lambda_i(s, a) = sum over K kernels of |key_k(s)| sigmoid(agents_ki(s)) sigmoid(action_ki(s, a)).
 
     :param state_dim: S
-    :param n_agents: N
     :param n_actions: A
     :param n_kernels: K
     :param hidden: sizes of the hidden layers of the networks of each kernel
@@ -189,7 +187,6 @@ class QPLEXMixer(Mixer):
     train the weights lambda only, not the agents.
 
     :param state_dim: S
-    :param n_agents: N
     :param n_actions: A
     :param hidden: size of the hidden layer of the networks of w and b
     :param n_kernels: K, attention kernels that are summed to lambda

@@ -51,9 +51,7 @@ class AgentMemory(Memory):
     Memory of an agent, which reads the features, the last action and the agent's index.
 
     :param kind: ``"gru"`` or ``"lstm"``
-    :param features_dim: d
     :param n_actions: A
-    :param n_agents: N
     :param size: H
     """
 

@@ -32,9 +32,7 @@ class QNetworks(NamedTuple):
     """
     All networks of Q_tot.
 
-    :param encoder: encoder of own observations
     :param memory: memory of each agent, or None
-    :param actor: Q heads
     :param mixer: mixer from Q_i of all agents to Q_tot
     :param state_encoder: encoder of the games' states for the mixer; None if it reads the agents' features
     """

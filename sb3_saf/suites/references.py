@@ -26,13 +26,9 @@ class Reference(NamedTuple):
     """
     A known result of a task.
 
-    :param task: id of the environment
     :param params: parameters of the game that differ from the suite's defaults
     :param unit: ``"return"`` or ``"won"``
-    :param value: in this unit
-    :param method: who played
     :param game_steps: of its training; 0 for players that do not learn
-    :param source: where the number is from
     """
 
     task: str
@@ -91,7 +87,6 @@ class Standing(NamedTuple):
     """
     A result beside what is known of its task.
 
-    :param text: one line
     :param share: of the way from a random team to the closest published result; None if one of them is unknown
     """
 
@@ -106,10 +101,7 @@ def standing(
     Compare a result with what is known of its task: players that do not learn, and the published result whose training
     is closest in game steps, as a ratio.
 
-    :param env: the environment
-    :param params: parameters of the games
     :param scores: the result by unit, from the most telling one: ``won``, ``return``
-    :param game_steps: of the training
     :return: None if nothing is known in these units
     """
     over = "sum" if env.suite is None else env.suite.team_return

@@ -6,6 +6,7 @@ import importlib
 import pkgutil
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache, partial
@@ -62,11 +63,7 @@ class TeamEnvironment:
         return params if self.suite.complete is None else self.suite.complete(self.task, params)
 
     def count_agents(self, params: Mapping[str, Any]) -> int:
-        """
-        Count the agents, N; a game is made unless the suite knows them.
-
-        :param params: result of :meth:`complete`
-        """
+        """Count the agents, N; a game is made unless the suite knows them."""
         if self.suite is not None and self.suite.complete is not None:
             return int(params["n_agents"])
         game: Any = None
@@ -84,9 +81,7 @@ class TeamEnvironment:
         """
         Make one game.
 
-        :param params: parameters of the game
         :param render_mode: of the game; None to leave the argument out
-        :param changes: parameters that replace others
         :raises ValueError: for invalid parameters, or if it is no ParallelEnv
         """
         if self.make is None:
@@ -123,10 +118,16 @@ def find_environment(name: str) -> TeamEnvironment:
     name = str(name)
     prefix, slash, task = name.partition("/") if "/" in name else (HOME, "", name)
     if (suite := suites().get(prefix)) is not None and (slash or suite.find_task(task) is not None):
-        return _of_suite(suite, task)
+        if (found := suite.find_task(task)) is None:
+            raise suite.unknown_task(task)
+        make = None if suite.game is None else partial(suite.game, found)
+        return TeamEnvironment(found if suite.name == HOME else f"{suite.name}/{found}", make, suite, found)
     if name in pettingzoo.parallel_registry:
         return TeamEnvironment(name, partial(pettingzoo.make, "parallel", name))
-    if ":" in name or "." in name or _is_module(name):
+    is_module = False
+    with suppress(ImportError, ValueError):
+        is_module = name.isidentifier() and find_spec(name) is not None
+    if ":" in name or "." in name or is_module:
         module, _, function = name.partition(":")
         return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"environment {name!r}"))
     home, *others = sorted(suites().values(), key=lambda one: one.name != HOME)
@@ -135,21 +136,6 @@ def find_environment(name: str) -> TeamEnvironment:
     nearest = " or ".join(map(repr, get_close_matches(name, ids, n=N_NEAREST)))
     did_you_mean = f" (did you mean {nearest}?)" if nearest else ""
     raise ValueError(f"unknown environment {name!r}{did_you_mean}; expected {HOW_TO_NAME}")
-
-
-def _of_suite(suite: Suite, name: str) -> TeamEnvironment:
-    task = suite.find_task(name)
-    if task is None:
-        raise suite.unknown_task(name)
-    make = None if suite.game is None else partial(suite.game, task)
-    return TeamEnvironment(task if suite.name == HOME else f"{suite.name}/{task}", make, suite, task)
-
-
-def _is_module(name: str) -> bool:
-    try:
-        return name.isidentifier() and find_spec(name) is not None
-    except (ImportError, ValueError):
-        return False
 
 
 def folder_name(env_id: str) -> str:

@@ -30,7 +30,6 @@ def evaluation_seed(seed: int, test: int | None = None) -> int:
 
     It is a separate branch in the run's tree of seeds, with the top bit of 63 set, which no run can have as its seed.
 
-    :param seed: the run's seed
     :param test: number of a batch of test games, which no evaluation during training has; None for the latter
     """
     branch = (_EVALUATION,) if test is None else (_TEST, test)
@@ -69,9 +68,6 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
     """
     Check that the rows are a whole number of teams.
 
-    :param n_rows: B
-    :param n_agents: N
-    :param fix: advice in the error message
     :return: E = B / N
     :raises ValueError: if N does not divide B
     """
@@ -101,7 +97,6 @@ def check_form(name: str, value: Any, like: Any) -> None:
     """
     Compare names, shapes and dtypes of nested dicts and lists of arrays, as ``load_state_dict`` does.
 
-    :param name: name of the value, for the message
     :raises ValueError: naming the first difference
     """
     if isinstance(like, Mapping):

@@ -61,7 +61,6 @@ def try_lock(path: Path) -> filelock.BaseFileLock | None:
     """
     Lock a file against other processes, and against other locks of this one.
 
-    :param path: the file of the lock; missing folders are created
     :return: the lock, held until ``release()``, the end of this object, or that of the process; None if it is taken
     :raises OSError: if the file cannot be written
     """

@@ -61,7 +61,6 @@ class AgentSpace(spaces.Discrete):
     """
     Discrete(N), the index of an agent in its team, with the agents' names and conversions.
 
-    :param n_agents: N
     :param names: PettingZoo's names of the agents in index order; None if they are unknown
     :param conversions: of the agents' observations and actions in the game, in index order; None if rows are the game's
     """
@@ -105,7 +104,6 @@ class TeamSpaces:
     whole team.
 
     :param own: space of one agent's own observation, shape ``(*shape)``: Box, Discrete, MultiDiscrete or MultiBinary
-    :param n_agents: N
     :param has_active: whether rows have ``"active"``
     :param n_masked_actions: A if rows have action masks, else None
     :param state: space of the game's state if rows have it
@@ -147,10 +145,6 @@ class TeamSpaces:
         """
         Split the observation space of the rows of a VecEnv of flattened teams into its parts.
 
-        :param space: observation space of the VecEnv
-        :param action_space: its action space
-        :param n_agents: N
-        :param names: the agents' names in index order, if they are known
         :raises ValueError: if the space has rows of teams already, or an optional key has another form
         """
         keys = set(space.spaces) if isinstance(space, spaces.Dict) else set()
@@ -173,7 +167,6 @@ class TeamSpaces:
         """
         Split the Dict observation space of ``CentralizedValueWrapper`` into its parts.
 
-        :param space: observation space of an algorithm, a policy or a buffer
         :raises ValueError: if the space is not that of a team, with a fix
         """
         if not isinstance(space, spaces.Dict) or not set(TEAM_KEYS) <= set(space.spaces) <= ALL_KEYS:
@@ -259,8 +252,6 @@ class TeamSpaces:
         """
         Return the parts of rows below ``CentralizedValueWrapper``.
 
-        :param obs: own observations, or Dicts where rows are Dicts
-        :param what: name of the rows, for the message
         :raises ValueError: if keys are missing
         """
         if not self.is_dict:
@@ -335,7 +326,6 @@ def bounds_of(space: spaces.Space[Any]) -> tuple[Array, Array]:
     """
     Return the lowest and the highest value of each entry, both included, in the space's shape and dtype.
 
-    :param space: a space of fixed shape
     :raises ValueError: for any other space
     """
     if isinstance(space, spaces.Box):

@@ -63,7 +63,6 @@ def read_tree(file: BinaryIO) -> Tree:
     """
     Read the data of :func:`write_tree`, tensors to the CPU.
 
-    :param file: open for reading
     :raises DamagedCheckpointError: if the file was changed or truncated
     :raises CheckpointError: if another version wrote it in another format
     """

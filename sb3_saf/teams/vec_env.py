@@ -31,7 +31,6 @@ def chosen_indices(indices: int | Iterable[int] | None, n: int, kind: str = "row
     Return the selected indices out of n rows (or games).
 
     :param indices: one, several, or None for all; negative ones count from the end
-    :param n: number of rows or games
     :param kind: ``"row"`` or ``"game"``, for the message
     :raises ValueError: for an index out of range
     """
@@ -47,8 +46,6 @@ class TeamVecEnv(VecEnv):
     """
     Base of vector environments with one row per agent: row ``e * N + i`` is agent ``i`` of game ``e``.
 
-    :param n_games: E
-    :param n_agents: N
     :param observation_space: of a row
     :param action_space: of a row
     :param seed: see :meth:`seed`
@@ -144,10 +141,7 @@ class TeamVecEnv(VecEnv):
         """
         Call a method once per game.
 
-        :param method_name: of the game
-        :param args: positional arguments
         :param games: which games, None for all
-        :param kwargs: keyword arguments
         :return: one result per game
         """
         raise NotImplementedError
@@ -183,7 +177,6 @@ def find_n_agents(venv: VecEnv) -> int | None:
 
     SB3's look-up through wrappers fails if two layers have the attribute, so each layer is checked.
 
-    :param venv: any vector environment
     :return: N, or None if no layer states it
     """
     *_, innermost = layers(venv)
@@ -210,7 +203,6 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     """
     Return N of a vector environment of flattened teams, checked against its number of rows.
 
-    :param venv: vector environment with B rows
     :param n_agents: N if known; None reads it from the environment
     :raises ValueError: if N is unknown, contradicts the environment or does not divide B
     """
@@ -242,7 +234,6 @@ def team_dones(dones: Array, n_agents: int, alone: bool = False) -> npt.NDArray[
     Return which games have ended.
 
     :param dones: (B,) one flag per row, of any dtype
-    :param n_agents: N
     :param alone: whether rows may be done before their team, as those of agents that a time limit has stopped are above
         ``CentralizedValueWrapper(time_limit="bootstrap")``
     :return: (E,)
@@ -268,7 +259,6 @@ def episode_value(infos: Iterable[Mapping[str, Any]], key: str) -> Any:
     """
     Return an entry that is of the whole episode from the last infos of a game's agents; None if none of them has it.
 
-    :param infos: of all agents
     :param key: its name; ``"is_success"`` is whether all agents that report it succeeded
     """
     values = [info[key] for info in infos if info.get(key) is not None]
@@ -282,7 +272,6 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
     Check that evaluation does not use the games of training.
 
     :param training: environment of teams; one without an attribute ``seeded_with`` passes
-    :param evaluation: environment for evaluation
     :raises ValueError: if both contain a game with the same seed
     """
     common = set(game_seeds_of(training) or ()) & set(game_seeds_of(evaluation) or ()) - {None}
@@ -304,9 +293,7 @@ def check_finite(name: str, values: Array, n_agents: int, step: int, games: Sequ
     """
     Raise NonFiniteError for NaN and infinity; integers are not read.
 
-    :param name: name of the values, for the message
     :param values: (B, ...) one entry per row
-    :param n_agents: N
     :param step: steps since the environment was made, for the message
     :param games: games of the rows, for the message; None for all
     :raises NonFiniteError: naming step, game and agent of the first bad row
@@ -317,20 +304,12 @@ def check_finite(name: str, values: Array, n_agents: int, step: int, games: Sequ
     row = int(np.flatnonzero(bad)[0])
     game, agent = divmod(row, n_agents)
     game = game if games is None else games[game]
+    entries, others = values[row].reshape(-1), int(bad.sum()) - 1
     raise NonFiniteError(
-        f"{name} must be finite, got {_short(values[row])} at step {step} for agent {agent} of game {game}"
-        f"{_others(int(bad.sum()) - 1)}; repair the environment, learning from it would "
-        "ruin the model"
+        f"{name} must be finite, got {entries[~np.isfinite(entries)][0]} at step {step} for agent {agent} of game "
+        f"{game}{f' (and {others} more rows)' if others else ''}; repair the environment, learning from it would ruin "
+        "the model"
     )
-
-
-def _short(value: Array) -> str:
-    entries = np.asarray(value).reshape(-1)
-    return str(entries[~np.isfinite(entries)][0])
-
-
-def _others(count: int) -> str:
-    return f" (and {count} more rows)" if count else ""
 
 
 class TeamVecEnvWrapper(VecEnvWrapper):

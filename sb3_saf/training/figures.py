@@ -74,21 +74,14 @@ class Style(NamedTuple):
 
 def method_styles(methods: Sequence[str]) -> dict[str, Style]:
     """Return one style per method: fixed for known methods, the method's colour for variants."""
-    styles = {method: _style(method) for method in methods}
-    taken = {_COLOURS["random"], *(style.colour for style in styles.values() if style is not None)}
-    free = [colour for colour in _COLOURS.values() if colour not in taken] or list(_COLOURS.values())
-    others = [method for method, style in styles.items() if style is None]
-    fresh = {method: Style(free[index % len(free)], ":", "..") for index, method in enumerate(others)}
-    return {method: style or fresh[method] for method, style in styles.items()}
-
-
-def _style(method: str) -> Style | None:
-    if method == "random":
-        return Style(_COLOURS[method], "--")
+    known = {name: Style(colour, "--" if name == "random" else "-") for name, colour in _COLOURS.items()}
     for ending, variant in _VARIANTS.items():
-        if method.endswith(ending) and method.removesuffix(ending) in _COLOURS:
-            return Style(_COLOURS[method.removesuffix(ending)], *variant)
-    return Style(_COLOURS[method]) if method in _COLOURS else None
+        known |= {f"{name}{ending}": Style(colour, *variant) for name, colour in _COLOURS.items()}
+    taken = {_COLOURS["random"], *(known[method].colour for method in methods if method in known)}
+    free = [colour for colour in _COLOURS.values() if colour not in taken] or list(_COLOURS.values())
+    others = [method for method in methods if method not in known]
+    fresh = {method: Style(free[index % len(free)], ":", "..") for index, method in enumerate(others)}
+    return {method: known.get(method) or fresh[method] for method in methods}
 
 
 def _methods_of(table: pd.DataFrame) -> list[str]:
@@ -113,11 +106,6 @@ def _figure(n_panels: int, height: float = 3.6) -> tuple[Figure, list[Axes]]:
     for unused in axes[n_panels:]:
         unused.set_axis_off()
     return figure, list(axes[:n_panels])
-
-
-def _wrapped(title: str) -> str:
-    """Return the title of a panel in lines that fit its width."""
-    return fill(title, _TITLE_WIDTH)
 
 
 def _finish(figure: Figure, axes: Sequence[Axes], title: str | None) -> Figure:
@@ -175,7 +163,7 @@ def draw_curves(
             ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
         for (label, score), line in zip((references or {}).items(), cycle(_REFERENCE_LINES), strict=False):
             ax.axhline(score, color=_REFERENCE, linestyle=line, label=label)
-        ax.set(xlabel="game steps", ylabel=y_label, title=_wrapped(name))
+        ax.set(xlabel="game steps", ylabel=y_label, title=fill(name, _TITLE_WIDTH))
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
@@ -208,7 +196,7 @@ def draw_levels(
         _draw_bars(ax, rows, level, styles, names or {})
         if maximum is not None:
             ax.axhline(maximum, color=_REFERENCE, linestyle=":", label="largest possible")
-        ax.set(xlabel=level, ylabel=y_label, title=_wrapped(name))
+        ax.set(xlabel=level, ylabel=y_label, title=fill(name, _TITLE_WIDTH))
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
 
@@ -274,7 +262,7 @@ def draw_differences(
         ax.set_yticks(middles.to_numpy(), middles.index)
         ax.axvline(0, color="black", linewidth=1)
         ax.invert_yaxis()
-        ax.set(xlabel=x_label, title=_wrapped(name))
+        ax.set(xlabel=x_label, title=fill(name, _TITLE_WIDTH))
     return _finish(figure, all_axes, title)
 
 

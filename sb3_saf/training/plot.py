@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.commands import OneLineParser, require, run_command, user_errors
-from sb3_saf.training.folders import RUN_FILE, Run, Source, python_command
+from sb3_saf.training.folders import RUN_FILE, Run, python_command
 from sb3_saf.training.settings import Settings, load_settings
 
 if TYPE_CHECKING:
@@ -70,7 +70,18 @@ def _draw(options: argparse.Namespace) -> Figure:
     from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_levels
     from sb3_saf.training.statistics import score_matrices
 
-    table = describe(_with_scores(find_runs(options.log_folder, options.algos, options.env), options.source))
+    runs, reasons = [], []
+    for run in find_runs(options.log_folder, options.algos, options.env):
+        try:
+            run.curve(options.source)
+            runs.append(run)
+        except ValueError as error:
+            reasons.append(str(error))
+    if not runs:
+        raise ValueError(reasons[0])
+    for reason in reasons:
+        print(f"left out: {reason}", file=sys.stderr)
+    table = describe(runs)
     if options.kind == "levels" and options.level not in table:
         raise unknown_name("parameter", options.level, (column for column in table if column not in _NO_LEVELS))
     without = [options.level] if options.kind == "levels" else []
@@ -92,22 +103,6 @@ def _draw(options: argparse.Namespace) -> Figure:
     if are_treasures:
         table["score"], y_label = table["score"] / table["n_treasures"], "treasures collected / on the map"
     return draw_aggregates(score_matrices(table, "setting"), options.title, y_label)
-
-
-def _with_scores(runs: Sequence[Run], source: Source) -> list[Run]:
-    """Leave out runs without scores, and say why; ValueError if none has any."""
-    found, reasons = [], []
-    for run in runs:
-        try:
-            run.curve(source)
-            found.append(run)
-        except ValueError as error:
-            reasons.append(str(error))
-    if not found:
-        raise ValueError(reasons[0])
-    for reason in reasons:
-        print(f"left out: {reason}", file=sys.stderr)
-    return found
 
 
 # --- runs as a table --------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
@@ -52,6 +51,7 @@ def ppo_settings(
     :param overrides: arguments of the algorithm that take precedence; ``policy_kwargs`` are merged
     :raises ValueError: if ``env`` has no teams, or the algorithm does not train ``algo``
     """
+    from sb3_saf.networks.encoders import LightEncoder
     from sb3_saf.suites.registry import HOME
     from sb3_saf.teams.checks import unknown_name
     from sb3_saf.training.settings import ALGOS, find_algorithm
@@ -62,7 +62,8 @@ def ppo_settings(
     if algo not in trained:
         raise unknown_name("method of PPO", algo, trained)
     n_agents, spec = require_n_agents(env), find_algorithm(algo, algorithm.__name__)
-    n_games, encoder = env.num_envs // n_agents, _encoder_of(env)
+    n_games, own = env.num_envs // n_agents, TeamSpaces.from_observation_space(env.observation_space).own
+    encoder = LightEncoder if hasattr(own, "atlas") else None
     source = entry_of(read_settings(spec.config), ("default",) if encoder is None else ("default", HOME), "small")
     hints, taken = algorithm_arguments(algorithm), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
     policy: Any = algorithm.policy_aliases[spec.policy]
@@ -88,10 +89,3 @@ def ppo_settings(
     elif policy_kwargs.get("normalize_values") is True:
         policy_kwargs["normalize_values"] = "agent"
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
-
-
-def _encoder_of(env: VecEnv) -> type[Any] | None:
-    from sb3_saf.networks.encoders import LightEncoder
-
-    own: spaces.Space[Any] = TeamSpaces.from_observation_space(env.observation_space).own
-    return LightEncoder if hasattr(own, "atlas") else None

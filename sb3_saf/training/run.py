@@ -63,7 +63,6 @@ class RunOptions:
     :param model_name: the trained model is saved as ``FOLDER/MODEL_NAME.zip``
     :param initial_model: a saved model with the initial weights and optimiser state; None for new ones
     :param log_interval: rollouts between log entries; None for SB3's default, 0 for no log
-    :param device: as in SB3
     :param n_cpus: processes for the training games; HECOGrid's compiled games need one
     :param num_threads: threads of torch; None for its default
     :param progress: whether to draw a progress bar in game steps
@@ -103,9 +102,7 @@ def train(
     Train a model; continue from the newest checkpoint if the folder has checkpoints of the same run.
 
     :param settings: everything that determines the result except the seed
-    :param seed: seed of the run
     :param folder: folder for ``monitor.csv``, models, evaluations and checkpoints; None writes none of them
-    :param options: options of the run
     :param callbacks: further callbacks, called before those of the options
     :return: the trained model; its games are closed
     :raises ValueError: if the games or the model cannot be made
@@ -151,8 +148,26 @@ class Training:
 
         Checkpoints are removed when everything else is on disk.
         """
+        options, total = self.options, self.settings.total_timesteps
+        arguments: dict[str, Any] = {"tb_log_name": self.settings.algo}
+        if options.log_interval is not None:
+            arguments["log_interval"] = options.log_interval or None
+        checkpoint_freq = self._every(options.checkpoint_freq, CHECKPOINTS_PER_RUN)
         try:
-            self._learn()
+            if self.folder is None or checkpoint_freq == 0:
+                with settings_restored_on_error(self.model):
+                    self.model.learn(total, [FiniteCallback(), GameStepsCallback(), *self.callbacks], **arguments)
+            else:
+                resumable_learn(
+                    self.model,
+                    total,
+                    self.folder / CHECKPOINTS,
+                    self.callbacks,
+                    every_game_steps=checkpoint_freq,
+                    keep=2,
+                    again=options.resume_hint,
+                    **arguments,
+                )
         except (KeyboardInterrupt, SystemExit):
             self._save()
             raise
@@ -164,27 +179,6 @@ class Training:
             finish_run(self.folder, **self.clock.cost())
             shutil.rmtree(self.folder / CHECKPOINTS, ignore_errors=True)
         return self.model
-
-    def _learn(self) -> None:
-        options, total = self.options, self.settings.total_timesteps
-        arguments: dict[str, Any] = {"tb_log_name": self.settings.algo}
-        if options.log_interval is not None:
-            arguments["log_interval"] = options.log_interval or None
-        checkpoint_freq = self._every(options.checkpoint_freq, CHECKPOINTS_PER_RUN)
-        if self.folder is None or checkpoint_freq == 0:
-            with settings_restored_on_error(self.model):
-                self.model.learn(total, [FiniteCallback(), GameStepsCallback(), *self.callbacks], **arguments)
-            return
-        resumable_learn(
-            self.model,
-            total,
-            self.folder / CHECKPOINTS,
-            self.callbacks,
-            every_game_steps=checkpoint_freq,
-            keep=2,
-            again=options.resume_hint,
-            **arguments,
-        )
 
     def _save(self) -> None:
         if self.folder is not None:

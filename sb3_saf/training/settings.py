@@ -73,7 +73,6 @@ class Settings:
     :param algo: name in ``ALGOS``
     :param env_id: such as ``"TeamTogether-v0"``; see ``suites.registry.HOW_TO_NAME``
     :param size: one of ``SIZES``
-    :param n_agents: N
     :param env_kwargs: parameters of the game; all of them for HECOGrid
     :param time_limit: whether a time limit counts as an end (see ``CentralizedValueWrapper``)
     :param n_envs: E, parallel training games
@@ -123,7 +122,6 @@ class Settings:
         """
         Make the games.
 
-        :param seed: the run's seed
         :param evaluation: whether the games are for evaluation, with seeds that no training game of any run has
         :param monitor_dir: folder for a ``monitor.csv``; None for none
         :param n_envs: E; None for the settings'
@@ -173,8 +171,6 @@ class Settings:
         """
         Make the algorithm, ready for ``learn(settings.total_timesteps)``; further arguments as in SB3.
 
-        :param env: from :meth:`make_env`
-        :param seed: the run's seed
         :raises ValueError: if the algorithm rejects its arguments
         """
         if issubclass(self.spec.algorithm, MaskablePPO) and not is_masking_supported(env):
@@ -227,7 +223,6 @@ def load_settings(
     :param algo: name in ``ALGOS``
     :param env_id: such as ``"TeamTogether-v0"``; see ``suites.registry.HOW_TO_NAME``
     :param size: ``"paper"``, ``"medium"``, ``"small"`` or ``"smoke"``
-    :param env_kwargs: parameters of the game
     :param overrides: keys as in the algorithm's file, such as ``{"n_envs": 8, "policy_kwargs": {"n_slots": 8}}``
     :param config: a file to read instead of the algorithm's
     :raises ValueError: for an unknown name, a value of the wrong type, games that cannot be made
@@ -270,8 +265,6 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
     """
     Read settings written by :meth:`Settings.as_dict`, independent of later changes of ``zoo_configs``.
 
-    :param saved: plain data
-    :param env_kwargs: parameters of the game to change
     :raises ValueError: if ``saved`` is invalid, or the games cannot be made
     """
     missing = [key for key in _SAVED_KEYS if key not in saved]

@@ -197,22 +197,17 @@ def _check(options: argparse.Namespace) -> None:
     model = options.trained_agent
     if model is not None and not (model.suffix == ".zip" and model.is_file()):
         raise CommandError(f"--trained-agent must be a .zip that is there, got {str(model)!r}")
-    _check_trial(options)
+    if options.trial_id is not None:
+        if options.storage is None or options.study_name is None:
+            raise CommandError("--trial-id needs the --storage and --study-name of the tuning")
+        if options.trial_id != "best" and not options.trial_id.isdecimal():
+            raise CommandError(f"--trial-id must be a trial's number or 'best', got {options.trial_id!r}")
     if options.eval_episodes is None:
         options.eval_episodes = 2 if options.size == "smoke" else RunOptions.eval_episodes
     if options.progress is None:
         options.progress = sys.stdout.isatty()
     if options.verbose is None:
         options.verbose = int(not options.progress)
-
-
-def _check_trial(options: argparse.Namespace) -> None:
-    if options.trial_id is None:
-        return
-    if options.storage is None or options.study_name is None:
-        raise CommandError("--trial-id needs the --storage and --study-name of the tuning")
-    if options.trial_id != "best" and not options.trial_id.isdecimal():
-        raise CommandError(f"--trial-id must be a trial's number or 'best', got {options.trial_id!r}")
 
 
 def _settings(
@@ -259,7 +254,13 @@ def _run_options(options: argparse.Namespace, settings: Settings, **more: Any) -
 
 def _train(options: argparse.Namespace, command: str) -> None:
     with user_errors():
-        sampled = None if options.trial_id is None else _trial(options)
+        sampled = None
+        if options.trial_id is not None:
+            require("optuna")
+            from sb3_saf.training.tune import trial_overrides
+
+            number = None if options.trial_id == "best" else int(options.trial_id)
+            sampled = trial_overrides(options.storage, options.study_name, number)
         settings, eval_settings = _settings(options, sampled)
     if options.verbose > 0:
         print(yaml.safe_dump(settings.as_dict(), sort_keys=False), end="")
@@ -293,7 +294,13 @@ def _train(options: argparse.Namespace, command: str) -> None:
             )
             lines = ProgressLines(verbose=int(not options.progress))
             training = stack.enter_context(closing(Training(settings, seed, folder, run_options, [lines])))
-        _announce(training, folder)
+        print(
+            f"{settings.algo} on {settings.env_id}, size {settings.size}, seed {seed}: {settings.game_steps:,} game "
+            f"steps in {settings.n_envs} games of {settings.n_agents} agents on {training.model.device.type}; {folder}",
+            flush=True,
+        )
+        if model is not None:
+            print(f"It begins with the weights and the optimiser of {model}; no code is loaded")
         with user_errors(CheckpointError, NonFiniteError, SettingsError):
             training.learn()
     if training.evaluation is not None:
@@ -304,31 +311,11 @@ def _train(options: argparse.Namespace, command: str) -> None:
     print(f"Saved to {folder}")
 
 
-def _trial(options: argparse.Namespace) -> dict[str, Any]:
-    require("optuna")
-    from sb3_saf.training.tune import trial_overrides
-
-    number = None if options.trial_id == "best" else int(options.trial_id)
-    return trial_overrides(options.storage, options.study_name, number)
-
-
 def _remove_unbegun(folder: Path) -> None:
     """Remove the folder of a run that has left nothing but its description: it would count as the latest run."""
     if [path.name for path in folder.iterdir()] == [RUN_FILE]:
         (folder / RUN_FILE).unlink()
         folder.rmdir()
-
-
-def _announce(training: Training, folder: Path) -> None:
-    settings = training.settings
-    print(
-        f"{settings.algo} on {settings.env_id}, size {settings.size}, seed {training.seed}: "
-        f"{settings.game_steps:,} game steps in {settings.n_envs} games of {settings.n_agents} agents on "
-        f"{training.model.device.type}; {folder}",
-        flush=True,
-    )
-    if training.options.initial_model is not None:
-        print(f"It begins with the weights and the optimiser of {training.options.initial_model}; no code is loaded")
 
 
 def _track(options: argparse.Namespace, settings: Settings, seed: int) -> None:

@@ -7,7 +7,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -80,20 +80,19 @@ def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[st
     known = set(algorithm_arguments(spec.algorithm))
     if {"n_steps", "batch_size"} <= known and "batch_size" not in fixed:
         known.add("n_minibatches")
-    for name in _open(_SEARCH, known, fixed):
-        _SEARCH[name](trial, name)
+    for name, suggest in _SEARCH.items():
+        if name in known and name not in fixed:
+            suggest(trial, name)
     if "learning_rate" in trial.params:
         trial.suggest_categorical(_LR_SCHEDULE, ("constant", _LINEAR))
     settled = {**spec.policy_kwargs, **fixed.get("policy_kwargs", {})}
     if settled.get("knowledge_source") is False:
         settled["n_slots"] = None  # no slots without a knowledge source
-    for name in _open(_POLICY_SEARCH, policy_arguments(spec.policy_class), settled):
-        _POLICY_SEARCH[name](trial, name)
+    arguments = policy_arguments(spec.policy_class)
+    for name, suggest in _POLICY_SEARCH.items():
+        if name in arguments and name not in settled:
+            suggest(trial, name)
     return to_overrides(trial.params)
-
-
-def _open(search: Mapping[str, _Suggest], known: Collection[str], settled: Mapping[str, Any]) -> list[str]:
-    return [name for name in search if name in known and name not in settled]
 
 
 def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,15 +155,17 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
     """
     Run trials and return the study.
 
-    :param settings_of: makes the settings of a trial
-    :param tuning: options
-    :param command: stored in the study
     :param goal: what is tuned on what; the trials of one study are of one goal
     :raises ValueError: if the study's trials are of another goal
     """
+    pruner: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
+    if tuning.pruner == "halving":
+        pruner = optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
+    elif tuning.pruner == "median":
+        pruner = optuna.pruners.MedianPruner(tuning.n_startup_trials, n_warmup_steps=tuning.n_evaluations // 3)
     study = optuna.create_study(
         sampler=_make_sampler(tuning),
-        pruner=_make_pruner(tuning),
+        pruner=pruner,
         storage=None if tuning.storage is None else open_storage(tuning.storage),
         study_name=tuning.study_name,
         load_if_exists=True,
@@ -244,14 +245,6 @@ def _make_sampler(tuning: Tuning) -> optuna.samplers.BaseSampler:
     return optunahub.load_module("samplers/auto_sampler").AutoSampler(seed=seed)
 
 
-def _make_pruner(tuning: Tuning) -> optuna.pruners.BasePruner:
-    if tuning.pruner == "halving":
-        return optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
-    if tuning.pruner == "median":
-        return optuna.pruners.MedianPruner(tuning.n_startup_trials, n_warmup_steps=tuning.n_evaluations // 3)
-    return optuna.pruners.NopPruner()
-
-
 # --- storages ---------------------------------------------------------------------------------------------------------
 
 
@@ -262,8 +255,8 @@ def open_storage(storage: str, *, must_exist: bool = False) -> BaseStorage:
     :param storage: ``sqlite:///study.db``, a journal file ``study.log``, or a database's URL
     :param must_exist: whether a missing file is an error; otherwise it is created
     """
-    path = _file_of(storage)
-    if path is not None:
+    if storage.startswith(_SQLITE) or storage.endswith(_JOURNAL):
+        path = Path(storage.removeprefix(_SQLITE))
         if must_exist and not path.is_file():
             raise ValueError(f"there is no study file {path}; give the --storage of the tuning")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -282,12 +275,6 @@ def open_storage(storage: str, *, must_exist: bool = False) -> BaseStorage:
                 raise ValueError(f"cannot open the storage {storage!r}: {error}") from error
             time.sleep(0.1 * (attempt + 1))
     raise AssertionError("the last attempt has raised")
-
-
-def _file_of(storage: str) -> Path | None:
-    if storage.startswith(_SQLITE):
-        return Path(storage.removeprefix(_SQLITE))
-    return Path(storage) if storage.endswith(_JOURNAL) else None
 
 
 def trial_overrides(storage: str, study_name: str, number: int | None) -> dict[str, Any]:

@@ -68,7 +68,6 @@ def convert(name: str, value: object, hint: Any) -> Any:
 
     :param name: the argument's name, which selects its classes and its range
     :param value: value from YAML or a command line; classes and functions are returned unchanged
-    :param hint: the argument's type
     :raises ValueError: for a wrong type or range
     """
     members = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)

@@ -94,7 +94,6 @@ def wrap_rows(
     """
     Wrap vector environments by ``vec_env_wrapper`` and ``normalize``.
 
-    :param env: from ``make_team_env``
     :param gamma: discount of the algorithm, for the normalisation of rewards
     :param is_training: whether statistics are updated and rewards normalised
     :return: ``env`` itself if there is nothing to do

@@ -63,7 +63,6 @@ def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[st
     Read a settings file, merged into its base files.
 
     :param source: name of a file of ``zoo_configs`` without ``.yml``, or the path of any other file
-    :param refined_by: names of the files that refine this one
     :return: mapping from ``"default"``, suites and environment ids to settings
     :raises ValueError: if a file cannot be read, or is no such mapping
     """

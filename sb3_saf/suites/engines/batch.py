@@ -52,10 +52,6 @@ class Batch(ABC):
     """
     Base of E games of N agents in one engine. Returned arrays are not modified later.
 
-    :param n_games: E
-    :param agents: N names
-    :param rows: spaces of a row's observation
-    :param action_space: action space of a row
     :param env: the suite's environment, for attributes that all games share
     :param objects: E objects of the single games, for their attributes and methods; empty if the engine has none
     :param shares_reward: whether all agents of a team receive the same reward
@@ -141,7 +137,6 @@ class BatchVecEnv(TeamVecEnv):
     hold ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite
     reports wins.
 
-    :param batch: the games
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
     :param render_mode: None or ``"rgb_array"``; games with objects of their own take all that these know
     :param stagger: whether episodes begun by :meth:`reset` end at different times: that of game ``e`` is shorter by
@@ -297,9 +292,6 @@ class ResumableBatchVecEnv(BatchVecEnv):
     VecEnv whose state is stored in checkpoints.
 
     :param batch: games with snapshots
-    :param seed: see the base class
-    :param render_mode: see the base class
-    :param stagger: see the base class
     """
 
     batch: ResumableBatch
@@ -321,7 +313,6 @@ class ResumableBatchVecEnv(BatchVecEnv):
         """
         Restore a state; the observations are those of that state.
 
-        :param state: result of :meth:`checkpoint_state`
         :raises ValueError: for the state of other games, naming the first difference
         """
         if state["running"]:

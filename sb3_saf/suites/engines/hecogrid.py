@@ -19,12 +19,7 @@ from sb3_saf.teams.rows import OBS_KEY, Array, TeamSpaces
 
 
 class HECOGridGames(ResumableBatch):
-    """
-    E games of a task.
-
-    :param batch: the games
-    :param render_mode: as in :func:`hecogrid_envs.parallel_env`
-    """
+    """E games of a task."""
 
     def __init__(self, batch: GameBatch, render_mode: RenderMode | None = None) -> None:
         games = [TASKS[batch.task].of_batch(batch, game, render_mode) for game in range(batch.n_games)]
@@ -100,11 +95,7 @@ def vec_env(
     Make games of a task.
 
     :param task: a name of ``hecogrid_envs.TASK_NAMES``
-    :param n_envs: E
-    :param seed: seed of the run
     :param state: must be False: the engine gives views only
-    :param render_mode: as in :func:`hecogrid_envs.parallel_env`
-    :param stagger: see :class:`BatchVecEnv`
     :param n_threads: threads of the engine; results do not depend on it
     :param params: fields of :class:`hecogrid_envs.HECOGridParams`
     :raises ValueError: for an unknown parameter or a value out of range, or if a state is requested

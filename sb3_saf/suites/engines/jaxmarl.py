@@ -8,7 +8,7 @@ suite's ``reset`` after ``step_env``: its ``step`` also resets, but loses the la
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -60,11 +60,7 @@ class Game(NamedTuple):
 
 
 class Packing:
-    """
-    Joins the arrays of a game to one buffer for each item size: XLA takes time for every array at every call.
-
-    :param form: shapes and dtypes of a game
-    """
+    """Joins the arrays of a game to one buffer for each item size: XLA takes time for every array at every call."""
 
     def __init__(self, form: Game) -> None:
         self._forms, self._tree = jax.tree.flatten(form)
@@ -91,8 +87,6 @@ class JaxPrograms:
     """
     Compiled functions of an environment, shared by its users and compiled once per number of games.
 
-    :param env: environment of JaxMARL
-    :param rules: rules of this environment
     :param with_state: whether rows have the state of the game
     :raises ValueError: if agents differ in more than lengths of observations and actions, or a requested state is
         missing
@@ -105,15 +99,18 @@ class JaxPrograms:
         key = jax.random.PRNGKey(0)
         observations, self._state_form = jax.eval_shape(env.reset, key)
         self._observations = {agent: observations[agent] for agent in self.agents}
-        self._shows_world = with_state
         self._has_world_entry = _WORLD_STATE in observations
         self._action_spaces = [env.action_space(agent) for agent in self.agents]
+        width = max(_size(one) for one in self._observations.values())
+        high = 255 if self._own_dtype == np.uint8 else np.inf
+        counts = self._n_actions
+        has_masks = bool(counts) and (self.gives_masks or len(set(counts)) > 1)
         self.rows = TeamSpaces(
-            self._own_space(),
+            spaces.Box(0 if high == 255 else -high, high, (width,), self._own_dtype),
             len(self.agents),
             has_active=not rules.pays_the_dead,
-            n_masked_actions=self._n_masked_actions(),
-            state=self._world_space(observations),
+            n_masked_actions=max(counts) if has_masks else None,
+            state=self._world_space() if with_state else None,
             is_dict=True,
         )
         active = jax.ShapeDtypeStruct((len(self.agents),), np.bool_)
@@ -124,16 +121,10 @@ class JaxPrograms:
     # ---- spaces
 
     @cached_property
-    def _own_dtype(self) -> npt.DTypeLike:
+    def _own_dtype(self) -> type[np.uint8] | type[np.float32]:
         """Uint8 if all observations are bytes or flags, else float32."""
         small = all(one.dtype in (np.uint8, np.bool_) for one in self._observations.values())
         return np.uint8 if small else np.float32
-
-    def _own_space(self) -> spaces.Box:
-        width = max(_size(one) for one in self._observations.values())
-        if self._own_dtype == np.uint8:
-            return spaces.Box(0, 255, (width,), np.uint8)
-        return spaces.Box(-np.inf, np.inf, (width,), np.float32)
 
     @cached_property
     def gives_masks(self) -> bool:
@@ -151,10 +142,6 @@ class JaxPrograms:
             return []
         return [int(space.n) for space in self._action_spaces]
 
-    def _n_masked_actions(self) -> int | None:
-        counts = self._n_actions
-        return max(counts) if counts and (self.gives_masks or len(set(counts)) > 1) else None
-
     @cached_property
     def action_space(self) -> spaces.Space[Any]:
         """Action space of a row."""
@@ -162,8 +149,12 @@ class JaxPrograms:
         if self._n_actions:
             return spaces.Discrete(max(self._n_actions))
         if all(isinstance(space, jax_spaces.Box) for space in self._action_spaces):
-            lows, highs = (self._padded_bounds(bound) for bound in ("low", "high"))
-            return spaces.Box(lows, highs, dtype=np.float32)
+            widest = max(self._action_spaces, key=lambda space: int(space.shape[0]))
+            low, high = (
+                np.broadcast_to(np.asarray(bound, dtype=np.float32), widest.shape)
+                for bound in (widest.low, widest.high)
+            )
+            return spaces.Box(low, high, dtype=np.float32)
         if isinstance(first, jax_spaces.MultiDiscrete):
             choices = {tuple(np.asarray(space.num_categories).tolist()) for space in self._action_spaces}
             if len(choices) == 1:
@@ -173,13 +164,7 @@ class JaxPrograms:
             f"{type(self.env).__name__}"
         )
 
-    def _padded_bounds(self, bound: str) -> npt.NDArray[np.float32]:
-        widest = max(self._action_spaces, key=lambda space: int(space.shape[0]))
-        return np.broadcast_to(np.asarray(getattr(widest, bound), dtype=np.float32), widest.shape)
-
-    def _world_space(self, observations: Mapping[str, Any]) -> spaces.Box | None:
-        if not self._shows_world:
-            return None
+    def _world_space(self) -> spaces.Box:
         if not self._has_world_entry and not hasattr(self.env, "get_world_state"):
             raise ValueError(f"{type(self.env).__name__} tells no state of the game; leave state=True out")
         key = jax.random.PRNGKey(0)
@@ -192,9 +177,7 @@ class JaxPrograms:
         """
         Step, and begin new episodes of ended games, if there are any.
 
-        :param games: E packed games
         :param actions: (E, N, ...)
-        :param extra_weight: see :class:`JaxGames`
         :return: games; (E, N, ...) their rows, and those before new episodes began; (E, R) see :meth:`_step`
         """
         games, last, results = jax.vmap(self._step, in_axes=(0, 0, None))(games, actions, extra_weight)
@@ -202,7 +185,8 @@ class JaxPrograms:
 
         def begin_where_ended(games: list[Any], last: dict[str, Any]) -> Any:
             fresh = jax.vmap(self._begin)(self.packing.unpack(games).key)
-            return jax.vmap(_choose)(fresh, (games, last), ended)
+            choose = jax.vmap(lambda one, other, is_over: jax.tree.map(partial(jnp.where, is_over), one, other))
+            return choose(fresh, (games, last), ended)
 
         games, rows = jax.lax.cond(ended.any(), begin_where_ended, lambda *same: same, games, last)
         return games, rows, last, results
@@ -272,7 +256,7 @@ class JaxPrograms:
             rows[ACTIVE_KEY] = active
         if self.rows.n_masked_actions is not None:
             rows[ACTION_MASK_KEY] = self._masks(state)
-        if self._shows_world:
+        if self.rows.state is not None:
             world = self._world(observations, state)
             rows[STATE_KEY] = jnp.broadcast_to(world, (len(self.agents), *world.shape))
         return rows
@@ -289,11 +273,6 @@ class JaxPrograms:
         return jnp.ravel(world).astype(jnp.float32)
 
 
-def _choose(fresh: Any, old: Any, ended: Any) -> Any:
-    """Select the new episode for ended games."""
-    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, old)
-
-
 def _size(form: Any) -> int:
     return int(np.prod(form.shape))
 
@@ -307,8 +286,6 @@ class JaxGames(ResumableBatch):
     """
     E games of an environment.
 
-    :param programs: programs of the environment
-    :param n_games: E
     :param extra_weight: weight of the rules' extra rewards, such as those for shaping
     :param extra_steps: game steps, summed over games, over which that weight decreases to 0; None for never
     """
@@ -349,17 +326,15 @@ class JaxGames(ResumableBatch):
     def step(self, actions: Array) -> BatchStep:
         """Step every game (see the base class)."""
         narrow = actions.astype(np.int32) if actions.dtype.kind == "i" else actions
-        self._buffers, rows, last, results = self._programs.step(self._buffers, narrow, self._weight())
+        left = 1.0 if self._extra_steps is None else max(0.0, 1.0 - self._n_steps / self._extra_steps)
+        weight = np.float32(self._extra_weight * left)
+        self._buffers, rows, last, results = self._programs.step(self._buffers, narrow, weight)
         self._n_steps += self.n_games
         rewards = np.asarray(results)
         ended, truncated, *won = (rewards[:, len(self.agents) :] != 0).T
         shown = self._on_host(rows)
         last_shown = self._on_host(last) if ended.any() else shown
         return BatchStep(shown, rewards[:, : len(self.agents)], ended, truncated, last_shown, *won)
-
-    def _weight(self) -> np.float32:
-        left = 1.0 if self._extra_steps is None else max(0.0, 1.0 - self._n_steps / self._extra_steps)
-        return np.float32(self._extra_weight * left)
 
     def _on_host(self, rows: dict[str, Any]) -> dict[str, Array]:
         """Convert (E, N, ...) on the device to NumPy (B, ...), without a copy on a CPU."""

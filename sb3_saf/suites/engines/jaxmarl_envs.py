@@ -72,16 +72,10 @@ def vec_env(
     """
     Make games of an environment.
 
-    :param name: JaxMARL's registered name
-    :param n_envs: E
-    :param seed: seed of the run
-    :param state: whether rows have the state of the game
     :param render_mode: None or ``"rgb_array"``
-    :param stagger: see :class:`ResumableBatchVecEnv`
     :param reward_shaping: weight of the shaped rewards, if the environment has any
     :param reward_shaping_steps: game steps, summed over games, over which that weight decreases to 0; None for never
     :param fixed: arguments of the environment that the task sets
-    :param params: its other arguments
     :raises ValueError: if the state, picture or reward is missing, or the environment has no teams of named agents
     """
     programs = _programs(name, _Params({**params, **(fixed or {})}), state)

@@ -97,11 +97,7 @@ _RULES: Final[dict[str, Rules]] = {
 
 
 def rules_of(name: str) -> Rules:
-    """
-    Return the rules of an environment.
-
-    :param name: JaxMARL's registered name
-    """
+    """Return the rules of an environment."""
     if name.startswith("MPE_"):
         return Rules(draw=_draw_particles)
     return _RULES.get(name, Rules())

@@ -83,17 +83,14 @@ class VmasGames(Batch):
             observations, rewards, terminated, limited, _ = self.env.step(self._chosen(actions))
             truncated = (limited & ~terminated).numpy(force=True)
             ended = (limited | terminated).numpy(force=True)
-            last = self._rows(observations, ~ended | truncated)
-            rows = last if not ended.any() else self._rows(self._begin_where(ended), np.ones_like(ended))
+            rows = last = self._rows(observations, ~ended | truncated)
+            if ended.all():
+                rows = self._rows(self.env.reset(), ended)
+            elif ended.any():
+                for game in np.flatnonzero(ended).tolist():
+                    self.env.reset_at(game, return_observations=False)
+                rows = self._rows(_observe(self.env), np.ones_like(ended))
         return BatchStep(rows, th.stack(rewards, dim=1).numpy(force=True), ended, truncated, last)
-
-    def _begin_where(self, ended: npt.NDArray[np.bool_]) -> list[Any]:
-        """Begin the next episode of some games; return the observations of all."""
-        if ended.all():
-            return list(self.env.reset())
-        for game in np.flatnonzero(ended).tolist():
-            self.env.reset_at(game, return_observations=False)
-        return _observe(self.env)
 
     def _chosen(self, actions: Array) -> list[th.Tensor]:
         """Return the agents' actions, limited to their own spaces; actions that an agent lacks become its first."""
@@ -169,16 +166,11 @@ def vec_env(
     """
     Make games of a scenario.
 
-    :param scenario: its name
-    :param n_envs: E
-    :param seed: seed of the run
     :param state: must be False: VMAS has no state of the game
     :param render_mode: None or ``"rgb_array"``
-    :param stagger: see :class:`BatchVecEnv`
     :param max_steps: time limit in game steps; None for none
     :param continuous_actions: whether actions are forces, or indices of directions
     :param device: torch device of the games
-    :param params: parameters of the scenario
     :raises ValueError: for an unknown parameter, or if a state is requested
     """
     if state:
