@@ -204,7 +204,7 @@ def loss_and_gradients(
 def test_naive_encoding_gives_the_same_loss_and_gradients(
     policy_class: type[TeamActorCriticPolicy], kwargs: dict[str, Any], own: spaces.Space[Any]
 ) -> None:
-    policy = make_policy(policy_class, own, chunk_size=3, **kwargs)
+    policy = make_policy(policy_class, own, chunk_size=3, encode_once=True, **kwargs)
     naive = make_policy(policy_class, own, chunk_size=None, encode_once=False, **kwargs)
     naive.load_state_dict(policy.state_dict())
     obs = team_rows(own, n_games=10)
