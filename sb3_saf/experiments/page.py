@@ -164,12 +164,12 @@ def known(content: Content) -> str:
     """Return mean results beside what is known of the same games, see ``sb3_saf.suites.references``."""
     lines = []
     keys = ["task", "method", "train_level", "level"]
-    means = content.frames.tests.groupby(keys)[["success_rate", "return_mean", "game_steps"]].mean()
+    results = content.frames.tests.groupby(keys)[["success_rate", "return_mean", "game_steps"]].mean()
     cells = {(cell.task, cell.method, cell.level.slug): cell for cell in content.cells if cell.is_trained}
     for key, cell in cells.items():
         for level in cell.tests:
-            if (*key, level.slug) in means.index:
-                won, score, game_steps = means.loc[(*key, level.slug)]
+            if (*key, level.slug) in results.index:
+                won, score, game_steps = results.loc[(*key, level.slug)]
                 settings = content.config.settings(cell, level)
                 scores = {"return": score} if pd.isna(won) else {"won": won, "return": score}
                 beside = standing(settings.environment, settings.env_kwargs, scores, int(game_steps))
