@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.patches import Rectangle
 
 pytest.importorskip("rliable")
 
@@ -147,6 +148,16 @@ def test_differences_are_drawn_at_their_values_by_level() -> None:
     dots, _, (bars,) = drawn["ippo"]
     assert dots.get_xydata().tolist() == [[2.0, 0.0], [0.5, 2.0]]
     assert bars.get_segments()[0].tolist() == [[1.0, 0.0], [4.0, 0.0]]
+
+
+def test_pooled_differences_are_diamonds_on_the_band_of_no_difference() -> None:
+    rows = [("saf", "a", 1.0, 0.0, 2.0, False), ("saf", "together", 2.0, 1.0, 3.0, True)]
+    names = ["method", "level", "value", "low", "high", "pooled"]
+    (axes,) = draw_differences(pd.DataFrame(rows, columns=names), band=2.0).axes
+    diamonds = [np.asarray(line.get_xdata()).tolist() for line in axes.get_lines() if str(line.get_marker()) == "D"]
+    assert diamonds == [[2.0]]
+    (band,) = axes.patches
+    assert isinstance(band, Rectangle) and (band.get_x(), band.get_width()) == (-2, 4)
 
 
 def test_methods_keep_their_styles_and_none_looks_like_another() -> None:
