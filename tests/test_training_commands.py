@@ -228,9 +228,10 @@ def test_any_environment_is_trained_watched_drawn_and_tuned(tmp_path: Path, caps
     assert "Best: trial 0" in capsys.readouterr().out
 
 
-def test_games_that_cannot_be_shown_say_what_they_lack() -> None:
-    with pytest.raises(ValueError, match=r"unexpected keyword argument 'render_mode'; to show its games, give it"):
-        find_environment("tests.toy_envs:BareEnv").make_game({}, "human")
+@pytest.mark.parametrize("given", [({}, "human"), ({"render_mode": "rgb_array"},)])
+def test_games_that_cannot_be_shown_say_what_they_lack(given: tuple[Any, ...]) -> None:
+    with pytest.raises(ValueError, match=r"argument 'render_mode'; to show its games, give it .*--no-render"):
+        find_environment("tests.toy_envs:BareEnv").make_game(*given)
 
 
 def test_environments_by_other_names(tmp_path: Path) -> None:

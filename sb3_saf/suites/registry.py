@@ -90,7 +90,9 @@ class TeamEnvironment:
         try:
             game = as_parallel(self.make(**kwargs))
         except TypeError as error:  # most often an argument that it does not have
-            hint = "" if render_mode is None else "; to show its games, give it the argument render_mode (PettingZoo's)"
+            hint = ""
+            if "render_mode" in kwargs:
+                hint = "; to show its games, give it the argument render_mode (PettingZoo's), or use --no-render"
             raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}{hint}") from error
         if not isinstance(game, pettingzoo.ParallelEnv):
             raise ValueError(f"expected {self.id} to make a PettingZoo ParallelEnv, got a {type(game).__name__}")
