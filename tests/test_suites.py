@@ -474,7 +474,7 @@ def test_a_result_stands_beside_what_is_known_of_its_task() -> None:
     assert standing(spread, {}, {"won": 0.5}, 1_000_000) is None
     level = load_settings("saf", "TeamSupport-v0", "small", env_kwargs={"coordination": 2}).env_kwargs
     assert len(references(find_environment("TeamSupport"), level)) == 2
-    assert not references(find_environment("TeamSupport"), level | {"heterogeneity": 2})
+    assert not references(find_environment("TeamSupport"), {**level, "heterogeneity": 2})
 
 
 def test_known_results_of_a_task_are_printed_also_without_its_package(capsys: pytest.CaptureFixture[str]) -> None:

@@ -263,7 +263,7 @@ def _difference_of_weights(before: Path, after: Path) -> str:
     for name, one in ours.items():
         other = theirs[name]
         if (one.dtype, one.shape) != (other.dtype, other.shape):
-            before, now = (f"{tensor.dtype} of shape {tuple(tensor.shape)}" for tensor in (one, other))
-            return f"{name} is {before}, now {now}"
+            old, new = (f"{tensor.dtype} of shape {tuple(tensor.shape)}" for tensor in (one, other))
+            return f"{name} is {old}, now {new}"
     changed = [name for name in ours if ours[name].numpy().tobytes() != theirs[name].numpy().tobytes()]
     return f"{len(changed)} of {len(ours)} tensors differ, such as {changed[0]}" if changed else ""
