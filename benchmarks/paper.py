@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_saf.experiments.comparisons import MARGIN, Difference, holm, pooled, shares
+from sb3_saf.experiments.comparisons import FEWEST_SEEDS, MARGIN, Difference, holm, pooled, shares
 from sb3_saf.experiments.definitions import METHODS, RANDOM
 from sb3_saf.experiments.tables import CURVES, RUNS, Frames, marl_eval, read_results
 from sb3_saf.teams.files import write_text
@@ -130,12 +130,11 @@ def methods_table(tests: pd.DataFrame) -> str:
         "all": tests["seed"] >= 0,
     }
     body = []
-    for method in (*MAIN, RANDOM):
+    for method in MAIN:
         here = tests["method"] == method
         cells = [_mean_share(tests[here & chosen]) for chosen in columns.values()]
-        trained = tests[here & (tests["game_steps"] > 0)]
-        seconds = "" if trained.empty else f"{trained['processor_seconds'].mean():.0f}"
-        probability = "" if method in ("saf", RANDOM) else _probability(tests, method)
+        seconds = f"{tests.loc[here, 'processor_seconds'].mean():.0f}"
+        probability = "" if method == "saf" else _probability(tests, method)
         body.append([WORDS[method], *cells, probability, seconds])
     return table(["method", *columns, "SAF is better", "processor seconds"], body)
 
@@ -157,9 +156,9 @@ def _probability(tests: pd.DataFrame, other: str) -> str:
 
 
 def claims_table(found: Sequence[Claim]) -> str:
-    """Return a row for each claim, with p values corrected for their number (Holm)."""
+    """Return a row for each claim with enough runs, with p values corrected for their number (Holm)."""
     tested = [(claim, difference(claim.rows, *claim.pair)) for claim in found]
-    shown = [(claim, test) for claim, test in tested if test is not None and not np.isnan(test.p)]
+    shown = [(claim, test) for claim, test in tested if test is not None and test.n >= FEWEST_SEEDS]
     corrected = holm([test.p for _, test in shown])
     body = []
     for (claim, test), p in zip(shown, corrected, strict=True):
@@ -229,7 +228,7 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
 
 
 def curves(frames: Frames) -> pd.DataFrame:
-    """Return the evaluations of the settings with most seeds."""
+    """Return the evaluations of two settings."""
     parts = [("TeamSupport", "c2-h1", "TeamSupport, c = 2"), ("TeamSupport", "c1-h5", "TeamSupport, h = 5")]
     here = frames.curves[frames.curves["method"].isin(MAIN)]
     return pd.concat(
