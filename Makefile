@@ -27,13 +27,10 @@ train: $(TRAINING) ## train SAF on TeamSupport, compare it with a random team, l
 	@$(RUN) sb3_saf.quickstart $(TRAIN_ARGS)
 
 test: $(INSTALLED) ## run the tests
-	@$(RUN) pytest -n $(JOBS) --dist loadscope $(PYTEST_ARGS)
+	@$(RUN) pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, notebooks, tests
-	@$(MAKE) --no-print-directory format-check
-	@$(MAKE) --no-print-directory lint
-	@$(MAKE) --no-print-directory types
-	@$(MAKE) --no-print-directory docs
+	@$(MAKE) --no-print-directory -j $(JOBS) format-check lint types docs
 	@$(MAKE) --no-print-directory notebooks
 	@$(MAKE) --no-print-directory test
 

@@ -265,19 +265,19 @@ def pages() -> dict[Path, str]:
     return {page: fill(page.read_text(encoding="utf-8"), blocks) for page in PAGES}
 
 
-def add(name: str, folder: Path) -> None:
+def add(name: str, folder: Path, raw: Path = RAW) -> None:
     """Add the finished cells of an experiment's folder, ``RESULTS/EXPERIMENT``, to the raw data."""
     frames = [read_results(folder.parent, folder.name)]
-    if (RAW / name).is_dir():
-        frames.insert(0, read(name))
+    if (raw / name).is_dir():
+        frames.insert(0, read_results(raw, name))
     tests = pd.concat([frame.tests for frame in frames]).drop_duplicates(["cell", "level"])
-    together = pd.concat([frame.curves for frame in frames]).drop_duplicates(
-        ["method", *_COLUMNS, "seed", "game_steps"]
-    )
-    (RAW / name).mkdir(parents=True, exist_ok=True)
+    keys = ["method", *_COLUMNS, "seed", "game_steps"]
+    together = pd.concat([frame.curves for frame in frames]).drop_duplicates(keys)
+    (raw / name).mkdir(parents=True, exist_ok=True)
     for file, frame in ((RUNS, tests), (CURVES, together)):
-        write_text(RAW / name / file, frame.to_csv(index=False, lineterminator="\n"))
-    write_text(RAW / name / "marl_eval.json", json.dumps(marl_eval(Frames(tests, together), "hecogrid")))
+        write_text(raw / name / file, frame.to_csv(index=False, lineterminator="\n"))
+    suite = tests["task"].iloc[0].partition("/")[0] if raw != RAW else "hecogrid"
+    write_text(raw / name / "marl_eval.json", json.dumps(marl_eval(Frames(tests, together), suite)))
 
 
 def main() -> None:

@@ -320,9 +320,9 @@ def print_trainings(clones: Mapping[str, Path | None], interpreters: Mapping[str
         row = _trained(peer, 0, clones, interpreters) if clones[peer.kind] is not None else []
         if row:
             _print_row(peer.task, peer.program, row[3], row[4], row[6])
-        task = suite_results.Task(peer.task, peer.game_steps)
+        task = suite_results.Task(peer.task, peer.game_steps, ("mappo", "ippo", "saf"))
         with tempfile.TemporaryDirectory() as folder:
-            options = argparse.Namespace(methods=("mappo", "ippo", "saf"), folder=Path(folder))
+            options = argparse.Namespace(folder=Path(folder))
             with contextlib.redirect_stdout(sys.stderr):
                 suite_results.run(task, 0, options)
             results = suite_results.read_results(Path(folder, task.name), task.name)

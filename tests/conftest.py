@@ -33,6 +33,16 @@ settings.register_profile("sb3_saf", deadline=None, max_examples=EXAMPLES, deran
 settings.load_profile("sb3_saf")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the tests that may take longest, so that no process is left alone with them at the end."""
+
+    def limit(item: pytest.Item) -> float:
+        marker = item.get_closest_marker("timeout")
+        return marker.args[0] if marker else 0
+
+    items.sort(key=limit, reverse=True)
+
+
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     """Seed the global generators, so that no test depends on the tests before it."""
