@@ -8,11 +8,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import PPO
 
 from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, game_seeds, make_team_env
 from sb3_saf.checkpoints.states import environment_state, load_environment_state
+from sb3_saf.inspection.recording import picture
+from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
 from sb3_saf.suites.registry import find_environment, suites
+from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.trees import decode, encode
 from sb3_saf.training.settings import load_settings
 
@@ -37,6 +41,36 @@ def rows_of(env_id: str, n_envs: int, seed: int = 0, **params: Any) -> Any:
 def legal_actions(observations: dict[str, Array], rng: np.random.Generator, n_actions: int) -> Array:
     masks = observations.get("action_mask", np.ones((len(observations["active"]), n_actions)))
     return np.asarray((rng.random(masks.shape) * masks).argmax(axis=1))
+
+
+# --- every engine -----------------------------------------------------------------------------------------------------
+
+
+class Still(Batch):
+    """Three games of two agents in which nothing happens; the picture of a game has its number in each pixel."""
+
+    def __init__(self) -> None:
+        super().__init__(3, ("a", "b"), TeamSpaces(spaces.Box(0, 1, (1,), np.float32), 2), spaces.Discrete(2))
+
+    def reset(self, seeds: Any) -> dict[str, Array]:
+        return {"obs": np.zeros((6, 1), dtype=np.float32)}
+
+    def step(self, actions: Array) -> BatchStep:
+        rows, ended = self.reset(None), np.zeros(3, dtype=bool)
+        return BatchStep(rows, np.zeros((3, 2), dtype=np.float32), ended, ended, rows)
+
+    def picture(self, game: int) -> npt.NDArray[np.uint8]:
+        return np.full((4, 4, 3), game, dtype=np.uint8)
+
+
+def test_games_without_objects_are_drawn_by_row() -> None:
+    """As ``enjoy`` and ``replay`` do."""
+    env = CentralizedValueWrapper(BatchVecEnv(Still(), render_mode="rgb_array"))
+    assert [frame.max() for frame in env.env_method("render")] == [0, 0, 1, 1, 2, 2]
+    first = picture(env)
+    assert first is not None and first.shape == (4, 4, 3)
+    with pytest.raises(AttributeError, match="share one engine"):
+        env.env_method("close")
 
 
 # --- JaxMARL ----------------------------------------------------------------------------------------------------------

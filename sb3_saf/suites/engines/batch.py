@@ -253,7 +253,8 @@ class BatchVecEnv(TeamVecEnv):
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """Call a method of each row's game, once per row; :meth:`game_method` calls it once per game."""
-        return [getattr(game, method_name)(*args, **kwargs) for game in self._games_of(indices)]
+        games = [row // self.n_agents for row in chosen_indices(indices, self.num_envs)]
+        return self.game_method(method_name, *args, games=games, **kwargs)
 
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
