@@ -91,6 +91,11 @@ def test_the_extra_of_a_suite_installs_what_it_requires(suite: Suite) -> None:
     assert [line for line in lines if not line.startswith("#")] == list(suite.requires)
 
 
+@pytest.mark.parametrize("name", suites())
+def test_the_page_of_suites_has_a_row_for_each(name: str) -> None:
+    assert f"\n| `{name}/" in (ROOT / "docs" / "suites.md").read_text(encoding="utf-8")
+
+
 def test_what_is_said_of_packages_that_are_missing_or_of_another_version() -> None:
     one: dict[str, Any] = {"title": "", "extra": "x", "page": "", "list_tasks": list, "examples": (), "game": print}
     assert Suite("x", requires=("no-such-package>=2",), **one).problem() == (
