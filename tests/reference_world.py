@@ -1,11 +1,11 @@
 """
 A second implementation of the rules: one HECOGrid world in plain Python, to test the fast kernels.
 
-It shares no code with ``hecogrid_envs`` and is not optimised. Its groups of methods follow the sections of
-``spec/hecogrid.md``:
+It shares no code with ``hecogrid_envs`` and is not optimised. The rule book is what ``hecogrid_envs/task.py`` says of
+all tasks, and the numbered list of ``docs/reference/differences.md``, whose numbers are the rows here:
 
 =====================  ==============================================================================
-section                here
+rules                  here
 =====================  ==============================================================================
 Parameters             ``DEFAULTS``, ``ReferenceWorld.__init__``
 World, State           ``set_state``, ``get_state`` (``cells`` keeps the order of arrival)
@@ -13,10 +13,10 @@ Actions                ``zone_of_column``, ``command``, ``step``, ``_forward``, 
 Collecting             ``_try_to_collect``, ``_enough_agents``
 Reward and end         the last line of ``step``; the environment handles the time limit
 Observation            ``visible``, ``view_cell``, ``observe``, ``_draw_tile``, ``_colour``
-Paper and released     each ``self.released``, with the number of the row of the table
+Paper and released     each ``self.released``, with the number of its row
 =====================  ==============================================================================
 
-Row 6 of that table (directions at reset) and the generation of levels are not included: a world starts from a state.
+Row 6 (directions at reset) and the generation of levels are not included: a world starts from a state.
 """
 
 from __future__ import annotations
