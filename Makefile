@@ -17,7 +17,7 @@ TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
 GRIDWORLDS = $(VENV)/.gridworlds
 
-.PHONY: help install train test coverage bench docs notebooks check format-check lint types format clean distclean
+.PHONY: help install train test coverage bench docs notebooks teams check format-check lint types format clean distclean
 
 help: ## this list (the default)
 	@echo "make TARGET, with TARGET one of"
@@ -48,6 +48,9 @@ docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as 
 notebooks: $(INSTALLED) ## run the notebooks with small numbers; whole: .venv/bin/python -m notebooks.execute --full
 	@echo "== notebooks"
 	@$(RUN) notebooks.execute --jobs $(JOBS)
+
+teams: $(INSTALLED) ## play the teams of trained_teams/ again and compare with the rows of their tables
+	@$(RUN) sb3_saf.experiments teams
 
 format-check: $(INSTALLED)
 	@echo "== format"

@@ -59,6 +59,7 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.teams.errors import CheckpointError, NonFiniteError
     from sb3_saf.teams.randomness import game_seeds
     from sb3_saf.training.ppo_settings import ppo_settings
+    from sb3_saf.training.trained_teams import load_team
 
     register_all()
 else:
@@ -116,6 +117,7 @@ __all__ = [
     "export_actors",
     "game_seeds",
     "inspect_team",
+    "load_team",
     "load_weights",
     "make_team_env",
     "make_vec_env",

@@ -404,7 +404,7 @@ def test_damaged_cells_are_named_and_run_again(
 
 
 def test_a_game_that_pays_nan_in_a_test_fails_the_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_saf.experiments.cell.evaluate_team", lambda *_: EvaluationResult([float("nan")], [1]))
+    monkeypatch.setattr("sb3_saf.experiments.cell.play_test", lambda *_: EvaluationResult([float("nan")], [1]))
     summary, _ = run_inline(tmp_path, ONE)
     assert summary.finished == 0 and len(summary.failed) == 2
     monkeypatch.undo()

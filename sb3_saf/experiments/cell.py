@@ -15,9 +15,8 @@ import msgspec
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.utils import set_random_seed
 
-from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team
+from sb3_saf import RandomPolicy
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.experiments.definitions import Level, find_method
 from sb3_saf.experiments.grid import Cell, RunConfig
@@ -35,7 +34,6 @@ from sb3_saf.experiments.results import (
     write_evaluations,
 )
 from sb3_saf.export.weights import read_weights
-from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.errors import CheckpointError, NonFiniteError
 from sb3_saf.teams.files import differences, read_json, write_json, write_text
 from sb3_saf.training.folders import (
@@ -50,11 +48,10 @@ from sb3_saf.training.folders import (
     write_run,
 )
 from sb3_saf.training.run import RunOptions, load_parameters, train
+from sb3_saf.training.trained_teams import TEST_GAMES, play_test
 
 #: Checkpoints of a training, from which another worker continues if this one is killed.
 CHECKPOINTS_PER_CELL: Final = 20
-#: Games of a test that are played at once.
-TEST_GAMES: Final = 32
 
 
 @dataclass(frozen=True)
@@ -169,14 +166,7 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
         if model is not None:
             load_parameters(model, models / (BEST_MODEL if policy == BEST else MODEL))  # only numbers are read
         clock = time.perf_counter()
-        # Drawn actions must not depend on the training or on other tests.
-        set_random_seed(cell.seed)
-        parts = []
-        for batch, first in enumerate(range(0, config.episodes, TEST_GAMES)):
-            env.seed(evaluation_seed(cell.seed, test=batch))
-            episodes = min(TEST_GAMES, config.episodes - first)
-            parts.append(evaluate_team(player, env, episodes, deterministic=actions == MOST_LIKELY))
-        result = EvaluationResult.joined(parts)
+        result = play_test(player, env, cell.seed, config.episodes, actions == MOST_LIKELY)
         if not np.isfinite(result.returns).all():
             raise NonFiniteError(f"team returns must be finite, got {result.returns} at {level}; repair the game")
         plays.append(Play.of(policy, actions, result, time.perf_counter() - clock))

@@ -1,4 +1,4 @@
-"""Command line: ``list``, ``plan``, ``run``, ``report``, ``check``."""
+"""Command line: ``list``, ``plan``, ``run``, ``report``, ``check``, ``publish``, ``teams``."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from sb3_saf.training.commands import (
     user_errors,
 )
 from sb3_saf.training.folders import python_command
+from sb3_saf.training.trained_teams import TEAMS, check_team, team_names
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
@@ -78,6 +79,14 @@ def _parser() -> argparse.ArgumentParser:
         "cell", type=Path, metavar="FOLDER/CELL", help="such as runs/x/cells/TeamSupport-c1-h1/saf/seed-0"
     )
     check.add_argument("--device", default="auto", help="as Stable-Baselines3 takes it")
+    publish = commands.add_parser("publish", help="write the best teams of a folder for others to play")
+    publish.set_defaults(function=_publish)
+    publish.add_argument("folder", type=Path, metavar="FOLDER", help="as -f of `run`")
+    publish.add_argument("target", type=Path, metavar="TEAMS", help="folder of the teams, such as trained_teams")
+    publish.add_argument("--only", default="*", metavar="PATTERN", help="of their names, such as 'TeamSupport-*/saf'")
+    teams = commands.add_parser("teams", help="play published teams again and compare with the rows of their tables")
+    teams.set_defaults(function=_teams)
+    teams.add_argument("folder", type=Path, nargs="?", default=TEAMS, metavar="TEAMS", help="default: trained_teams")
     cell = commands.add_parser("cell", help="what `run` starts for each cell: do the job of a folder")
     cell.add_argument("cell", type=Path, metavar="FOLDER", help="with a job.json")
     cell.add_argument("--until-stdin-closes", action="store_true", help="end when whoever started this ends")
@@ -312,6 +321,26 @@ def _check(options: argparse.Namespace) -> int:
     if check.software:
         print(f"software has changed: {check.software}")
     return 1 if check.different else 0
+
+
+def _publish(options: argparse.Namespace) -> int:
+    require("pandas")
+    from sb3_saf.experiments.tables import publish
+
+    for name in publish(options.folder, options.target, options.only):
+        print(options.target / name)
+    return 0
+
+
+def _teams(options: argparse.Namespace) -> int:
+    failed = 0
+    for name in team_names(options.folder):
+        try:
+            print(check_team(name, options.folder))
+        except ValueError as error:
+            failed = 1
+            print(error, file=sys.stderr)
+    return failed
 
 
 def _cell(options: argparse.Namespace) -> int:

@@ -32,7 +32,10 @@ has one row per cell and test level:
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterable, Iterator
+from contextlib import closing
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -41,13 +44,19 @@ import pandas as pd
 
 from sb3_saf.experiments.definitions import MODULE, RANDOM, Experiment, View
 from sb3_saf.experiments.grid import Cell, Grid, expand, merge
-from sb3_saf.experiments.results import BEST, EVALUATIONS, LAST, MOST_LIKELY, Results
-from sb3_saf.teams.files import write_text
-from sb3_saf.training.folders import python_command, read_curve
+from sb3_saf.experiments.results import BEST, BEST_MODEL, EVALUATIONS, LAST, MOST_LIKELY, Results
+from sb3_saf.export.weights import save_weights
+from sb3_saf.teams.files import read_json, write_json, write_text
+from sb3_saf.training.enjoy import make_policy
+from sb3_saf.training.folders import RUN_FILE, Run, finish_run, python_command, read_curve
+from sb3_saf.training.replay import write_page
 from sb3_saf.training.statistics import require_columns
+from sb3_saf.training.trained_teams import WEIGHTS, check_runs_no_code
 
 RUNS: Final = "runs.csv"
 CURVES: Final = "curves.csv"
+#: Largest page of an episode that is published with a team.
+_PAGE_BYTES: Final = 300_000
 
 
 class Frames(NamedTuple):
@@ -196,6 +205,51 @@ def write_tables(experiment: Experiment, results: Results) -> Frames:
     for name, frame in zip((RUNS, CURVES), frames, strict=True):
         write_text(results.folder / experiment.name / name, frame.to_csv(index=False, lineterminator="\n"))
     return frames
+
+
+def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
+    """
+    Write teams for others to play, see ``training/trained_teams.py``: of each task, level and method of a folder of
+    experiments the seed with the best test at the level of its training.
+
+    :param target: folder of all teams; a team of the same name is replaced
+    :param only: pattern of names, such as ``"TeamSupport-*/saf"``
+    :return: names of the teams
+    :raises ValueError: if there are none, or their files could run code
+    """
+    rows: list[dict[str, Any]] = []
+    for path in sorted(folder.glob("*/selections")):
+        tests = read_results(folder, path.parent.name).tests
+        own = tests[(tests["game_steps"] > 0) & (tests["level"] == tests["train_level"])]
+        rows += own.assign(experiment=path.parent.name).to_dict("records")
+    best = {}
+    for row in sorted(rows, key=lambda row: row["return_mean"]):
+        env, method, _ = row["cell"].split("/")
+        if fnmatchcase(name := f"{env.removesuffix('-default')}/{method}", only):
+            best[name] = row
+    if not best:
+        raise ValueError(f"expected finished cells of experiments in {folder} that fit {only!r}, got none")
+    for name, row in best.items():
+        source, team = Run(folder / "cells" / row["cell"]), target / name
+        check_runs_no_code(source.description["settings"], source.folder)
+        shutil.rmtree(team, ignore_errors=True)
+        team.mkdir(parents=True)
+        with closing(source.settings.make_env(source.seed, evaluation=True, n_envs=1)) as games:
+            save_weights(make_policy(source.settings, source.folder / BEST_MODEL, games), team / WEIGHTS)
+        returns = read_json(source.folder / "tests" / f"{row['level']}.json")["plays"][0]["returns"]
+        row = {key: value for key, value in row.items() if value == value and "seconds" not in key}  # no NaN
+        versions = {
+            key: value for key, value in source.description["versions"].items() if key not in ("system", "host")
+        }
+        content = {**source.description, "versions": versions, "row": {**row, "returns": " ".join(map(repr, returns))}}
+        write_json(team / RUN_FILE, content)
+        suite = source.settings.environment.suite
+        if suite is not None and suite.is_drawn_from_state:
+            page = write_page(["--model", str(team / WEIGHTS), "-o", str(team / "replay.html")])
+            if page.stat().st_size > _PAGE_BYTES:
+                page.unlink()
+        finish_run(team, **{key: value for key, value in source.finished().items() if key != "files"})
+    return list(best)
 
 
 def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:

@@ -35,6 +35,7 @@ from sb3_saf.training.commands import (
 )
 from sb3_saf.training.folders import find_model
 from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
+from sb3_saf.training.trained_teams import WEIGHTS, find_team, version_in_errors
 from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.enjoy"
@@ -54,6 +55,9 @@ def make_parser() -> argparse.ArgumentParser:
     add_environment_options(parser, "another level than was trained on, such as coordination:3")
     parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="the folder of the training")
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run, 0 for the latest")
+    parser.add_argument(
+        "--team", metavar="ENV/METHOD", help="a published team, such as TeamSupport-c2-h1/saf, in the place of a run"
+    )
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="the model with the best evaluation")
     which.add_argument("--load-checkpoint", metavar="STEPS", type=int, help="the model saved after these game steps")
@@ -75,22 +79,30 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
     import_packages(options.gym_packages)
     with user_errors(ValueError, RuntimeError, ImportError):
         seed = check_seed(options.seed)
-        find_algorithm(options.algo)
-        environment = find_environment(options.env)
-        which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
-        run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
-        trained = run.settings
+        if options.team is None:
+            find_algorithm(options.algo)
+            environment = find_environment(options.env)
+            which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
+            run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
+        else:
+            run = find_team(options.team)
+            path = run.folder / WEIGHTS
+        with version_in_errors(run):
+            trained = run.settings
+        if options.team is not None:
+            options.algo, options.env, environment = trained.algo, trained.env_id, trained.environment
         if (trained.algo, trained.env_id) != (options.algo, environment.id):
             raise ValueError(f"{run.folder} is a run of {trained.algo} on {trained.env_id}; give its --algo and --env")
         settings = saved_settings(trained.as_dict(), options.env_kwargs)
         mode = None if options.no_render else "ansi" if options.text else "rgb_array"
         games = settings.make_env(seed, evaluation=True, n_envs=options.episodes, render_mode=mode)
         with closing(games):
-            if settings.n_agents == trained.n_agents:
-                policy = make_policy(settings, path, games)
-            else:  # the actor is that of the trained size
-                with closing(trained.make_env(seed, n_envs=1)) as own_games:
-                    policy = make_policy(trained, path, own_games)
+            with version_in_errors(run):
+                if settings.n_agents == trained.n_agents:
+                    policy = make_policy(settings, path, games)
+                else:  # the actor is that of the trained size
+                    with closing(trained.make_env(seed, n_envs=1)) as own_games:
+                        policy = make_policy(trained, path, own_games)
             load_normalization(games, run.folder)
             set_random_seed(seed)
             with open_screen(options, games) as show:

@@ -1,0 +1,228 @@
+"""Published teams: what is written, loaded and checked, and those of the repository."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_saf import ExportError, evaluate_team, load_team, load_weights, save_weights
+from sb3_saf.experiments import cli
+from sb3_saf.experiments.definitions import find_experiment
+from sb3_saf.experiments.grid import RunConfig, Selection
+from sb3_saf.experiments.results import Results
+from sb3_saf.experiments.run import run
+from sb3_saf.suites.registry import suites
+from sb3_saf.teams.files import read_json, write_json
+from sb3_saf.training import trained_teams
+from sb3_saf.training.enjoy import enjoy
+from sb3_saf.training.folders import finish_run
+from sb3_saf.training.replay import write_page
+from sb3_saf.training.trained_teams import TEAMS, TEST_GAMES, WEIGHTS, check_team, find_team, team_names
+from tests.experiments_jobs import InlineEngine, read_table
+
+SMOKE = RunConfig("smoke", episodes=TEST_GAMES + 8, eval_freq=200, eval_episodes=2)
+METHODS = ("saf", "mappo", "ippo", "ippo-separate", "saf-gru", "qplex")
+LEVEL = "TeamSupport-c2-h2"
+NAMES = sorted(f"{LEVEL}/{method}" for method in METHODS)
+#: All teams of the repository may take no more.
+MEGABYTES = 20
+ROOT = TEAMS.parent
+
+
+@pytest.fixture(scope="module")
+def experiments(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of experiments with all methods, of ``ippo`` two seeds, read-only."""
+    folder = tmp_path_factory.mktemp("experiments")
+    for seeds, methods in (((0,), METHODS), ((1,), ("ippo",))):
+        run(find_experiment("joint"), Selection(seeds, methods, (), ("2",)), SMOKE, Results(folder), InlineEngine())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def published(experiments: Path) -> Path:
+    """Return the teams of the experiments, read-only."""
+    assert cli.main(["publish", str(experiments), str(experiments / "teams")]) == 0
+    return experiments / "teams"
+
+
+@pytest.fixture
+def teams(published: Path, tmp_path: Path) -> Path:
+    """Return a copy of the teams to damage."""
+    return shutil.copytree(published, tmp_path / "teams")
+
+
+def change(teams: Path, edit: Callable[[dict[str, Any]], object], name: str = f"{LEVEL}/ippo") -> None:
+    """Change the settings of a team."""
+    content = read_json(teams / name / "run.json")
+    edit(content["settings"])
+    write_json(teams / name / "run.json", content)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_team_plays_its_games_again(published: Path, method: str) -> None:
+    model = load_team(LEVEL, method, published)
+    env = model.get_env()
+    assert env is not None
+    assert len(evaluate_team(model, env, 3).returns) == 3
+    env.close()
+    assert check_team(f"{LEVEL}/{method}", published).endswith("equal game by game")
+    assert f"{TEST_GAMES} games" in check_team(f"{LEVEL}/{method}", published, batches=1)
+
+
+def test_the_best_seed_of_each_method_is_published_with_its_row(experiments: Path, published: Path) -> None:
+    assert team_names(published) == NAMES
+    rows = read_table(experiments / "joint" / "runs.csv")
+    for name in NAMES:
+        row = find_team(name, published).description["row"]
+        mine = [one for one in rows if one["method"] == row["method"]]
+        assert len(mine) == (2 if name.endswith("/ippo") else 1)
+        (best,) = (one for one in mine if one["cell"] == row["cell"])
+        assert row["return_mean"] == float(best["return_mean"]) == max(float(one["return_mean"]) for one in mine)
+        assert np.mean([float(text) for text in row["returns"].split()]) == row["return_mean"]
+
+
+def test_published_files_name_no_computer_and_are_small(published: Path) -> None:
+    for name in NAMES:
+        assert {path.name for path in (published / name).iterdir()} == {
+            *("run.json", "finished.json", "replay.html", WEIGHTS)
+        }
+        assert not {"host", "system"} & read_json(published / name / "run.json")["versions"].keys()
+        assert (published / name / "replay.html").stat().st_size <= 300_000
+
+
+def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trained_teams, "TEAMS", published)
+    assert len(enjoy(["--team", f"{LEVEL}/saf-gru", "--no-render", "--episodes", "2"]).returns) == 2
+    assert len(enjoy(["--team", f"{LEVEL}/saf", "--no-render", "--env-kwargs", "n_agents:5"]).returns) == 32
+    assert write_page(
+        ["--model", str(published / LEVEL / "saf" / WEIGHTS), "-o", str(tmp_path / "page.html")]
+    ).is_file()
+
+
+def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["teams", str(teams)]) == 0
+    assert capsys.readouterr().out.count("equal game by game") == len(METHODS)
+    path = teams / LEVEL / "saf" / WEIGHTS
+    content = bytearray(path.read_bytes())
+    content[-7] ^= 1
+    path.write_bytes(content)
+    assert cli.main(["teams", str(teams)]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.count("equal game by game") == len(METHODS) - 1
+    assert "has changed since the run was finished; restore it from the repository" in printed.err
+
+
+def test_exchanged_weights_are_found_by_their_games(teams: Path, experiments: Path) -> None:
+    """The other seed's, with new digests: only the games tell."""
+    row = read_json(teams / LEVEL / "ippo" / "run.json")["row"]
+    other = experiments / "cells" / LEVEL.replace("/", "-") / "ippo" / f"seed-{1 - row['seed']}" / "best_model.zip"
+    model = load_team(LEVEL, "ippo", teams)
+    load_weights(model, other)
+    save_weights(model, teams / LEVEL / "ippo" / WEIGHTS)
+    finish_run(teams / LEVEL / "ippo")
+    with pytest.raises(ValueError, match="expected equal returns on this kind of processor"):
+        check_team(f"{LEVEL}/ippo", teams)
+
+
+def test_on_another_processor_returns_may_differ_by_chance_only(teams: Path) -> None:
+    path = teams / LEVEL / "ippo" / "run.json"
+    content = read_json(path)
+    content["versions"]["processor"] = "another"
+    returns = [float(text) for text in content["row"]["returns"].split()]
+    for shift, passes in ((1e-4, True), (5.0, False)):
+        moved = [value + shift * (1 if passes and index % 2 else -1) for index, value in enumerate(returns)]
+        content["row"]["returns"] = " ".join(map(repr, moved))
+        write_json(path, content)
+        if passes:
+            assert "a difference by chance (processor was 'another'" in check_team(f"{LEVEL}/ippo", teams)
+        else:
+            with pytest.raises(ValueError, match="expected no difference but by chance, got 5 to 5"):
+                check_team(f"{LEVEL}/ippo", teams)
+
+
+@pytest.mark.parametrize(
+    ("env", "method", "message"),
+    [
+        (LEVEL, "ipo", f"unknown team '{LEVEL}/ipo' \\(did you mean '{LEVEL}/ippo'"),
+        ("TeamSupport-c2", "ippo", f"did you mean '{LEVEL}/ippo'"),
+        ("../teams/" + LEVEL, "ippo", "unknown team"),
+    ],
+)
+def test_an_unknown_team_names_the_nearest(published: Path, env: str, method: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_team(env, method, published)
+
+
+def test_a_folder_without_teams_says_where_they_are(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="got none; name the folder trained_teams of the repository"):
+        load_team(LEVEL, "saf", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (
+            lambda saved: saved["hyperparams"]["policy_kwargs"].update(net_arch=[8]),
+            "has a tensor that the network does not have",
+        ),
+        (lambda saved: saved["hyperparams"].update(novelty=1), "unknown setting of PPO 'novelty'"),
+        (lambda saved: saved.update(algo="ippo-2"), "unknown algorithm 'ippo-2' \\(did you mean 'ippo'"),
+    ],
+)
+def test_a_team_of_another_version_says_which(
+    teams: Path, edit: Callable[[dict[str, Any]], object], message: str
+) -> None:
+    change(teams, edit)
+    with pytest.raises(ExportError, match=f"{message}.* was trained with sb3-saf 0.* at commit .*; this is sb3-saf 0"):
+        load_team(LEVEL, "ippo", teams)
+
+
+@pytest.mark.skipif(suites()["smax"].problem() is None, reason="jaxmarl is installed")
+def test_a_suite_that_is_not_installed_says_how_to_install_it(teams: Path) -> None:
+    change(teams, lambda saved: saved.update(env="smax/2s3z"))
+    with pytest.raises(ValueError, match="needs jaxmarl, which is not installed: pip install 'sb3-saf\\[jaxmarl\\]'"):
+        load_team(LEVEL, "ippo", teams)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"env": "os:system"}, {"env": "mpe2.simple_spread_v3"}, {"env_wrapper": "os.system"}]
+)
+def test_files_that_name_code_are_refused(teams: Path, settings: dict[str, str]) -> None:
+    change(teams, lambda saved: saved.update(settings))
+    with pytest.raises(ExportError, match="must be a team on the games of a suite"):
+        load_team(LEVEL, "ippo", teams)
+
+
+# --- those of the repository ------------------------------------------------------------------------------------------
+
+OWN = team_names() if TEAMS.is_dir() else []
+
+
+def test_the_teams_of_the_repository_are_whole_and_small() -> None:
+    for name in OWN:
+        row = find_team(name).description["row"]  # compares the digest of the weights
+        assert np.mean([float(text) for text in row["returns"].split()]) == row["return_mean"]
+    files = [path for path in TEAMS.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) <= MEGABYTES * 10**6
+    assert {path.parent for path in files} == {TEAMS / name for name in OWN}
+
+
+@pytest.mark.parametrize("name", OWN[::4])
+def test_a_sample_of_the_repositorys_teams_has_the_returns_of_its_rows(name: str) -> None:
+    assert "mean team return of 32 games" in check_team(name, batches=1)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_rows_are_those_of_the_results(name: str) -> None:
+    row = find_team(name).description["row"]
+    path = ROOT / "results" / "paper" / row["experiment"] / "runs.csv"
+    table = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines())) if path.is_file() else []
+    for one in table:
+        if (one["cell"], one["level"], one["commit"]) == (row["cell"], row["level"], row["commit"]):
+            assert float(one["return_mean"]) == row["return_mean"]
