@@ -28,12 +28,19 @@ from sb3_saf.training.statistics import Estimate
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 RAW: Final = ROOT / "results" / "paper"
-PAGES: Final = (ROOT / "results" / "README.md", RAW / "README.md")
+PAGES: Final = (ROOT / "results" / "README.md", RAW / "README.md", ROOT / "docs" / "algorithms" / "memory.md")
+#: Tests at other levels than that of the training.
+OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
 #: The experiments of the grid; others have settings of their own.
-GRID: Final = ("coordination", "heterogeneity", "joint")
+GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
+#: With a GRU, in settings of the grid.
+MEMORY: Final = "memory"
 #: Methods of the grid; SAF is compared with the others.
 MAIN: Final = ("saf", "mappo", "ippo-separate", "ippo")
-WORDS: Final = {name: method.words for name, method in METHODS.items()}
+WORDS: Final = {
+    **{name: method.words for name, method in METHODS.items()},
+    **{f"{name}-gru": f"{METHODS[name].words}, GRU" for name in ("saf", "mappo", "ippo")},
+}
 _COLUMNS: Final = ["task", "level"]
 
 
@@ -59,9 +66,10 @@ def read(name: str) -> Frames:
 
 
 def grid() -> Frames:
-    """Return the raw data of the grid, each cell once, in the order of tasks and levels."""
+    """Return the raw data of the grid at levels of training, each cell once, in the order of tasks and levels."""
     frames = [read(name) for name in GRID]
-    tests = pd.concat([frame.tests for frame in frames]).drop_duplicates(["method", *_COLUMNS, "seed"])
+    tests = pd.concat([frame.tests.query("train_level == level") for frame in frames])
+    tests = tests.drop_duplicates(["method", *_COLUMNS, "seed"])
     curves = pd.concat([frame.curves for frame in frames]).drop_duplicates(["method", *_COLUMNS, "seed", "game_steps"])
     tasks = ["TeamSupport", "TeamTogether", "KeyForTreasure"]
     tests["task"] = pd.Categorical(tests["task"], tasks)
@@ -71,7 +79,12 @@ def grid() -> Frames:
     return Frames(tests, curves)
 
 
-def claims(tests: pd.DataFrame, pixels: pd.DataFrame) -> list[Claim]:
+def other_levels() -> pd.DataFrame:
+    """Return the tests at other levels than that of the training."""
+    return pd.concat([read(name).tests.query("train_level != level and game_steps > 0") for name in OTHER_LEVELS])
+
+
+def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> list[Claim]:
     """Return the claims that these data can test."""
     general = 'SAF is better than {} "across different tasks and different heterogeneity and coordination levels"'
     everywhere = "all settings"
@@ -82,6 +95,7 @@ def claims(tests: pd.DataFrame, pixels: pd.DataFrame) -> list[Claim]:
         Claim(general.format("IPPO"), ("saf", "ippo-separate"), everywhere, tests),
         Claim("high coordination favours SAF", ("saf", "mappo"), "c > 1", coordinated),
         Claim("high heterogeneity favours SAF", ("saf", "mappo"), "h > 1", zones),
+        Claim("SAF is robust to unseen levels", ("saf", "mappo"), "other levels than in training", unseen),
         Claim("the same, zones as the paper's agents see them", ("saf", "mappo"), hidden, pixels),
         Claim("the pool helps in heterogeneous maps", ("saf", "saf-no-pool"), hidden, pixels),
         Claim("the knowledge source helps", ("saf", "saf-no-ks"), hidden, pixels),
@@ -203,6 +217,36 @@ def other_table(names: Iterable[str]) -> str:
     return table(["experiment", "setting", "method", "seeds", "return of 100"], body)
 
 
+def memory_table(tests: pd.DataFrame, remembering: pd.DataFrame) -> str:
+    """Return each method without and with a GRU in the settings that both have, paired by seed and test games."""
+    body = []
+    for (task, level), here in remembering.query("game_steps > 0").groupby(_COLUMNS, sort=False):
+        for method in ("mappo", "saf", "ippo"):
+            both = pd.concat([tests[(tests["task"] == task) & (tests["level"] == level)], here])
+            found = difference(both, f"{method}-gru", method)
+            if found is None:
+                continue
+            seeds = set.intersection(
+                *(set(both.loc[both["method"] == one, "seed"]) for one in (method, f"{method}-gru"))
+            )
+            rows = both[both["seed"].isin(seeds)].groupby("method")
+            means, seconds = rows["return_mean"].mean(), rows["processor_seconds"].mean()
+            pair = (method, f"{method}-gru")
+            cells = [f"{means[one]:.1f}" for one in pair] + [show(found.estimate)]
+            spent = "; ".join(f"{seconds[one]:.0f}" for one in pair)
+            body.append([f"{task}, {level}", WORDS[method], str(len(seeds)), *cells, spent])
+    head = [
+        "setting",
+        "method",
+        "seeds",
+        "without",
+        "with a GRU",
+        "difference, % of the treasures",
+        "processor seconds",
+    ]
+    return table(head, body)
+
+
 def costs(names: Iterable[str]) -> str:
     """Return processor hours of training and tests, commits, and processors of all raw data."""
     tests = pd.concat([read(name).tests for name in names])
@@ -250,13 +294,14 @@ def fill(text: str, blocks: dict[str, str]) -> str:
 def pages() -> dict[Path, str]:
     """Return the pages with their blocks made of the raw data."""
     names = sorted(path.parent.name for path in RAW.glob(f"*/{RUNS}"))
-    others = [name for name in names if name not in GRID]
+    others = [name for name in names if name not in (*GRID, MEMORY)]
     tests = grid().tests
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
         "answer": answer(tests),
         "methods": methods_table(tests),
-        "claims": claims_table(claims(tests, pixels)),
+        "claims": claims_table(claims(tests, other_levels(), pixels)),
+        "memory": memory_table(tests, read(MEMORY).tests),
         "losses": losses(tests),
         "settings": settings_table(tests),
         "others": other_table(others),

@@ -10,8 +10,8 @@ import venv
 from pathlib import Path
 from typing import Final
 
-#: What an activated environment sets, and this process may have.
-_ACTIVATION: Final = ("VIRTUAL_ENV", "PYTHONPATH", "PYTHONHOME")
+#: What an activated environment sets, and the options of the `make` that runs these tests.
+_INHERITED: Final = ("VIRTUAL_ENV", "PYTHONPATH", "PYTHONHOME", "MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")
 
 
 def make_environment(folder: Path) -> Path:
@@ -31,7 +31,7 @@ def start(command: str, folder: Path, activation: str = "", **settings: str) -> 
     :param activation: what the shell runs before; by default no environment is active
     :param settings: environment variables
     """
-    environment = {name: value for name, value in os.environ.items() if name not in _ACTIVATION}
+    environment = {name: value for name, value in os.environ.items() if name not in _INHERITED}
     return subprocess.Popen(
         ["bash", "-c", f"{activation}exec {command}"],
         cwd=folder,

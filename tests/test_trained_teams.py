@@ -32,6 +32,7 @@ LEVEL = "TeamSupport-c2-h2"
 NAMES = sorted(f"{LEVEL}/{method}" for method in METHODS)
 #: All teams of the repository may take no more.
 MEGABYTES = 20
+ALL_EQUAL = "; 100% of the games are equal"
 ROOT = TEAMS.parent
 
 
@@ -71,7 +72,7 @@ def test_a_team_plays_its_games_again(published: Path, method: str) -> None:
     assert env is not None
     assert len(evaluate_team(model, env, 3).returns) == 3
     env.close()
-    assert check_team(f"{LEVEL}/{method}", published).endswith("equal game by game")
+    assert check_team(f"{LEVEL}/{method}", published).endswith(ALL_EQUAL)
     assert f"{TEST_GAMES} games" in check_team(f"{LEVEL}/{method}", published, batches=1)
 
 
@@ -107,14 +108,14 @@ def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypat
 
 def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["teams", str(teams)]) == 0
-    assert capsys.readouterr().out.count("equal game by game") == len(METHODS)
+    assert capsys.readouterr().out.count(ALL_EQUAL) == len(METHODS)
     path = teams / LEVEL / "saf" / WEIGHTS
     content = bytearray(path.read_bytes())
     content[-7] ^= 1
     path.write_bytes(content)
     assert cli.main(["teams", str(teams)]) == 1
     printed = capsys.readouterr()
-    assert printed.out.count("equal game by game") == len(METHODS) - 1
+    assert printed.out.count(ALL_EQUAL) == len(METHODS) - 1
     assert "has changed since the run was finished; restore it from the repository" in printed.err
 
 
@@ -126,23 +127,42 @@ def test_exchanged_weights_are_found_by_their_games(teams: Path, experiments: Pa
     load_weights(model, other)
     save_weights(model, teams / LEVEL / "ippo" / WEIGHTS)
     finish_run(teams / LEVEL / "ippo")
-    with pytest.raises(ValueError, match="expected equal returns on this kind of processor"):
+    with pytest.raises(ValueError, match="of the games are equal, expected 90%"):
         check_team(f"{LEVEL}/ippo", teams)
 
 
-def test_on_another_processor_returns_may_differ_by_chance_only(teams: Path) -> None:
+@pytest.mark.parametrize(
+    ("n_changed", "shift", "message"),
+    [(3, 0.5, ""), (TEST_GAMES, 1e-4, "0% of the games are equal, expected 90%")],
+)
+def test_few_games_may_differ(teams: Path, n_changed: int, shift: float, message: str) -> None:
+    """As on another kind of processor."""
     path = teams / LEVEL / "ippo" / "run.json"
     content = read_json(path)
-    content["versions"]["processor"] = "another"
     returns = [float(text) for text in content["row"]["returns"].split()]
-    for shift, passes in ((1e-4, True), (5.0, False)):
-        moved = [value + shift * (1 if passes and index % 2 else -1) for index, value in enumerate(returns)]
+    returns[:n_changed] = [value + shift for value in returns[:n_changed]]
+    content["row"]["returns"] = " ".join(map(repr, returns))
+    write_json(path, content)
+    if message:
+        with pytest.raises(ValueError, match=message):
+            check_team(f"{LEVEL}/ippo", teams, batches=1)
+    else:
+        assert "91% of the games are equal" in check_team(f"{LEVEL}/ippo", teams, batches=1)
+
+
+def test_games_of_other_packages_may_differ_by_chance(teams: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trained_teams, "EQUAL_GAMES", 0.0)
+    path = teams / LEVEL / "ippo" / "run.json"
+    content = read_json(path)
+    returns = [float(text) for text in content["row"]["returns"].split()]
+    for shift, sign in ((1.0, -1), (5.0, 1)):
+        moved = [value + shift * (1 if index % 2 else sign) for index, value in enumerate(returns)]
         content["row"]["returns"] = " ".join(map(repr, moved))
         write_json(path, content)
-        if passes:
-            assert "a difference by chance (processor was 'another'" in check_team(f"{LEVEL}/ippo", teams)
+        if sign < 0:
+            assert "0% of the games are equal" in check_team(f"{LEVEL}/ippo", teams)
         else:
-            with pytest.raises(ValueError, match="expected no difference but by chance, got 5 to 5"):
+            with pytest.raises(ValueError, match="expected no difference but by chance, got -5 to -5"):
                 check_team(f"{LEVEL}/ippo", teams)
 
 

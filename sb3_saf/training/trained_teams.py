@@ -29,7 +29,6 @@ from sb3_saf.export.weights import load_weights
 from sb3_saf.suites.registry import HOME, folder_name, suites
 from sb3_saf.teams.checks import evaluation_seed, unknown_name
 from sb3_saf.teams.errors import ExportError
-from sb3_saf.teams.files import differences
 from sb3_saf.training.folders import Run, software_versions
 
 WEIGHTS: Final = "weights.safetensors"
@@ -39,8 +38,8 @@ TEAMS: Final = Path(__file__).resolve().parents[2] / "trained_teams"
 TEST_GAMES: Final = 32
 #: A check fails by chance in one of a thousand teams.
 _CONFIDENCE: Final = 0.999
-#: With these equal, and one thread, HECOGrid's returns are equal bit for bit.
-_ROUNDING: Final = ("processor", "torch", "numpy")
+#: On another kind of processor networks are rounded otherwise, and an action is drawn otherwise in one game of many.
+EQUAL_GAMES: Final = 0.9
 _FIX: Final = "restore the team from the repository, or publish it again if a change of the code is meant to change it"
 #: Settings that import by name.
 _CODE: Final = ("env_wrapper", "vec_env_wrapper", "callback")
@@ -139,11 +138,11 @@ def check_team(name: str, folder: str | Path | None = None, batches: int | None 
     :param name: such as ``"TeamSupport-c2-h1/saf"``
     :param batches: only the first games, in batches of 32; None for all
     :return: the outcome
-    :raises ValueError: if returns are not equal where they have to be (HECOGrid on the row's kind of processor and
-        versions), or elsewhere their mean differs by more than chance (99.9 %, Student's t over the games)
+    :raises ValueError: if fewer than 90 % of HECOGrid's games have equal returns, or the mean of any games differs by
+        more than chance (99.9 %, Student's t over the games)
     """
     run = find_team(name, folder)
-    row, versions, now = run.description["row"], run.description["versions"], software_versions()
+    row = run.description["row"]
     env, _, method = name.rpartition("/")
     th.set_num_threads(1)
     model = load_team(env, method, folder, device="cpu")
@@ -153,13 +152,14 @@ def check_team(name: str, folder: str | Path | None = None, batches: int | None 
     expected = [float(text) for text in row["returns"].split()][: None if batches is None else TEST_GAMES * batches]
     with closing(run.settings.make_env(run.seed, evaluation=True, n_envs=min(TEST_GAMES, row["episodes"]))) as games:
         result = play_test(model, games, run.seed, len(expected), row["actions"] != "drawn")
-    means = f"{name}: mean team return of {len(expected)} games {result.mean:.4g}, in its row {np.mean(expected):.4g}"
-    if result.returns == expected:
-        return f"{means}, equal game by game"
-    changed = differences({key: versions.get(key) for key in _ROUNDING}, {key: now.get(key) for key in _ROUNDING})
-    if not changed and "/" not in run.settings.env_id:  # HECOGrid's, the games of this repository
-        raise ValueError(f"{means}: expected equal returns on this kind of processor and versions; {_FIX}")
+    equal = float(np.mean(np.equal(result.returns, expected)))
+    means = (
+        f"{name}: mean team return of {len(expected)} games {result.mean:.4g}, in its row {np.mean(expected):.4g}; "
+        f"{equal:.0%} of the games are equal"
+    )
+    if "/" not in run.settings.env_id and equal < EQUAL_GAMES:  # HECOGrid's, the games of this repository
+        raise ValueError(f"{means}, expected {EQUAL_GAMES:.0%}; {_FIX}")
     low, high = confidence_interval(np.subtract(result.returns, expected), _CONFIDENCE)
     if not low <= 0 <= high:
-        raise ValueError(f"{means}: expected no difference but by chance, got {low:.4g} to {high:.4g}; {_FIX}")
-    return f"{means}, a difference by chance ({changed or 'games of another package'})"
+        raise ValueError(f"{means}; expected no difference but by chance, got {low:.4g} to {high:.4g}; {_FIX}")
+    return means
