@@ -213,7 +213,7 @@ def _make_rows(
 
 
 def _make_in_engine(env: TeamEnvironment, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:
-    assert env.suite is not None and env.suite.vec_env is not None
+    assert env.suite is not None
     others = "" if env.suite.game is None else ", or use backend='supersuit'"
     if request.n_cpus != 1:
         raise ValueError(
@@ -221,10 +221,7 @@ def _make_in_engine(env: TeamEnvironment, request: Request, seed: int | None, pa
             f"steps all games at once; leave n_cpus out{others}"
         )
     params = {**params, "stagger": True} if request.stagger else params
-    try:
-        venv: VecEnv = env.suite.vec_env(env.task, request.n_envs, seed, state=request.state, **params)
-    except TypeError as error:  # most often an argument that it does not have
-        raise ValueError(f"{env.id} cannot be made with {params}: {error}") from error
+    venv = env.make_engine(request.n_envs, seed, params, state=request.state)
     rows = TeamSpaces.of_rows(venv.observation_space, venv.action_space, require_n_agents(venv))
     given = {"active": rows.has_active, "action_masks": rows.n_masked_actions is not None}
     asked = {"active": request.active, "action_masks": request.action_masks}

@@ -218,6 +218,7 @@ def test_published_results_are_drawn_beside_ones_own(folder: Path, tmp_path: Pat
     row = part_of(page, "Team return by").split("| theirs |")[1].splitlines()[0]
     assert f"| IPPO, shared |{row}" in page  # equal numbers
     assert "longer" not in page and "larger" not in page
+    assert report(mine, "--beside", str(tmp_path / "published" / "coordination")) == page
     assert set(pd.read_csv(mine / "coordination" / "runs.csv")["method"]) == {"saf", "ippo", "random"}
     (tmp_path / "published" / "coordination" / "runs.csv").write_text("a,b\n1,2\n")
     with pytest.raises(SystemExit, match="2"):

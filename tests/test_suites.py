@@ -122,6 +122,15 @@ def test_unknown_ids_name_the_nearest() -> None:
         make_team_env("lbf/Foraging-8x8-2p-3f-v3", colour=1)
 
 
+def test_an_engine_that_does_not_take_a_parameter_says_so() -> None:
+    def engine(task: str, n_envs: int, seed: int | None, *, size: int) -> None:
+        raise AssertionError
+
+    suite = Suite("x", title="", requires=(), extra="x", page="", list_tasks=list, examples=(), vec_env=engine)
+    with pytest.raises(ValueError, match=r"x/y cannot be made with \{'colour': 1\}: .* 'colour'"):
+        TeamEnvironment("x/y", None, suite, "y").count_agents({"colour": 1})
+
+
 @_needs("mpe")
 def test_competitive_games_are_said_to_be_trained_as_one_team() -> None:
     with pytest.warns(UserWarning, match="simple_tag_v3 play against each other; .* one team"):

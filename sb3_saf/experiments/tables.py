@@ -71,12 +71,14 @@ def read_results(folder: str | Path, name: str) -> Frames:
     Return the results of an experiment, complete or not.
 
     :param folder: folder of results, as in ``python -m sb3_saf.experiments run NAME -f FOLDER``; or one that has only
-        ``NAME/runs.csv`` and ``NAME/curves.csv``
+        ``runs.csv`` and ``curves.csv``, or a folder ``NAME`` with them
     :raises ValueError: for an unknown name, or if no cell is finished
     """
     results = Results(Path(folder))
-    if results.config() is None and (found := _published(results.folder / name)) is not None:
-        return found
+    if results.config() is None:
+        for published in (results.folder / name, results.folder):
+            if (found := _published(published)) is not None:
+                return found
     experiment = results.experiment(name)
     cells = [] if results.config() is None else requested(experiment, results).cells
     tests = frame_of_tests(results, cells)

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from typing import Any, Final
 
 import pettingzoo
+from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf.suites
 from sb3_saf.envs.gymnasium_team import as_parallel
@@ -70,12 +71,26 @@ class TeamEnvironment:
         if self.make is not None:
             game = self.make_game(params)
         elif self.suite is not None and self.suite.vec_env is not None:
-            game = self.suite.vec_env(self.task, 1, None, **params)
+            game = self.make_engine(1, None, params)
         agents = getattr(game, "possible_agents", None)
         game.close()
         if not agents:
             raise ValueError(f"expected {self.id} to list its agents in possible_agents, got {agents!r}")
         return len(agents)
+
+    def make_engine(self, n_envs: int, seed: int | None, params: Mapping[str, Any], **options: Any) -> VecEnv:
+        """
+        Make the suite's engine, which steps all games at once.
+
+        :param options: arguments of the engine that are none of the game
+        :raises ValueError: for invalid parameters
+        """
+        assert self.suite is not None and self.suite.vec_env is not None
+        try:
+            venv: VecEnv = self.suite.vec_env(self.task, n_envs, seed, **options, **params)
+        except TypeError as error:  # most often an argument that it does not have
+            raise ValueError(f"{self.id} cannot be made with {dict(params)}: {error}") from error
+        return venv
 
     def make_game(self, params: Mapping[str, Any], render_mode: str | None = None, **changes: Any) -> Any:
         """
