@@ -35,3 +35,12 @@ def test_two_kinds_of_agents_from_rules_to_replay(tmp_path: Path, capsys: pytest
     )
     assert "exported actor of packer_0: calls" in printed
     assert (tmp_path / "actor" / "actor.onnx").exists() and (tmp_path / "replay.html").exists()
+
+
+def test_connect_four_is_trained_and_played_on_both_sides(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pygame")
+    from examples import connect_four
+
+    assert -1 <= connect_four.main(["--moves", "64", "--games", "4"]) <= 1
+    of_games = r"4 games: won (\d+)% \(\d+% moving first, \d+% second\), mean reward -?\d\.\d\d\n"
+    assert re.fullmatch(f"most likely actions, {of_games}drawn actions, {of_games}", capsys.readouterr().out)
