@@ -200,7 +200,7 @@ def settings_table(tests: pd.DataFrame) -> str:
     """Return the mean return in each setting, with the smallest number of seeds."""
     body = []
     for (task, c, h), rows in tests.groupby(["task", "coordination", "heterogeneity"], sort=False):
-        means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"] != RANDOM]
+        means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"].isin(MAIN)]
         cells = [f"{means[method]:.1f}" if method in means else "" for method in (RANDOM, *MAIN)]
         body.append([f"{task}, c = {c}, h = {h}", *cells, str(trained.groupby("method")["seed"].nunique().min())])
     return table(["setting", *(WORDS[method] for method in (RANDOM, *MAIN)), "seeds"], body)
