@@ -108,9 +108,11 @@ class TeamMonitor(TeamVecEnvWrapper):
         # float64, because sums of many float32 rewards are inexact.
         self._returns += rewards.reshape(self.n_games, self.n_agents)
         self._lengths += 1
-        for row, info in enumerate(infos):
-            if info and not ended[row // self.n_agents]:
-                self._notes[row // self.n_agents].update({key: info[key] for key in self._of_episode if key in info})
+        if any(infos):  # most steps have none, and a loop over all rows takes as long as the games
+            for row, info in enumerate(infos):
+                if info and not ended[row // self.n_agents]:
+                    noted = {key: info[key] for key in self._of_episode if key in info}
+                    self._notes[row // self.n_agents].update(noted)
         if ended.any():
             infos = list(infos)
             for game in np.flatnonzero(ended).tolist():
