@@ -152,6 +152,18 @@ def test_missing_info_keyword_is_named_once(tmp_path: Path) -> None:
     assert [infos[step][0]["episode"]["episode_number"] for step in (1, 3)] == [0, 1]
 
 
+def test_what_an_agent_says_before_the_last_step_belongs_to_the_episode() -> None:
+    class Early(TeamVenv):
+        def step_wait(self) -> Any:
+            obs, rewards, dones, infos = super().step_wait()
+            if not dones.any():
+                infos[1] = {**infos[1], "score": 7}
+            return obs, rewards, dones, infos
+
+    infos = play(TeamMonitor(Early(lengths=(3,)), info_keywords=("score",)), 3)
+    assert infos[2][0]["episode"]["score"] == 7 and "score" not in infos[2][1]
+
+
 def test_nan_reward_stops_the_run() -> None:
     venv = TeamVenv(
         lengths=(9, 9), reward=lambda game, agent, step: np.nan if (game, agent, step) == (1, 2, 4) else 1.0
