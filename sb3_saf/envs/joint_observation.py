@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -276,14 +276,20 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         infos = list(infos)
         if not ended.any():
             return infos
-        rows = np.flatnonzero(ended.repeat(self.n_agents)).tolist()
-        last = self._terminal_parts([infos[row] for row in rows], np.flatnonzero(ended).tolist())
-        for index, row in enumerate(rows):
-            infos[row] = self._terminal_info(infos[row], last, index, row)
+        rows = np.flatnonzero(ended.repeat(self.n_agents))
+        last = self._terminal_parts([infos[row] for row in rows.tolist()], np.flatnonzero(ended).tolist())
+        of_games = last.keys() & {TEAM_KEY, ACTIVE_KEY}
+        by_row = [_repeated(part, self.n_agents) if key in of_games else part for key, part in last.items()]
+        is_limit_an_end = self.time_limit == "terminal"
+        for row, *entries in zip(rows.tolist(), *by_row, strict=True):
+            info = {**infos[row], TERMINAL_OBSERVATION: TerminalRow(zip(last, entries, strict=True), row)}
+            if is_limit_an_end and TRUNCATED in info:
+                info[TRUNCATED] = False
+            infos[row] = info
         return infos
 
     def _terminal_parts(self, infos: list[dict[str, Any]], games: list[int]) -> dict[str, Array]:
-        """Return the parts of the last observations of ended games, as in :meth:`_checked_parts`, and their teams."""
+        """Return the parts of the last observations of ended games: (G * N, ...), or (G, ...) if they are of a game."""
         observations: list[Any] = [info.get(TERMINAL_OBSERVATION) for info in infos]
         missing = [divmod(index, self.n_agents) for index, seen in enumerate(observations) if seen is None]
         if missing:
@@ -302,7 +308,12 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         else:
             stacked = self._stacked(observations, games, space)
         parts = self._checked_parts(stacked, "terminal observations", games)
-        return {**parts, TEAM_KEY: parts[OBS_KEY].reshape(len(games), *self.team_spaces.team.shape)}
+        return {
+            **parts,
+            TEAM_KEY: parts[OBS_KEY].reshape(len(games), *self.team_spaces.team.shape),
+            AGENT_KEY: np.tile(self._agents[: self.n_agents], len(games)),
+            EPISODE_START_KEY: (self._playing[games] == 0).reshape(-1).astype(np.int64),
+        }
 
     def _stacked(self, observations: list[Any], games: list[int], space: spaces.Space[Any]) -> Array:
         try:
@@ -315,14 +326,10 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"got {sorted(set(shapes))}; make the environment return what its space promises"
             ) from None
 
-    def _terminal_info(self, info: dict[str, Any], last: dict[str, Array], index: int, row: int) -> dict[str, Any]:
-        game, agent = divmod(index, self.n_agents)
-        entries = {key: part[game if key in (TEAM_KEY, ACTIVE_KEY) else index] for key, part in last.items()}
-        entries |= {AGENT_KEY: np.int64(agent), EPISODE_START_KEY: np.int64(self._playing.flat[row] == 0)}
-        info = {**info, TERMINAL_OBSERVATION: TerminalRow(entries, row)}
-        if self.time_limit == "terminal" and TRUNCATED in info:
-            info[TRUNCATED] = False
-        return info
+
+def _repeated(parts: Array, n_agents: int) -> Iterator[Array]:
+    """Yield the entry of each game once per agent, without copies."""
+    return (part for part in parts for _ in range(n_agents))
 
 
 class Untransposed(VecTransposeImage):

@@ -147,9 +147,13 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._lengths[game] = 0
         self._notes[game] = {}
         self.episode_count += 1
-        others = [{key: value for key, value in info.items() if key != IS_SUCCESS} for info in infos]
-        success = {IS_SUCCESS: of_episode[IS_SUCCESS]} if IS_SUCCESS in of_episode else {}
-        return [{**others[0], **success, "episode": episode}, *others[1:]]
+        copies = [dict(info) for info in infos]
+        if IS_SUCCESS in of_episode:
+            for info in copies:
+                info.pop(IS_SUCCESS, None)
+            copies[0][IS_SUCCESS] = of_episode[IS_SUCCESS]
+        copies[0]["episode"] = episode
+        return copies
 
     def _begin_file(self) -> ResultsWriter | None:
         """Create the file at the first step, so that a run that fails earlier touches no file."""

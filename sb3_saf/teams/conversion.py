@@ -166,8 +166,8 @@ def read_leaves(leaves: Sequence[Leaf], observation: Any) -> list[Array]:
 
     :raises ValueError: also for entries that the space lacks
     """
-    keys = list(dict.fromkeys(leaf.path[0] for leaf in leaves if leaf.path))
-    if keys:
+    if leaves and leaves[0].path:  # parts of a Dict or Tuple
+        keys = list(dict.fromkeys(leaf.path[0] for leaf in leaves))
         known = isinstance(observation, (Mapping, tuple, list))
         got = list(observation) if isinstance(observation, Mapping) else list(range(len(observation))) if known else []
         if not known or set(got) != set(keys):
@@ -279,8 +279,10 @@ class AgentConversion:
             array = np.moveaxis(arrays[0], -1, 0) if self.channels_last else arrays[0]
         if array.shape != self.shape:
             array = _padded(array, self.shape)
+        if array.dtype == self.dtype:
+            return array
         with np.errstate(over="ignore"):
-            return array.astype(self.dtype, copy=False)
+            return array.astype(self.dtype)
 
     def mask(self, mask: Any) -> Array:
         """

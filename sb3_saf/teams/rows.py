@@ -7,7 +7,7 @@ Letters: E games, N agents, B = E * N rows. Rows are game-major, then agent: row
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal, get_args
@@ -84,7 +84,9 @@ class TerminalRow(dict[str, Any]):
     :param row: index of the row, whose memory policies use for the value of the observation; (K,) for K observations
     """
 
-    def __init__(self, entries: Mapping[str, Any], row: int | npt.NDArray[np.int64]) -> None:
+    def __init__(
+        self, entries: Mapping[str, Any] | Iterable[tuple[str, Any]], row: int | npt.NDArray[np.int64]
+    ) -> None:
         super().__init__(entries)
         self.row = row
 

@@ -222,16 +222,16 @@ class BatchVecEnv(TeamVecEnv):
         if not dones.any():
             return infos
         last = zip(*(part[dones] for part in step.last.values()), strict=True)
-        for row in dones.nonzero()[0].tolist():
-            game, agent = divmod(row, self.n_agents)
-            observation = dict(zip(step.last, next(last), strict=True))
-            info = {TRUNCATED: bool(step.truncated[game]), TERMINAL_OBSERVATION: self._observations(observation)}
-            if step.won is not None and agent == 0:
-                info[IS_SUCCESS] = bool(step.won[game])
+        for game in step.ended.nonzero()[0].tolist():
+            of_game = {TRUNCATED: bool(step.truncated[game])}
             if self._is_short[game]:
-                info[STAGGERED] = True
-            infos[row] = info
-            self.reset_infos[row] = {}
+                of_game[STAGGERED] = True
+            for row in range(game * self.n_agents, (game + 1) * self.n_agents):
+                observation = dict(zip(step.last, next(last), strict=True))
+                infos[row] = {**of_game, TERMINAL_OBSERVATION: self._observations(observation)}
+                self.reset_infos[row] = {}
+            if step.won is not None:
+                infos[game * self.n_agents][IS_SUCCESS] = bool(step.won[game])
         return infos
 
     def close(self) -> None:
