@@ -203,7 +203,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
 def _copied(info: Mapping[str, Any], agent: Any) -> Info:
     """Copy an info."""
-    if all(type(value) in _UNCHANGING for value in info.values()):
+    if not info or all(type(value) in _UNCHANGING for value in info.values()):
         return dict(info)  # equivalent to a deep copy, and ten times faster
     try:
         return deepcopy(dict(info))

@@ -255,6 +255,8 @@ class AgentConversion:
 
     def split(self, observation: Any) -> tuple[Any, Any]:
         """Return an observation of the game without its mask, and the mask; None if it has none."""
+        if type(observation) is np.ndarray:
+            return observation, None
         key = ACTION_MASK if self.mask_key is None else self.mask_key
         if (
             not isinstance(observation, Mapping)
