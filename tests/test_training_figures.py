@@ -64,6 +64,8 @@ def test_curves_are_drawn_where_they_are() -> None:
     assert to_hex(str(lines["mappo (1 seed)"].get_color())) == method_styles(["mappo"])["mappo"].colour.lower()
     assert (axes.get_xlabel(), axes.get_title()) == ("game steps", "t")
     assert figure.get_suptitle() == "T"
+    two = draw_curves(pd.concat([table, runs(saf=[[0, 0, 1]]).assign(task="u")]), panel="task")
+    assert [text.get_text() for text in two.legends[0].get_texts()] == ["saf (1 to 2 seeds)", "mappo (1 seed)"]
 
 
 def test_bars_are_means_of_seeds_not_of_episodes() -> None:

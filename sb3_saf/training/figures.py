@@ -150,14 +150,18 @@ def draw_curves(
     """
     require_columns(runs, CURVE_COLUMNS)
     panels, methods = _panels(runs, panel), _methods_of(runs)
-    styles = method_styles(methods)
+    styles, labels = method_styles(methods), {}
+    for method in methods:
+        counts = [rows[rows["method"] == method]["seed"].nunique() for _, rows in panels]
+        fewest, most = min(n for n in counts if n), max(counts)
+        seeds = f"{most} seed{'s' * (most > 1)}" if fewest == most else f"{fewest} to {most} seeds"
+        labels[method] = f"{(names or {}).get(method, method)} ({seeds})"
     figure, all_axes = _figure(len(panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
         for method in [method for method in methods if (rows["method"] == method).any()]:
-            of_method, style = rows[rows["method"] == method], styles[method]
-            curve, n_seeds = learning_curve(of_method), of_method["seed"].nunique()
+            of_method, style, label = rows[rows["method"] == method], styles[method], labels[method]
+            curve = learning_curve(of_method)
             marker = "o" if len(curve) == 1 else None
-            label = f"{(names or {}).get(method, method)} ({n_seeds} seed{'s' * (n_seeds > 1)})"
             steps = curve["game_steps"]
             ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
             ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
