@@ -16,10 +16,9 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, RandomPolicy, SAFPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.teams.rows import TeamSpaces
 from tests.team_venv import Array
-from tests.toy_envs import CounterEnv, DictEnv, LateEnv, TellingEnv
+from tests.toy_envs import CounterEnv, DictEnv, TellingEnv
 
 N_AGENTS, N_ACTIONS = 3, 4
 #: Agent 0 is active for steps 1 to 3, agent 1 from the observation after step 2, agent 2 until a time limit.
@@ -94,15 +93,6 @@ def test_whoever_ends_with_the_last_step_is_not_active_after_it() -> None:
     assert [info["terminal_observation"]["active"].tolist() for info in infos] == [[0, 1, 1]] * 3
 
 
-def test_agents_that_join_in_an_environment_without_masks() -> None:
-    env = make_team_env(LateEnv, seed=0, n_agents=2)
-    obs: Any = env.reset()
-    assert set(obs) == {"obs", "team", "agent", "episode_start", "active"}
-    assert obs["active"].tolist() == [[1, 0]] * 2
-    obs, *_ = env.step(np.zeros(2, dtype=int))
-    assert obs["active"].tolist() == [[1, 1]] * 2
-
-
 def test_nothing_is_told_that_is_not_there_or_not_wanted() -> None:
     names = {"obs", "team", "agent", "episode_start"}
     small: dict[str, Any] = {"n_agents": 2, "grid_size": 10, "n_treasures": 5, "view_size": 5}
@@ -132,8 +122,6 @@ def policy_of(kind: Any, n_actions: int = 4, state: Any = None, **kwargs: Any) -
         ),
         (lambda: make_team_env(DictEnv, action_masks=True), r"got Box\(.*pass action_masks=False"),
         (lambda: telling_env(stuck=0).reset(), "legal action .* at step 0 for agent 0 of game 0"),
-        (lambda: make_team_env("TeamTogether", state=True), "state=True needs"),
-        (lambda: make_team_env("TeamTogether", active=True), "active=True"),
         (lambda: rows_with(active=spaces.Discrete(3)), r"'active' .*Discrete\(2\), got Discrete\(3\)"),
         (
             lambda: rows_with(action_mask=spaces.MultiBinary(3)),
@@ -275,15 +263,6 @@ def test_minibatches_leave_out_who_takes_no_part_and_keep_the_rest() -> None:
     }
 
 
-def test_states_are_stored_once_per_game() -> None:
-    env = telling_env()
-    team, stock = make_buffer(env, 8), make_buffer(env, 8, DictRolloutBuffer)
-    fill([team], env, 8, zero_values=True)
-    assert team.states.shape == (8, 2, 2)
-    assert team.active.shape == (8, 2, N_AGENTS)
-    assert team.nbytes < sum(array.nbytes for array in stock.observations.values()) + 7 * stock.values.nbytes
-
-
 def test_minibatches_without_anybody_are_skipped() -> None:
     class Nobody(CentralizedValueWrapper):
         """All agents of game 0 are inactive."""
@@ -422,18 +401,6 @@ def test_other_actors_keep_to_legal_actions_with_finite_gradients(kwargs: dict[s
     gradients = [p.grad for p in policy.actor.parameters() if p.grad is not None]
     assert gradients
     assert all(gradient.isfinite().all() for gradient in gradients)
-
-
-def test_a_mask_that_allows_everything_changes_nothing() -> None:
-    logits = th.randn(5, 4)
-    assert th.equal(masked_parameters(spaces.Discrete(4), logits, th.ones(5, 4, dtype=th.bool)), logits)
-    policy = make_policy(SAFPolicy)
-    obs = random_rows()
-    obs["action_mask"][:] = 1
-    parameters = policy.actor(policy.extract_features(obs))
-    unmasked = policy.actor.distribution(parameters)
-    masked = policy.get_distribution(obs)
-    th.testing.assert_close(cast(Any, masked.distribution).logits, cast(Any, unmasked.distribution).logits)
 
 
 def test_predict_needs_the_mask_and_at_least_one_legal_action() -> None:

@@ -9,9 +9,8 @@ import numpy.typing as npt
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
 
-from sb3_saf import CentralizedValueWrapper, TeamRolloutBuffer, evaluate_team, game_seeds, make_team_env
+from sb3_saf import CentralizedValueWrapper, game_seeds, make_team_env
 from sb3_saf.checkpoints.states import environment_state, load_environment_state
 from sb3_saf.inspection.recording import picture
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
@@ -327,17 +326,6 @@ def test_agents_of_vmas_with_other_spaces() -> None:
         make_team_env("vmas/balance", colour=1)
     with pytest.raises(ValueError, match="vmas/balance tells no state"):
         make_team_env("vmas/balance", state=True)
-
-
-@needs_vmas
-@pytest.mark.parametrize("continuous", [True, False])
-def test_a_team_of_robots_is_trained_and_evaluated(continuous: bool) -> None:
-    env: CentralizedValueWrapper = make_team_env(
-        "vmas/balance", n_envs=4, seed=0, max_steps=8, continuous_actions=continuous
-    )
-    model = PPO("SAFPolicy", env, n_steps=8, batch_size=48, rollout_buffer_class=TeamRolloutBuffer, seed=0)
-    model.learn(192)
-    assert max(evaluate_team(model, env, 4).lengths) <= 8
 
 
 STAGGERED = [

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -73,64 +74,27 @@ def test_rows_of_two_games_with_three_agents() -> None:
     ],
     ids=lambda value: None if callable(value) else str(value),
 )
-class TestEverySpace:
-    def test_rows_lie_in_the_space(self, own_space: spaces.Space[Any], see: Any) -> None:
-        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
-        env.reset()
-        for _ in range(4):
-            obs, _, dones, infos = env.step(still(env))
-            assert isinstance(obs, dict)
-            rows = [{key: part[row] for key, part in obs.items()} for row in range(6)]
-            rows += [infos[row]["terminal_observation"] for row in np.flatnonzero(dones)]
-            for row in rows:
-                assert isinstance(env.observation_space, spaces.Dict)
-                assert row.keys() == env.observation_space.spaces.keys()
-                for key, space in env.observation_space.spaces.items():
-                    assert space.contains(row[key]), key
-                    assert np.asarray(row[key]).dtype == space.dtype
-                np.testing.assert_array_equal(row["team"][row["agent"]], row["obs"])
-
-    def test_nothing_that_was_returned_changes_later(self, own_space: spaces.Space[Any], see: Any) -> None:
-        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
-        obs = env.reset()
-        before = {key: part.copy() for key, part in obs.items()}
-        step = env.step(still(env))
-        assert isinstance(step[0], dict)
-        step_before = {key: part.copy() for key, part in step[0].items()}
-        rewards, dones = step[1].copy(), step[2].copy()
-        env.step(still(env))
-        for key in before:
-            np.testing.assert_array_equal(before[key], obs[key])
-            np.testing.assert_array_equal(step_before[key], step[0][key])
-        np.testing.assert_array_equal(rewards, step[1])
-        np.testing.assert_array_equal(dones, step[2])
-
-    def test_sb3_takes_the_rows_as_they_are(self, own_space: spaces.Space[Any], see: Any) -> None:
-        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
-        assert PPO._wrap_env(env) is env
-
-    def test_parts_are_found_again(self, own_space: spaces.Space[Any], see: Any) -> None:
-        env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
-        parts = TeamSpaces.from_observation_space(env.observation_space)
-        assert parts == env.team_spaces
-        assert parts.n_agents == 3
-        assert parts.own_shape == parts.own.shape
-
-
-@pytest.mark.parametrize(
-    ("own", "low", "high"),
-    [
-        (spaces.Discrete(4, start=3), 3, 6),
-        (spaces.MultiDiscrete([2, 5], start=[1, -1]), [1, -1], [2, 3]),
-        (spaces.MultiBinary(2), [0, 0], [1, 1]),
-        (spaces.Box(np.array([-1, 0], np.float32), np.array([1, 9], np.float32)), [-1, 0], [1, 9]),
-    ],
-    ids=lambda value: None if callable(value) else str(value),
-)
-def test_bounds_of_a_team_are_those_of_its_agents(own: spaces.Space[Any], low: Any, high: Any) -> None:
-    team = TeamSpaces(own, 3).team
-    assert team.low.tolist() == [low] * 3
-    assert team.high.tolist() == [high] * 3
+def test_rows_lie_in_the_space_and_do_not_change_later(own_space: spaces.Space[Any], see: Any) -> None:
+    env = CentralizedValueWrapper(TeamVenv(own_space=own_space, see=see))
+    assert PPO._wrap_env(env) is env, "SB3 takes the rows as they are"
+    parts = TeamSpaces.from_observation_space(env.observation_space)
+    assert parts == env.team_spaces and parts.n_agents == 3
+    assert isinstance(env.observation_space, spaces.Dict)
+    returned: list[Any] = [(env.reset(), None, None, [])]
+    copies = copy.deepcopy(returned)
+    for _ in range(4):
+        returned.append(env.step(still(env)))
+        copies.append(copy.deepcopy(returned[-1]))
+    np.testing.assert_equal(returned, copies)
+    for obs, _, dones, infos in returned[1:]:
+        rows = [{key: part[row] for key, part in obs.items()} for row in range(6)]
+        rows += [infos[row]["terminal_observation"] for row in np.flatnonzero(dones)]
+        for row in rows:
+            assert row.keys() == env.observation_space.spaces.keys()
+            for key, space in env.observation_space.spaces.items():
+                assert space.contains(row[key]), key
+                assert np.asarray(row[key]).dtype == space.dtype
+            np.testing.assert_array_equal(row["team"][row["agent"]], row["obs"])
 
 
 def test_what_a_caller_writes_does_not_come_back() -> None:
@@ -168,11 +132,6 @@ def test_images_that_sb3_would_transpose_twice() -> None:
     assert PPO._wrap_env(env) is env
 
 
-def test_channel_first_images_stay() -> None:
-    venv = TeamVenv(own_space=spaces.Box(0, 255, (3, 9, 8), np.uint8), see=bytes_of((3, 9, 8)))
-    np.testing.assert_array_equal(CentralizedValueWrapper(venv).reset()["obs"][5], bytes_of((3, 9, 8))(1, 2, 0, 0))
-
-
 def test_codes_are_no_image_even_if_they_look_like_one() -> None:
     see = bytes_of((9, 8, 3))
     env = CentralizedValueWrapper(TeamVenv(own_space=AtlasSpace((9, 8, 3), 256), see=see))
@@ -181,7 +140,7 @@ def test_codes_are_no_image_even_if_they_look_like_one() -> None:
 
 
 def test_terminal_observation_is_the_rows_own_dict() -> None:
-    venv = TeamVenv(lengths=(3, 2))
+    venv = TeamVenv(lengths=(3, 2, 2))
     env = CentralizedValueWrapper(venv)
     env.reset()
     env.step(still(env))
@@ -194,6 +153,7 @@ def test_terminal_observation_is_the_rows_own_dict() -> None:
         assert row["team"].tolist() == last
         assert row["agent"] == agent
         assert "terminal_observation" not in infos[agent]
+        assert infos[6 + agent]["terminal_observation"]["obs"].tolist() == [2, agent, 0, 2], "game 2 ends, too"
     assert isinstance(obs, dict)
     assert obs["obs"][3].tolist() == [1, 0, 1, 0], "the next episode has begun"
     # The environment's infos are not changed.
@@ -267,14 +227,8 @@ def test_team_size_is_seen_through_further_wrappers() -> None:
         assert (layer.n_agents, layer.n_games) == (3, 3)  # type: ignore[attr-defined]
         assert layer.has_attr("n_agents")
         assert layer.get_attr("n_agents", [0, 1]) == [3, 3]
-
-
-def test_team_size_that_only_the_wrapper_knows() -> None:
-    venv = TeamVenv(n_agents=3, tell_size=False)
-    env = CentralizedValueWrapper(venv, n_agents=2)
-    assert (env.n_agents, env.n_games) == (2, 3)
-    assert env.get_attr("n_agents") == [2] * 6
-    assert VecNormalize(env, norm_obs=False).get_attr("n_games") == [3] * 6
+    told = VecNormalize(CentralizedValueWrapper(TeamVenv(tell_size=False), n_agents=2), norm_obs=False)
+    assert told.get_attr("n_agents") == [2] * 6 and told.get_attr("n_games") == [3] * 6
 
 
 def team_space(team: tuple[int, ...] = (3, 4), agent: Any = None) -> spaces.Dict:
@@ -359,17 +313,7 @@ def test_silent_garbage_is_not_passed_on(fault: Callable[[Broken], None], messag
         step_twice(env)
 
 
-def test_games_that_end_together_have_their_own_last_observations() -> None:
-    env = CentralizedValueWrapper(TeamVenv(lengths=(3, 2, 2)))
-    env.reset()
-    env.step(still(env))
-    *_, infos = env.step(still(env))
-    for row in range(3, 9):
-        last = infos[row]["terminal_observation"]
-        np.testing.assert_array_equal(last["obs"], see_where(*divmod(row, 3), 0, 2))
-        np.testing.assert_array_equal(last["team"], [see_where(row // 3, i, 0, 2) for i in range(3)])
-        assert last["agent"] == row % 3 and "terminal_observation" not in infos[row % 3]
-
+def test_last_observations_of_games_that_end_together_are_checked_apart() -> None:
     def short_in_game_2(venv: Broken) -> None:
         for info in venv.infos[6:]:
             info["terminal_observation"] = np.zeros(3, dtype=np.float32)

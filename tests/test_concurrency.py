@@ -17,7 +17,6 @@ import numpy as np
 import psutil
 import pytest
 import torch as th
-from stable_baselines3 import PPO
 
 import sb3_saf
 from sb3_saf import make_vec_env
@@ -131,15 +130,3 @@ def test_numbers_of_threads_that_change_in_between(make: Callable[[int], Any]) -
         th.set_num_threads(before[0])
         numba.set_num_threads(before[1])
         venv.close()
-
-
-def test_models_trained_in_turn_are_as_if_each_were_alone() -> None:
-    def trained(policy: str) -> list[bytes]:
-        env = sb3_saf.make_team_env(LazyEnv, 2, seed=0)
-        settings: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
-        model = PPO(policy, env, seed=0, rollout_buffer_class=sb3_saf.TeamRolloutBuffer, **settings).learn(64)
-        env.close()
-        return [tensor.numpy().tobytes() for tensor in model.policy.state_dict().values()]
-
-    alone = {policy: trained(policy) for policy in ("SAFPolicy", "MAPPOPolicy")}
-    assert {policy: trained(policy) for policy in ("MAPPOPolicy", "SAFPolicy")} == alone

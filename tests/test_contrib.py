@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
-from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_saf
-from sb3_saf import make_team_env
 from sb3_saf.networks.actor import PolicyPool
 from sb3_saf.networks.distributions import distribution_of, masked_parameters
 from sb3_saf.networks.mixtures import mixture_of
@@ -24,9 +21,8 @@ from sb3_saf.policies.base import TeamMaskablePolicy
 from sb3_saf.registration import DECLARATIONS
 from tests import test_policies
 from tests.contrib_teams import MaskedTeams, choices_of, is_allowed, random_masks
-from tests.test_policies import ACTIONS, SMALL, SMALL_SAF, VARIANTS, equal_weights
-from tests.toy_envs import CounterEnv
-from tests.toy_teams import VECTOR, ToyTeams, team_rows, to_numpy
+from tests.test_policies import ACTIONS, SMALL, SMALL_SAF, VARIANTS
+from tests.toy_teams import VECTOR, ToyTeams, team_rows
 
 #: All algorithms declared for MaskablePPO.
 FAMILIES = sorted(one.name for one in DECLARATIONS if MaskablePPO in one.policies)
@@ -95,24 +91,6 @@ def test_every_weight_is_trained(name: str, action: str) -> None:
     model.learn(96)
     assert unchanged(before, model.policy) == set()
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-
-
-@pytest.mark.parametrize("kind", ALGORITHMS)
-def test_model_saves_loads_and_continues(kind: str, tmp_path: Path) -> None:
-    name = f"SAF{kind}Policy"
-    kwargs = {"n_policies": 3, "critic_input": "team", "chunk_size": 7, "normalize_images": False}
-    model = make_model(name, policy_kwargs=kwargs).learn(96)
-    model.save(tmp_path / "model")
-    loaded: Any = ALGORITHMS[kind].load(tmp_path / "model", env=make_venv(name), device="cpu")
-    assert type(loaded.policy) is type(model.policy)
-    assert (loaded.policy.parts, loaded.policy.chunk_size) == (model.policy.parts, 7)
-    assert loaded.policy.normalize_images is False
-    assert equal_weights(model.policy, loaded.policy)
-    obs = to_numpy(team_rows(VECTOR))
-    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
-    loaded.learn(96, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 192
-    assert not equal_weights(model.policy, loaded.policy)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -249,22 +227,6 @@ def test_masked_mixture_against_enumeration(action: str) -> None:
 
 
 @pytest.mark.parametrize("action", MASKABLE)
-@pytest.mark.parametrize("kwargs", [{}, {"selection": "gumbel"}, {"n_policies": 1}])
-def test_forbidden_actions_are_never_taken(action: str, kwargs: dict[str, Any]) -> None:
-    space = ACTIONS[action]
-    policy = make_policy("SAFMaskablePolicy", space, **kwargs)
-    obs, masks = to_numpy(team_rows(VECTOR, n_games=400)), random_masks(space, 1200, np.random.default_rng(0))
-    assert not is_allowed(space, policy.predict(obs)[0], masks).all()
-    for deterministic in (False, True):
-        actions, _ = policy.predict(obs, deterministic=deterministic, action_masks=masks)
-        assert is_allowed(space, actions, masks).all()
-        plain, _ = policy.predict(obs["obs"], deterministic=deterministic, action_masks=masks)
-        assert is_allowed(space, plain, masks).all()
-    one, _ = policy.predict(obs["obs"][3], action_masks=masks[3])
-    assert is_allowed(space, one, masks[3:4]).all()
-
-
-@pytest.mark.parametrize("action", MASKABLE)
 def test_training_keeps_to_the_masks_and_sees_the_likelihoods_of_the_rollout(action: str) -> None:
     venv = MaskedTeams(ACTIONS[action])
     model = make_model("SAFMaskablePolicy", venv, n_epochs=1, learning_rate=0.0, policy_kwargs={"ortho_init": False})
@@ -318,20 +280,6 @@ def test_masked_actions_depend_on_own_observation_and_own_mask_only(policy_class
     kept = policy.evaluate_actions(obs, outcomes[0][0], other_masks)[1]
     assert th.equal(kept[7], outcomes[0][1][7])
     assert not th.equal(kept, outcomes[0][1])
-
-
-def test_masks_reach_the_algorithm_through_every_wrapper() -> None:
-    # CounterEnv: agent i may do i only.
-    env = make_team_env(CounterEnv, n_envs=2)
-    env.reset()
-    assert is_masking_supported(env)
-    np.testing.assert_array_equal(get_action_masks(env), np.tile(np.eye(2, 4, dtype=bool), (2, 1)))
-    model = MaskablePPO(
-        "SAFMaskablePolicy", env, n_steps=4, batch_size=16, n_epochs=1, policy_kwargs=sizes_of("SAF"), device="cpu"
-    )
-    model.learn(16)
-    np.testing.assert_array_equal(model.rollout_buffer.actions.reshape(-1), model.rollout_buffer.action_masks.argmax(1))
-    assert env.get_attr("last_actions")[0] == {"agent_0": 0, "agent_1": 1}
 
 
 def test_malformed_masks_are_refused() -> None:

@@ -45,12 +45,6 @@ def test_paper_cnn_has_the_papers_size() -> None:
     assert encoder(th.zeros(2, 3, 28, 28, dtype=th.uint8)).shape == (2, 64)
 
 
-@pytest.mark.parametrize("shape", [(3, 8, 8), (1, 30, 17), (4, 64, 48), (28, 28, 3), (8, 9, 1)])
-def test_paper_cnn_infers_sizes(shape: tuple[int, ...]) -> None:
-    space = spaces.Box(0, 255, shape, np.uint8)
-    assert PaperCNN(space, features_dim=7)(th.tensor(samples(space, 3))).shape == (3, 7)
-
-
 def n_weights(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
@@ -188,19 +182,14 @@ SHARES = partial(spaces.Box, 0.0, 1.0, dtype=np.float32)
     ("space", "expected"),
     [
         (PICTURE, PaperCNN),
-        (CodeSpace(), PaperCNN),
         (spaces.Box(0, 255, (84, 84), np.uint8), NatureEncoder),
-        (spaces.Box(0, 255, (28, 28), np.uint8), PaperCNN),
         (spaces.Box(0, 255, (40, 40, 3), np.float32), PaperCNN),
-        (spaces.Box(0, 255, (84, 84), np.int64), NatureEncoder),
         (SHARES((4, 84, 84)), NatureEncoder),
         (SHARES((16, 20)), PaperCNN),
         (SHARES((10, 8)), MLPEncoder),  # rather ten things with eight properties
         (spaces.Box(0, 255, (7, 7), np.uint8), MLPEncoder),
         (spaces.Box(0, 30, (20, 20, 3), np.float32), MLPEncoder),
-        (spaces.Box(0, 1, (20, 20), np.int8), MLPEncoder),
         (spaces.Box(0, 255, (9,), np.uint8), MLPEncoder),
-        (spaces.Discrete(2), MLPEncoder),
     ],
 )
 def test_default_encoder_is_chosen_by_space(space: spaces.Space[Any], expected: type) -> None:

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, Level, View, find_experiment, own_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, find_experiment, own_experiment
 from sb3_saf.experiments.grid import RunConfig, Selection, expand
-from sb3_saf.experiments.page import Content, known, losses, means
+from sb3_saf.experiments.page import Content, known, losses
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.experiments.tables import Frames, complete, marl_eval, read_results
@@ -171,13 +171,6 @@ def test_commits_that_differ_are_in_the_warning(folder: Path, page: str, tmp_pat
     assert "**Cells differ in commit.**" in report(part, "--tasks", "TeamSupport", "--levels", "1")
 
 
-def test_names_of_users_do_not_format_the_page(tmp_path: Path) -> None:
-    rows = [("sa|f", seed, "a|b <i>*x*") for seed in (0, 1)]
-    table = pd.DataFrame(rows, columns=["method", "seed", "task"]).assign(return_mean=1.0, level="default")
-    text = means(table.assign(train_level="default"), View("", (Level(),)))
-    assert r"| a\|b \<i\>\*x\* | default | seeds |" in text and r"| sa\|f | 1.00 " in text
-
-
 def test_a_killed_report_leaves_the_old_one(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = shutil.copytree(folder, tmp_path / "part")
     words = ("--tasks", "TeamSupport", "--levels", "1")
@@ -262,23 +255,6 @@ def test_results_stand_beside_what_is_known_of_the_same_games(tmp_path: Path) ->
     text = known(Content(experiment, config, results, cells, [], [], frames, []))
     line = "TeamSupport, c=2, h=1, SAF: return, sum over agents: 17; random 1.38; script that sees 7 x 7 tiles 17.03"
     assert [part[2:] for part in text.splitlines()[2:]] == [line]
-
-
-def test_another_experiment_runs_and_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With one method and one seed there is no spread, so the page leaves intervals out."""
-    monkeypatch.chdir(tmp_path)
-    name, results = "ood-ablation", Path("runs", "experiments", "smoke")
-    selection = Selection((0,), ("ippo",), ("TeamSupport-v0",))
-    config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80}, 16, 40, 2)
-    run(find_experiment(name), selection, config, Results(results), InlineEngine())
-    assert cli.main(["report", name, "--size", "smoke"]) == 0
-    page = (results / name / "report.md").read_text(encoding="utf-8")
-    charts = {path.name for path in (results / name).glob("levels-*.png")}
-    assert charts == {f"levels-{view.axis.replace(' = ', '-')}.png" for view in EXPERIMENTS[name].views}
-    for view in EXPERIMENTS[name].views:
-        assert f"## Team return by {view.axis}{view.suffix}" in page
-    assert "nan" not in page and "inf" not in page
-    assert "--hyperparams n_epochs:1" in page and "--game-steps 80" in page
 
 
 def test_an_environment_of_ones_own(

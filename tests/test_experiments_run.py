@@ -366,21 +366,14 @@ def with_last_return(path: Path, value: float) -> list[dict[str, Any]]:
 
 DAMAGE: dict[str, Any] = {
     "model.zip cut": ("model.zip", cut),
-    "model.zip missing": ("model.zip", Path.unlink),
     "curve.csv cut": ("curve.csv", cut),
-    "curve.csv missing": ("curve.csv", Path.unlink),
-    "best_model.zip missing": ("best_model.zip", Path.unlink),
     "evaluations.csv cut": ("evaluations.csv", cut),
     "run.json edited": ("run.json", edited(seed=5)),
-    "run.json missing": ("run.json", Path.unlink),
     "finished.json empty": ("finished.json", write("")),
-    "finished.json a list": ("finished.json", write("[]")),
     "finished.json nested": ("finished.json", write("[" * 100_000)),
     "finished.json missing": ("finished.json", Path.unlink),
     "mean edited": ("tests/c2-h2.json", edited(return_mean=99.0)),
-    "returns missing": ("tests/c2-h2.json", edited(plays=[])),
     "returns not finite": ("tests/c2-h2.json", relisted),
-    "no JSON": ("tests/c2-h2.json", write("\x00")),
     "test missing": ("tests/c2-h2.json", Path.unlink),
 }
 

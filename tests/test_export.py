@@ -178,13 +178,6 @@ def test_draws_as_the_model_does(name: str, exports: Callable[[str], Exported]) 
     np.testing.assert_allclose(found.std(axis=0), expected.std(axis=0), rtol=0.15, atol=0.05)
 
 
-def test_pictures_may_come_with_channels_last(exports: Callable[[str], Exported]) -> None:
-    actor, obs = exports("pool with identity, pictures").actor, samples(PICTURE, 20)
-    last = np.moveaxis(obs, 1, -1)
-    np.testing.assert_array_equal(actor.act(last), actor.act(obs))
-    np.testing.assert_array_equal(actor.act(last[0]), actor.act(obs[0]))
-
-
 def test_an_actor_of_tile_codes_takes_pixels(exports: Callable[[str], Exported]) -> None:
     actor, space = exports("pool, codes").actor, CodeSpace()
     codes = samples(space, 10)
@@ -452,12 +445,10 @@ def test_an_agent_that_matters_must_be_named(exports: Callable[[str], Exported])
     ("name", "observation", "message"),
     [
         ("own encoder", np.zeros(4), r"observation of shape \(4,\)"),
-        ("own encoder", np.zeros((2, 2, 5)), r"observation of shape \(2, 2, 5\)"),
         ("own encoder", [np.nan] * 5, "observation has NaN"),
         ("own encoder", ["a"] * 5, "observation of float32.* does not fit"),
         ("pool, codes", np.full((3, 3), 20), "observation of at least 0 and below 20"),
         ("pool, codes", np.full((3, 3), -1), "observation of uint8.* does not fit"),
-        ("pool, codes", np.full((3, 3), 0.5), "observation of uint8.* does not fit"),
         ("shared, choices", 5, "observation of at least 0 and below 5"),
     ],
 )

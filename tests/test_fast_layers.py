@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.distributions import LeanCategorical
-from sb3_saf.networks.layers import mlp, side_by_side
+from sb3_saf.networks.layers import mlp
 from sb3_saf.networks.tanh import Tanh
 from sb3_saf.teams.errors import NonFiniteError
 
@@ -47,25 +47,6 @@ def test_the_tanh_can_be_differentiated_twice() -> None:
     th.testing.assert_close(second, -2 * y * (1 - y**2), rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize("hidden", [[], [8], [8, 9]])
-@pytest.mark.parametrize("n_outputs", [3, 20])
-def test_mlps_side_by_side_are_those_mlps(hidden: list[int], n_outputs: int) -> None:
-    one = [mlp([6, 4, 2], nn.Tanh)]
-    group = [mlp([6, *hidden, n_outputs], nn.Tanh) for _ in range(4)]
-    x = th.randn(11, 6)
-
-    def apart(x: th.Tensor) -> th.Tensor:
-        return th.cat([one[0](x), *(net(x) for net in group)], dim=1)
-
-    def together(x: th.Tensor) -> th.Tensor:
-        (alone,), outputs = side_by_side([one, group], x)
-        assert outputs.shape == (4, 11, n_outputs)
-        return th.cat([alone, *outputs], dim=1)
-
-    for found, expected in zip(gradients(together, x), gradients(apart, x), strict=True):
-        th.testing.assert_close(found, expected, rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("queries", [th.randn(9, 5, 16), th.randn(3, 16)], ids=["of each group", "the same for all"])
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("of_weights", [False, True])
@@ -88,16 +69,6 @@ def test_compiled_attention_is_attention(queries: th.Tensor, masked: bool, of_we
         th.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-5)
     if active is not None:
         assert not found[0][2].any()
-
-
-@pytest.mark.parametrize("shape", [(1, 5), (400, 2), (48, 33)])
-def test_actions_are_those_of_multinomial(shape: tuple[int, int]) -> None:
-    distribution = LeanCategorical(shape[1]).proba_distribution(3 * th.randn(shape))
-    th.manual_seed(1)
-    found = distribution.sample(), th.rand(1)
-    th.manual_seed(1)
-    expected = th.multinomial(distribution.log_probs.exp(), 1, True).squeeze(1), th.rand(1)
-    assert th.equal(found[0], expected[0]) and th.equal(found[1], expected[1])
 
 
 def test_nan_probabilities_are_refused() -> None:

@@ -161,19 +161,3 @@ def test_evaluation_on_the_games_of_training_is_refused(backend: Any) -> None:
     with pytest.raises(ValueError, match=r"got 2 with seeds of training games.*another one"):
         ppo(games(seed=7), seed=5).learn(ROLLOUT, evaluations[0])
     ppo(games(seed=5), seed=7).learn(ROLLOUT, evaluations[1])
-
-
-def test_another_number_of_agents_is_found() -> None:
-    model = ppo()
-    with pytest.raises(ValueError, match="Observation spaces do not match"):
-        model.set_env(sb3_saf.make_team_env("TeamTogether", 2, **{**TASK, "n_agents": 3}))
-
-    class OneLess(VecEnvWrapper):
-        def reset(self) -> Any:
-            return np.asarray(self.venv.reset())[:-1]
-
-        def step_wait(self) -> Any:
-            return self.venv.step_wait()
-
-    with pytest.raises(ValueError, match=r"expected observations of shape \(6, 7, 7\).*got shape \(5, 7, 7\)"):
-        sb3_saf.CentralizedValueWrapper(OneLess(games().venv)).reset()

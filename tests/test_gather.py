@@ -33,17 +33,6 @@ def test_gather_is_indexing(shape: tuple[int, ...]) -> None:
     assert th.equal(gather_agents(of_agents, teams, agent), of_agents[teams, agent])
 
 
-@pytest.mark.usefixtures("two_threads")
-def test_the_gradient_repeats() -> None:
-    x, rows, weights = th.randn(500, 64), th.randint(0, 500, (8_000,)), th.randn(8_000, 64)
-
-    def gradient() -> th.Tensor:
-        leaf = x.clone().requires_grad_()
-        return th.autograd.grad((gather(leaf, rows) * weights).sum(), leaf)[0]
-
-    assert all(th.equal(gradient(), gradient()) for _ in range(10))
-
-
 def _trained(algorithm: type[Any], policy: str, memory: str | None = None, **kwargs: Any) -> th.Tensor:
     env = make_team_env("TeamSupport", n_envs=32, seed=0, n_agents=5, grid_size=12, n_treasures=20)
     policy_kwargs: dict[str, Any] = {"features_extractor_class": LightEncoder}

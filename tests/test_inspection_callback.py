@@ -33,9 +33,8 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.inspection.recording import EpisodeRecording, lambda_returns, record_episodes, zones_by_attribute
-from sb3_saf.inspection.scalars import calibrate, critic_scalars, message_scalars, pool_scalars
+from sb3_saf.inspection.scalars import calibrate, critic_scalars, message_scalars
 from sb3_saf.inspection.tensorboard import Line, line_of
-from sb3_saf.networks.actor import PolicyPool, PoolOutput
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.ippo import IPPOPolicy
 from sb3_saf.policies.saf import SAFPolicy
@@ -323,26 +322,7 @@ class ZonedProbe(Probe):
         return (self.bits[:, 0] > 0).astype(np.int64)
 
 
-class PoolByZone(PolicyPool):
-    """Weights 0.2 and 0.8 in zone 0, 0.9 and 0.1 in zone 1."""
-
-    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
-        weights = th.tensor([[0.2, 0.8], [0.9, 0.1]])[(features[:, 0] > 0).long()]
-        return PoolOutput(weights.log(), super().evaluate(features).actions)
-
-
 class TestZones:
-    @pytest.mark.parametrize("zones", [None, False])
-    def test_a_pool_with_known_choices_gives_the_known_table(self, zones: Any) -> None:
-        env = make_team_env(ZonedProbe(length=2), n_envs=16)
-        policy = hand_made(SAFPolicy, env, n_policies=2)
-        policy.actor.__class__ = PoolByZone
-        scalars = pool_scalars(play(env, policy, 32, zones), env.action_space)
-        by_zone = {tag: value for tag, value in scalars.items() if tag.startswith("pool_by_zone")}
-        shares = zip([(zone, head) for zone in (0, 1) for head in (0, 1)], (0.2, 0.8, 0.9, 0.1), strict=True)
-        table = {f"pool_by_zone/zone_{zone}/policy_{head}": share for (zone, head), share in shares}
-        assert by_zone == pytest.approx({} if zones is False else table)
-
     def test_hecogrids_zones_are_those_of_the_agents_columns(self) -> None:
         env = make_team_env("TeamTogether", n_envs=5, seed=0, n_agents=4, grid_size=12, heterogeneity=3, n_treasures=4)
         env.reset()

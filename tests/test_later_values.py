@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
-from sb3_saf.buffers.later import LaterValues, compute_together
+from sb3_saf.buffers.later import LaterValues
 from tests.toy_envs import LateEnv
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 
@@ -67,21 +67,3 @@ def test_values_of_many_steps_are_those_of_each(policy: str, game: str, normaliz
     active = expected != 0  # the buffer's values of other rows are those of the wait until the agent acts again
     np.testing.assert_allclose(values[active], expected[active], rtol=1e-5, atol=1e-5)
     assert np.ptp(values[active]) > 1e-3
-
-
-def test_who_uses_them_has_them_computed_once() -> None:
-    asked: list[int] = []
-
-    def compute(steps: Any) -> list[th.Tensor]:
-        asked.append(len(steps))
-        return [th.full((3, 1), step) for step in steps]
-
-    steps: Any = (1.0, 2.0, 3.0)
-    one, other, third = (LaterValues.of(step, th.zeros(3), compute) for step in steps)
-    assert one.shape == (3, 1) and asked in ([], [1])
-    assert (one + one).tolist() == [[2.0]] * 3
-    assert th.cat([one, one]).sum() == 6.0
-    assert asked == [1]
-    assert [float(values.mean()) for values in compute_together([one, other, third])] == [1.0, 2.0, 3.0]
-    assert other.numpy().tolist() == [[2.0]] * 3
-    assert asked == [1, 2]

@@ -93,15 +93,6 @@ def test_hecogrid_through_supersuit_has_the_games_state_and_signals() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("env", ["TeamTogether", CounterEnv])
-def test_a_step_that_nobody_started(env: Any) -> None:
-    venv = make_team_env(env)
-    venv.reset()
-    venv.step(np.zeros(venv.num_envs, dtype=int))
-    with pytest.raises(RuntimeError, match=r"no step has been started: call step_async\(actions\) before step_wait"):
-        venv.step_wait()
-
-
 def test_staggered_games_end_at_different_times_and_play_whole_episodes_then() -> None:
     env = make_team_env(
         "TeamSupport", n_envs=5, seed=0, stagger=True, n_agents=2, grid_size=8, n_treasures=2, max_cycles=10

@@ -316,24 +316,6 @@ def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tm
     assert np.isfinite(recorded.values).all()
 
 
-def test_games_in_other_processes_are_trained_alike() -> None:
-    found = []
-    for n_cpus in (1, 2):
-        env = make_team_env(DyingGame, 4, seed=0, n_cpus=n_cpus)
-        found.append(weights(make_model(env=env).learn(32 * env.num_envs)))
-        env.close()
-    assert equal(*found)
-
-
-def test_saves_loads_and_continues(tmp_path: Any) -> None:
-    model = make_model("SAFPolicy", "lstm", policy_kwargs={"critic_memory": False}).learn(16 * 9)
-    model.save(tmp_path / "model")
-    loaded: Any = PPO.load(tmp_path / "model", env=make_env(), device="cpu")
-    assert (loaded.policy.memory, loaded.policy.memory_size, loaded.policy.critic_memory) == ("lstm", 8, False)
-    assert equal(weights(model), weights(loaded))
-    loaded.learn(16 * 9)
-
-
 # --- learning ---------------------------------------------------------------------------------------------------------
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO
@@ -164,39 +163,11 @@ def test_what_an_agent_says_before_the_last_step_belongs_to_the_episode() -> Non
     assert infos[2][0]["episode"]["score"] == 7 and "score" not in infos[2][1]
 
 
-def test_nan_reward_stops_the_run() -> None:
-    venv = TeamVenv(
-        lengths=(9, 9), reward=lambda game, agent, step: np.nan if (game, agent, step) == (1, 2, 4) else 1.0
-    )
-    with pytest.raises(ValueError, match="rewards must be finite, got nan at step 4 for agent 2 of game 1"):
-        play(TeamMonitor(venv), 5)
-
-
-def test_done_must_hold_for_the_whole_team() -> None:
-    venv = TeamVenv(lengths=(9, 9))
-    env = TeamMonitor(venv)
-    env.reset()
-    env.step_async(still(env))
-    step = venv.step_wait()
-    step[2][4] = 1
-    venv.step_wait = lambda: step  # type: ignore[method-assign]
-    with pytest.raises(ValueError, match=r"got \[False, True, False\] for the agents of game 1"):
-        env.step_wait()
-
-
 def test_team_size_can_be_told() -> None:
     venv = TeamVenv(lengths=(2, 2), n_agents=3, tell_size=False)
     assert TeamMonitor(venv, n_agents=2).n_games == 3
     with pytest.raises(ValueError, match="expected a VecEnv of flattened teams that states its team size"):
         TeamMonitor(venv)
-
-
-def test_sb3_logs_team_episodes() -> None:
-    env = CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(3, 2))))
-    model = PPO("MultiInputPolicy", env, n_steps=6, batch_size=36, n_epochs=1, device="cpu").learn(36)
-    assert model.ep_info_buffer is not None
-    returns = [episode["r"] for episode in model.ep_info_buffer]
-    assert returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0] * 2 + [RETURN_OF_GAME_1]
 
 
 def test_sb3_alone_counts_every_agent_as_an_episode() -> None:

@@ -86,12 +86,6 @@ def test_numbers_are_never_translated(action: int, raw: bool) -> None:
     assert game.actions[-1][1] == action
 
 
-def test_the_others_do_nothing() -> None:
-    session, game = noted_session(heterogeneity=2)
-    session.press("up")
-    assert game.actions == [[2, ZONE_1[6], 6]]
-
-
 def test_the_others_can_wander() -> None:
     session, game = noted_session(others="random", max_cycles=100)
     for _ in range(100):
@@ -133,52 +127,6 @@ def test_an_ended_game_waits_for_a_new_one() -> None:
     session.press("r")
     session.press("up")
     assert len(game.actions) == 4
-
-
-def test_status() -> None:
-    session = real_session(heterogeneity=2)
-    session.press("tab")
-    assert session.status == "agent 1 (zone 1, facing south): selected"
-    session.press("up")
-    assert session.status == f"agent 1 (zone 1, facing south): up: action {ZONE_1[2]} = forward"
-    session.press("x")
-    assert session.status.endswith("key 'x' does nothing; h lists the keys")
-    session.press("h")
-    assert session.status.endswith(play.KEYS_HELP)
-
-
-# --- the real game
-
-
-def test_walking_to_a_treasure() -> None:
-    session = real_session()
-    for key in ("up", "up"):
-        session.press(key)
-    assert session.env.get_state()["agent_pos"][0].tolist() == [3, 1]
-    assert session.env.collected == 1
-    assert session.status == "agent 0 (zone 0, facing east): up: action 2 = forward; 1 collected!"
-
-
-def test_forward_walks_in_every_zone_unless_raw() -> None:
-    session = real_session(heterogeneity=2)
-    session.press("tab")
-    session.press("up")
-    assert session.env.get_state()["agent_pos"][1].tolist() == [5, 2]
-    session.raw = True
-    session.press("up")
-    assert session.env.get_state()["agent_pos"][1].tolist() == [5, 2]
-
-
-def test_picture_marks_the_selected_agent_and_the_views() -> None:
-    pytest.importorskip("PIL")
-    session, game = noted_session()
-    first = game.picture(12, selected=0)
-    assert first.shape[1] == 120
-    assert not np.array_equal(first, game.picture(12, selected=1))
-    session.press("right")
-    session.press("left")
-    back = game.picture(12, selected=0)
-    assert np.array_equal(first[-120:], back[-120:]), "all but the steps above the map"
 
 
 # --- in a window
@@ -259,15 +207,6 @@ def test_mistakes_end_with_a_message(words: list[str], message: str, capsys: pyt
         make_session(words)
     assert stop.value.code == 2
     assert message in capsys.readouterr().err
-
-
-def test_help_lists_keys_and_parameters(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        make_session(["--help"])
-    page = capsys.readouterr().out
-    assert play.KEYS_HELP.strip() in page
-    assert "--heterogeneity" in page
-    assert "number of zones" in page
 
 
 def test_without_a_window_the_program_says_why(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -334,20 +334,6 @@ def test_all_that_is_saved_is_trained(policy_class: type[TeamActorCriticPolicy],
 # --- spaces and arguments ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
-@pytest.mark.parametrize("kwargs", [{}, {"selection": "gumbel"}, {"n_policies": 1}])
-def test_action_spaces(action_space: spaces.Space[Any], kwargs: dict[str, Any]) -> None:
-    policy, obs = make_policy(SAFPolicy, action_space=action_space, **kwargs), team_rows(VECTOR)
-    for deterministic in (False, True):
-        actions, _, log_prob = policy(obs, deterministic=deterministic)
-        assert actions.shape == (12, *(action_space.shape or ()))
-        assert log_prob.shape == (12,) and log_prob.isfinite().all()
-    predicted, _ = policy.predict(to_numpy(obs))
-    assert all(action_space.contains(np.asarray(action, dtype=action_space.dtype)) for action in predicted)
-    has_log_std = isinstance(action_space, spaces.Box)
-    assert hasattr(policy, "log_std") == has_log_std
-
-
 OWN_SPACES = [VECTOR, PICTURE, CodeSpace(), spaces.Discrete(6), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)]
 
 
@@ -432,10 +418,8 @@ BAD_ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"critic_input": "all"}, r"critic_input must be one of 'own', 'team', got 'all'"),
     ({"n_policies": 0}, r"n_policies must be an integer of at least 1, got 0"),
     ({"n_slots": 2.5}, r"n_slots must be an integer of at least 1, got 2.5"),
-    ({"latent_dim": True}, r"latent_dim must be an integer of at least 1, got True"),
     ({"knowledge_source": "no"}, r"knowledge_source must be True or False, got 'no'"),
     ({"actor_identity": 1}, r"actor_identity must be True or False, got 1"),
-    ({"chunk_size": -1}, r"chunk_size must be an integer of at least 1, got -1"),
     ({"use_sde": True}, r"team policies have no state-dependent exploration \(gSDE\): leave use_sde=False"),
     ({"share_features_extractor": False}, r"share the features extractor .*: leave share_features_extractor=True"),
 ]
@@ -457,13 +441,6 @@ def test_an_unwrapped_environment_is_refused_with_what_to_do(name: str) -> None:
     with pytest.raises(ValueError, match=r"make_team_env.*CentralizedValueWrapper") as error:
         PPO(name, "CartPole-v1", device="cpu")
     assert "got Box" in str(error.value)
-
-
-def test_dict_observations_of_an_agent_are_refused() -> None:
-    own = spaces.Dict({"a": VECTOR})
-    space = spaces.Dict({"obs": own, "team": spaces.Box(0, 1, (3, 5)), "agent": spaces.Discrete(3)})
-    with pytest.raises(ValueError, match="flatten"):
-        SAFPolicy(space, spaces.Discrete(2), constant)
 
 
 # --- predict ----------------------------------------------------------------------------------------------------------

@@ -110,14 +110,6 @@ def test_mixture_of_gaussians_agrees_with_schoolbook_densities() -> None:
     assert th.equal(mixture.mode(), parameters[th.arange(N_ROWS), likeliest, :2])
 
 
-def test_the_mixtures_mode_need_not_be_any_policys_favourite() -> None:
-    # Two policies that prefer actions 0 and 1, and both have action 2 as second choice.
-    logits = th.tensor([[[0.5, 0.1, 0.4], [0.1, 0.5, 0.4]]]).log()
-    log_weights = th.tensor([[0.5, 0.5]]).log()
-    assert mixture_of(spaces.Discrete(3), log_weights, logits).mode().tolist() == [2]
-    assert mixture_of(spaces.MultiDiscrete([3]), log_weights, logits).mode().tolist() == [[2]]
-
-
 def test_many_joint_actions_are_not_enumerated() -> None:
     log_weights, parameters = random_mixture(LARGE)
     mixture = mixture_of(LARGE, log_weights, parameters)

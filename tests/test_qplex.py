@@ -17,13 +17,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_saf import (
     QPLEX,
     Actor,
-    ExportError,
     LightEncoder,
-    QPLEXPoolPolicy,
-    TeamEvalCallback,
     evaluate_team,
     export_actors,
-    load_weights,
     make_team_env,
 )
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
@@ -325,37 +321,11 @@ def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path
     assert again.num_timesteps == 120 * 3
 
 
-def test_a_loaded_model_acts_as_the_saved(tmp_path: Path) -> None:
-    env = toy_env()
-    model = make_model(env, "QPLEXPoolPolicy", mixer="qmix").learn(40 * 3)
-    model.save(tmp_path / "model")
-    obs = env.reset()
-    loaded = QPLEX.load(tmp_path / "model", device="cpu")
-    assert isinstance(loaded.policy, QPLEXPoolPolicy) and loaded.policy.parts.mixer == "qmix"
-    assert np.array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
-    fresh = make_model(env, "QPLEXPoolPolicy", mixer="qmix", seed=1)
-    load_weights(fresh, tmp_path / "model")
-    assert same(weights(fresh), weights(model))
-    loaded.set_env(toy_env(4))
-    loaded.learn(20 * 3, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 60 * 3
-    with pytest.raises(ExportError, match="lacks the tensor"):
-        load_weights(make_model(env), tmp_path / "model")
-
-
 def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
     make_model(toy_env(2)).learn(20 * 3).save_replay_buffer(tmp_path / "buffer")
     words = "4 games of 3 agents, got TeamReplayBuffer of 6 rows"
     with pytest.warns(UserWarning, match="unpickled"), pytest.raises(ValueError, match=words):
         make_model(toy_env(4)).load_replay_buffer(tmp_path / "buffer")
-
-
-def test_evaluation_callback(tmp_path: Path) -> None:
-    games = toy_env(2)
-    games.seed(10_000)
-    callback = TeamEvalCallback(games, n_eval_episodes=2, eval_freq=20, log_path=str(tmp_path), verbose=0)
-    make_model(policy="QPLEXPolicy-lstm").learn(60 * 3, callback=callback)
-    assert np.load(tmp_path / "evaluations.npz")["game_steps"].tolist() == [20, 40, 60]
 
 
 # --- export -----------------------------------------------------------------------------------------------------------
@@ -457,8 +427,3 @@ def test_bad_environments() -> None:
         make_model(VecNormalize(toy_env(), norm_obs=False))
     with pytest.raises(ValueError, match="expected one of QPLEX's policies"):
         make_model(policy="QPLEXPolice")
-
-
-def test_verbose_tells_the_memory(capsys: pytest.CaptureFixture[str]) -> None:
-    make_model(verbose=1)
-    assert "Replay buffer of 200 game steps: 0.0 MB" in capsys.readouterr().out

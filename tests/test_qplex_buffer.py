@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
@@ -153,21 +152,6 @@ def test_sequences_are_consecutive_and_know_where_episodes_start() -> None:
         step = story.told[game][t]
         assert np.array_equal(last, step["last"])
         assert reset == (step["start"] or t == 31 - 12)
-
-
-def test_a_pickled_buffer_goes_on() -> None:
-    buffer, story = make_buffer(), Story()
-    for _ in range(25):
-        story.step(buffer)
-    copy, other = pickle.loads(pickle.dumps(buffer)), pickle.loads(pickle.dumps(story))
-    for _ in range(12):
-        story.step(buffer)
-        other.step(copy)
-    drawn = []
-    for each in (buffer, copy):
-        np.random.seed(3)  # noqa: NPY002
-        drawn.append(each.sample(50))
-    assert (drawn[0].now.own == drawn[1].now.own).all() and (drawn[0].after.own == drawn[1].after.own).all()
 
 
 def test_rows_that_are_no_teams_are_refused() -> None:

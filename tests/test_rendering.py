@@ -117,15 +117,6 @@ def test_floor_shows_the_zone_and_walls_do_not() -> None:
     assert len(draw(one_zone)[0]) < len(draw(scene)[0])
 
 
-@pytest.mark.parametrize(("rules", "n_zones"), [("paper", 3), ("released", 4)])
-def test_zone_names_stand_over_their_columns(rules: str, n_zones: int) -> None:
-    scene = make_scene(heterogeneity=3, rules=rules)
-    band = draw(scene)[0][-1]
-    colours = [tuple(band[x * TILE].tolist()) for x in range(SIDE)]
-    assert colours == [zone_colour(int(zone)) for zone in scene.params.zone_of_column()]
-    assert len(set(colours)) == n_zones
-
-
 # --- treasures and keys
 
 
@@ -141,14 +132,6 @@ def test_available_and_collected_treasures_and_floor_all_differ(tile: int) -> No
     # Only treasures that can be collected are bright.
     assert np.ptp(available, axis=-1).max() > 100
     assert np.ptp(collected, axis=-1).max() < 40
-
-
-@pytest.mark.parametrize(("task", "brightest"), [("TeamTogether", 0), ("TeamSupport", 1), ("KeyForTreasure", 1)])
-def test_gems_have_the_colour_of_the_task(task: TaskName, brightest: int) -> None:
-    scene = make_scene(task=task)
-    scene.state["treasures"][2, 2] = 1
-    body = cell_of(scene, 2, 2)[12, 12]
-    assert body.argmax() == brightest
 
 
 # --- agents
@@ -179,37 +162,11 @@ def test_key_carriers_show_their_key() -> None:
     assert golden(cells[4, 2]) == 0
 
 
-def test_treasure_shows_behind_an_agent() -> None:
-    scene = make_scene([(5, 5, 0, False)])
-    cells = []
-    for treasure in (0, 1, 2):
-        scene.state["treasures"][5, 5] = treasure
-        cells.append(cell_of(scene, 5, 5))
-        assert count(cells[-1], rendering.AGENT_COLOURS[0]) > 40
-    green = [int(((cell[..., 1] > 150) & (cell[..., 0] < 70)).sum()) for cell in cells]
-    assert green[0] == green[2] == 0
-    assert green[1] > 10
-
-
 def test_selected_agent_is_marked() -> None:
     scene = make_scene([(2, 2, 0, False), (4, 2, 0, False)])
     plain, marked = draw(scene)[1], draw(scene._replace(selected=0))[1]
     changed = (plain != marked).any(axis=(2, 3, 4))
     assert np.argwhere(changed).tolist() == [[2, 2]]
-
-
-@pytest.mark.parametrize("number", [2, 4, 10, 11])
-def test_one_agent_more_in_a_cell_is_seen(number: int) -> None:
-    fewer = cell_of(make_scene([(5, 5, 0, False)] * (number - 1)), 5, 5)
-    more = cell_of(make_scene([(5, 5, 0, False)] * number), 5, 5)
-    assert not np.array_equal(fewer, more)
-
-
-def test_agents_draw_only_in_their_cells() -> None:
-    alone = (8, 8, 0, False)
-    one, all_ = make_scene([alone]), make_scene([alone] + [(5, 5, 0, True)] * 12)
-    changed = (draw(one)[1] != draw(all_)[1]).any(axis=(2, 3, 4))
-    assert np.argwhere(changed).tolist() == [[5, 5]]
 
 
 # --- fields of view
@@ -240,12 +197,6 @@ def test_step_score_and_treasures_are_in_the_header() -> None:
     assert len(pages) == 4
     scene.state["treasures"][2, 2] = 2
     assert draw(scene._replace(step=3, collected=1))[0].tobytes() not in pages
-
-
-@pytest.mark.parametrize(("step", "share"), [(0, 0.0), (25, 0.5), (50, 1.0)])
-def test_time_bar_grows_with_the_steps(step: int, share: float) -> None:
-    bars = [draw(make_scene()._replace(step=at))[0][-1] for at in (step, 50)]
-    assert count(bars[0], tuple(bars[1][0].tolist())) == share * SIDE * TILE
 
 
 # --- missing packages

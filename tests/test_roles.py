@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-import pytest
 from stable_baselines3 import PPO
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
@@ -32,15 +31,3 @@ def test_roles_are_learned_by_actors_that_read_who_acts() -> None:
     rows: dict[str, np.ndarray] = {"obs": np.tile(SEEN, (900, 1)), "agent": np.arange(900) % 3}
     actions, _ = model.predict(rows, deterministic=False)
     assert (actions == rows["agent"]).mean() > 0.9  # without actor_identity a third
-
-
-def test_one_agent_alone_must_say_who_it_is() -> None:
-    model = PPO(
-        "MAPPOPolicy",
-        make_team_env(BUTTONS, seed=0),
-        policy_kwargs={"actor_identity": True, "net_arch": [8]},
-        device="cpu",
-    )
-    with pytest.raises(ValueError, match=r"\{'obs': \.\.\., 'agent': its index\}"):
-        model.predict(SEEN)
-    model.predict({"obs": SEEN, "agent": np.array(1)})

@@ -57,18 +57,14 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], object]:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (_set("x", 10_000_000), "'agent_pos' .*got 10000000"),
         (_set("x", 0), "agent 0 .*wall"),
-        (_set("terrain", 9), "`terrain` .*got 9"),
         (_set("terrain", 0), "outer ring"),
-        (_set("direction", 4), "'agent_dir'"),
         (_set("has_key", 2), "`has_key`"),
         (_set("colour", 200), "`colour` .*got 200"),
         (_set("order", 77), "`order` is not a permutation"),
         (lambda snapshot: snapshot.pop("rng"), "`rng`"),
         (lambda snapshot: snapshot.update(x=snapshot["x"][:, :5]), r"`x` as int32 \(4, 6\)"),
         (lambda snapshot: snapshot.update(x=snapshot["x"].astype(float)), "`x` .*got float64"),
-        (lambda snapshot: snapshot.update(x=None), "`x` .*got object"),
     ],
 )
 def test_what_kernels_cannot_index_is_refused_and_changes_nothing(change: Callable[..., object], named: str) -> None:

@@ -423,28 +423,6 @@ def test_masks_that_nobody_asks_for_are_told_of_once() -> None:
         step_twice(make_team_env(PickUp))
 
 
-@_needs("lbf")
-def test_wins_are_counted_once_for_each_team() -> None:
-    env = make_team_env("lbf/Foraging-5x5-2p-1f-v3", n_envs=4, seed=0)
-    model = PPO("IPPOPolicy", env, n_steps=128, batch_size=512, n_epochs=1, seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model.learn(1024)
-    assert model.ep_info_buffer is not None and model.ep_success_buffer is not None
-    returns = [episode["r"] for episode in model.ep_info_buffer]
-    assert list(model.ep_success_buffer) == [value > 0.99 for value in returns] and 0 < np.mean(returns) < 1
-    result = evaluate_team(RandomPolicy(env, seed=0), env, 12)
-    assert result.successes == tuple(value > 0.99 for value in result.returns) and result.success_rate
-    assert f"{100 * result.success_rate:.0f} % won" in str(result)
-
-
-def test_modules_and_functions_by_name() -> None:
-    env = make_team_env("tests.toy_envs:CounterEnv", n_envs=2, n_agents=3)
-    assert (env.n_games, env.n_agents) == (2, 3)
-    with pytest.raises(ValueError, match=r"cannot import parallel_env from 'no_such\.module'"):
-        make_team_env("no_such.module")
-
-
 def test_the_tasks_of_hecogrid_are_a_suite_and_have_short_names() -> None:
     for name in ("TeamSupport", "TeamSupport-v0", "hecogrid/TeamSupport", "hecogrid/TeamSupport-v0"):
         environment = find_environment(name)

@@ -25,7 +25,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_saf import game_seeds
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
@@ -101,13 +101,6 @@ def test_stock_drops_options() -> None:
     venv = stock(CounterEnv(), 2)
     venv.reset(options={"level": 3})
     assert venv.reset_infos[0]["options"] is None
-
-
-@one_and_two_cpus
-def test_seed_of_ppo_reaches_the_games(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(CounterEnv, n_games=3, seed=1, n_cpus=n_cpus)
-    PPO("MlpPolicy", venv, seed=0, n_steps=2, batch_size=12, n_epochs=1, device="cpu").learn(12)
-    assert venv.get_attr("last_seed")[::2] == game_seeds(0, 3)
 
 
 @one_and_two_cpus
@@ -189,31 +182,6 @@ def test_stock_dones_are_numbers() -> None:
     assert venv.step(zeros(venv))[2].dtype == np.uint8
 
 
-def discounted_return_variance(venv: Any, gamma: float, n_steps: int) -> float:
-    """Return VecNormalize's variance of discounted returns."""
-    normalised = VecNormalize(venv, norm_obs=False, gamma=gamma)
-    normalised.reset()
-    for _ in range(n_steps):
-        normalised.step(zeros(venv))
-    return float(normalised.ret_rms.var)
-
-
-@one_and_two_cpus
-def test_reward_normalisation(bridge: Bridge, n_cpus: int) -> None:
-    returns: list[float] = []
-    value = np.zeros(2)
-    for step in range(60):
-        value = 0.9 * value + 10.0 * (step % 3 + 1) + np.arange(2)
-        returns.extend(value.tolist())
-        if step % 3 == 2:
-            value = np.zeros(2)
-    expected = np.var(returns)
-    with pytest.warns(UserWarning, match="`render_mode` attribute is not defined"):
-        assert discounted_return_variance(stock(CounterEnv(), 2), 0.9, 60) > 2 * expected
-    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
-    assert discounted_return_variance(venv, 0.9, 60) == pytest.approx(expected, rel=1e-2)
-
-
 # ---- trap: truncation, terminal step
 
 
@@ -273,18 +241,6 @@ def test_last_step_keeps_its_infos(bridge: Bridge, n_cpus: int) -> None:
     assert isinstance(observations, np.ndarray)
     assert observations[:, 0].tolist() == [0] * 4
     assert [info["terminal_observation"][:2].tolist() for info in infos] == [[2, 0], [2, 1]] * 2
-
-
-@one_and_two_cpus
-def test_value_of_the_state_after_a_time_limit_counts(bridge: Bridge, n_cpus: int) -> None:
-    """SB3 adds gamma * V(terminal observation) to the reward of a truncated row; here too."""
-    venv = bridge(lambda: CounterEnv(2, max_cycles=1), n_games=1, n_cpus=n_cpus)
-    model = PPO("MlpPolicy", venv, n_steps=2, batch_size=4, n_epochs=1, gamma=0.5, seed=0, device="cpu")
-    model.policy.value_net.weight.data.zero_()
-    model.policy.value_net.bias.data.fill_(8.0)
-    model.learn(1)
-    actions = model.rollout_buffer.actions.reshape(2, 2)
-    assert model.rollout_buffer.rewards == pytest.approx(10.0 + np.arange(2) + actions + 0.5 * 8.0)
 
 
 @one_and_two_cpus
@@ -435,6 +391,7 @@ def test_masks_by_row(bridge: Bridge, n_cpus: int) -> None:
 
 @one_and_two_cpus
 def test_pictures(bridge: Bridge, n_cpus: int) -> None:
+    assert bridge(CounterEnv, n_games=2, n_cpus=n_cpus).get_images() == [None] * 4
     venv = bridge(lambda: CounterEnv(2, render_mode="rgb_array"), n_games=4, n_cpus=n_cpus)
     assert venv.render_mode == "rgb_array"
     assert VecMonitor(venv).render_mode == "rgb_array"
@@ -447,15 +404,6 @@ def test_pictures(bridge: Bridge, n_cpus: int) -> None:
     mosaic = venv.render()
     assert mosaic is not None
     assert mosaic.shape == (8, 12, 3)  # one picture per game, not per row
-
-
-@one_and_two_cpus
-def test_no_pictures(bridge: Bridge, n_cpus: int) -> None:
-    venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
-    assert venv.render_mode is None
-    assert venv.get_images() == [None] * 4
-    with pytest.warns(UserWarning, match="no `render_mode` was passed"):
-        assert venv.render() is None
 
 
 # ---- trap: agents that die
@@ -627,19 +575,12 @@ box = spaces.Box(-1.0, np.array([1.0, 0.7], np.float32), (2,), np.float32)
     [
         (spaces.Discrete(4), [0, 1, 2], "expected actions from Discrete(4) for 4 rows, int64 of shape (4,), "
          "got int64 of shape (3,)"),
-        (spaces.Discrete(4), [[0], [1], [2], [3]], "got int64 of shape (4, 1)"),
         (spaces.Discrete(4), [0.0, 1.0, 2.0, 3.0], "got float64 of shape (4,)"),
-        (spaces.Discrete(4), [True] * 4, "got bool of shape (4,)"),
-        (spaces.Discrete(4), None, "got object of shape ()"),
         (spaces.Discrete(4), [0, 0, 4, 0], "expected actions from Discrete(4), got 4 in row 2 (game 1, agent_0)"),
-        (spaces.Discrete(4), [0, 0, 0, -1], "got -1 in row 3 (game 1, agent_1)"),
         (spaces.Discrete(2, start=5), [0, 1, 5, 0], "expected actions from Discrete(2), got 5 in row 2"),
         (spaces.MultiDiscrete([2, 3]), [[0, 0], [0, 3], [0, 0], [0, 0]], "got [0 3] in row 1 (game 0, agent_1)"),
-        (spaces.MultiBinary(2), [[0, 0], [0, 1], [0, 0], [0, 2]], "got [0 2] in row 3"),
         (box, np.zeros((4, 3)), "float32 of shape (4, 2), got float64 of shape (4, 3)"),
-        (box, [[0, 0], [0, 0], [0, 0], [0, 0.8]], "got [0.  0.8] in row 3"),
         (box, [[0, 0], [np.nan, 0], [0, 0], [0, 0]], "in row 1"),
-        (box, [[1e300, 0], [0, 0], [0, 0], [0, 0]], "got [inf  0.] in row 0"),
         (box, np.full((4, 2), "a"), "got <U1 of shape (4, 2)"),
         (spaces.Box(0, 9, (1,), np.uint8), [[0], [256], [0], [0]], "got [256] in row 1"),
     ],
@@ -700,20 +641,14 @@ def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
 
 
 @one_and_two_cpus
-@pytest.mark.parametrize(
-    ("how", "error", "message"),
-    [
-        ("raise", ArithmeticError, "the game broke"),
-        ("exit", SystemExit, "3"),
-    ],
-)
-def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[BaseException], message: str) -> None:
+@pytest.mark.parametrize(("how", "error"), [("raise", ArithmeticError), ("exit", SystemExit)])
+def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[BaseException]) -> None:
     """Its exception is raised, and a reset starts again."""
     unlucky = game_seeds(0, 3)[1]
     venv = bridge(lambda: FaultyEnv(how, unlucky), n_games=3, seed=0, n_cpus=n_cpus)
     venv.reset()
     venv.step(zeros(venv))
-    with pytest.raises(error, match=message):
+    with pytest.raises(error):
         venv.step(zeros(venv))
     assert venv.get_attr("steps", indices=2) == [2]
     with pytest.raises(RuntimeError, match=r"stopped by an error\): call reset\(\)"):
@@ -723,24 +658,6 @@ def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[Bas
     for _ in range(3):
         dones = venv.step(zeros(venv))[2]
     assert dones.all()
-
-
-@one_and_two_cpus
-def test_next_episode_that_breaks(bridge: Bridge, n_cpus: int) -> None:
-    class ShortLived(CounterEnv):
-        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-            if self.episode == 1:
-                raise LookupError("only one episode here")
-            return super().reset(seed, options)
-
-    venv = bridge(ShortLived, n_games=2, n_cpus=n_cpus)
-    venv.reset()
-    for _ in range(2):
-        venv.step(zeros(venv))
-    with pytest.raises(LookupError, match="only one episode here"):
-        venv.step(zeros(venv))
-    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
-        venv.step(zeros(venv))
 
 
 class LocalError(Exception):
@@ -875,15 +792,6 @@ def test_game_that_can_only_be_closed_after_a_reset(bridge: Bridge, n_cpus: int)
             assert self.episode
 
     bridge(Game, n_games=2, n_cpus=n_cpus).reset()
-
-
-def test_the_users_own_environment_is_left_alone(bridge: Bridge) -> None:
-    env = CounterEnv()
-    venv = bridge(env, n_games=2)
-    venv.reset()
-    venv.step(zeros(venv))
-    venv.close()
-    assert (env.episode, env.closed) == (0, False)
 
 
 def test_every_game_that_was_made_is_closed(bridge: Bridge) -> None:

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -138,33 +137,6 @@ def test_memory_is_one_observation_per_row_and_33_bytes() -> None:
     assert stock_bytes == 50 * 40 * 587
 
 
-def test_arrays_are_reused_and_hold_the_new_rollout() -> None:
-    env = make_env()
-    team, fresh = make_buffer(env), make_buffer(env)
-    fill([team], env, seed=1)
-    kept = {name: getattr(team, name) for name in ("actions", "rewards", "values", "log_probs", "advantages")}
-    observations = team.observations["obs"]
-    list(team.get(6))
-    team.reset()
-    assert (team.pos, team.full, team.generator_ready) == (0, False, False)
-    fill([team, fresh], env, seed=2)
-    assert all(getattr(team, name) is array for name, array in kept.items())
-    assert team.observations["obs"] is observations
-    assert rows_of(list(team.get())) == rows_of(list(fresh.get()))
-
-
-def test_samples_are_copies() -> None:
-    team, _ = make_both("tiles")
-    sample = next(team.get())
-    before = team.values.copy(), team.observations["obs"].copy(), team.actions.copy()
-    sample.old_values.zero_()
-    sample.actions.zero_()
-    for value in sample.observations.values():
-        value.zero_()
-    for kept, now in zip(before, (team.values, team.observations["obs"], team.actions), strict=True):
-        np.testing.assert_array_equal(kept, now)
-
-
 def a_step(env: CentralizedValueWrapper) -> tuple[dict[str, Array], tuple[Any, ...]]:
     rest = (np.zeros((env.num_envs, 1)), np.zeros(env.num_envs), np.zeros(env.num_envs), th.zeros(env.num_envs))
     return env.reset(), (*rest, th.zeros(env.num_envs))
@@ -231,23 +203,6 @@ def make_model(algorithm: Any = PPO, buffer: Any = TeamRolloutBuffer, env: Any =
 
 def weights(model: Any) -> dict[str, list[Any]]:
     return {name: value.tolist() for name, value in model.policy.state_dict().items()}
-
-
-def test_ppo_trains_saves_loads_and_goes_on(tmp_path: Path) -> None:
-    model = make_model().learn(120)
-    assert isinstance(model.rollout_buffer, TeamRolloutBuffer)
-    model.save(tmp_path / "model")
-    loaded = PPO.load(tmp_path / "model", env=make_env(), device="cpu")
-    assert isinstance(loaded.rollout_buffer, TeamRolloutBuffer)
-    assert weights(loaded) == weights(model)
-    loaded.learn(60, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 180
-    assert weights(loaded) != weights(model)
-
-
-def test_a2c_and_normalised_rewards() -> None:
-    make_model(A2C).learn(120)
-    make_model(env=VecNormalize(make_env(), norm_obs=False)).learn(120)
 
 
 def test_observations_normalised_above_the_wrapper_are_refused() -> None:

@@ -25,16 +25,6 @@ def batch_of(n_threads: int, n_games: int = 6) -> GameBatch:
     return batch
 
 
-@pytest.mark.parametrize(("n_threads", "n_games"), [(2, 40), (3, 17), (4, 1)])
-def test_whoever_plays_a_game_it_is_the_same(n_threads: int, n_games: int) -> None:
-    alone, shared = batch_of(1, n_games), batch_of(n_threads, n_games)
-    for row in np.random.default_rng(0).integers(0, 7, size=(200, n_games, 5)):
-        ours, over = shared.advance(row)
-        theirs, also_over = alone.advance(row)
-        assert (ours == theirs).all() and (over == also_over).all()
-    np.testing.assert_array_equal(shared.collected, alone.collected)
-
-
 def test_threads_end_with_their_batch() -> None:
     before = set(threading.enumerate())
     batch = batch_of(3)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from torch import nn
 
 from sb3_saf import LightEncoder, PaperCNN, make_vec_env
 from sb3_saf.networks.encoders import PixelInput
@@ -17,7 +16,6 @@ from sb3_saf.networks.tile_sums import (
     places_of_convolution,
     places_of_linear,
     rectified_sums,
-    table_of_convolution,
     used_codes,
 )
 
@@ -26,31 +24,6 @@ N_CODES = 11
 
 def _views(rows: int, columns: int, n_views: int = 5) -> th.Tensor:
     return th.from_numpy(np.random.default_rng(0).integers(0, N_CODES, (n_views, rows * columns)))
-
-
-def _pixels(views: th.Tensor, tiles: th.Tensor, rows: int, columns: int) -> th.Tensor:
-    """Draw (K, C, rows * t, columns * t) images of codes, tile by tile."""
-    of_tiles = tiles[views].unflatten(1, (rows, columns))
-    return th.cat([th.cat(list(row.unbind(1)), dim=3) for row in of_tiles.unbind(1)], dim=2)
-
-
-@pytest.mark.parametrize(
-    ("tile", "kernel", "stride"),
-    [(4, 4, 2), (4, 3, 2), (4, 2, 2), (4, 8, 4), (4, 4, 4), (4, 1, 4), (6, 5, 3), (2, 7, 2), (3, 3, 1), (4, 5, 1)],
-)
-def test_a_convolution_by_looking_up_is_the_convolution(tile: int, kernel: int, stride: int) -> None:
-    rows, columns = 4, 5
-    tiles = th.randn(N_CODES, 3, tile, tile, dtype=th.float64)
-    weight = th.randn(6, 3, kernel, kernel, dtype=th.float64)
-    views = _views(rows, columns)
-    used = used_codes(views)
-    places = places_of_convolution(rows, columns, tile, kernel, stride)
-    bias = th.randn(6, dtype=th.float64)
-    looked_up = rectified_sums(used.views, table_of_convolution(tiles[used.codes], weight, stride), bias, places)
-    expected = nn.functional.conv2d(_pixels(views, tiles, rows, columns), weight, bias, stride=stride).relu()
-    assert (expected == 0).any() and (expected > 0).any()
-    assert looked_up.shape == expected.shape
-    th.testing.assert_close(looked_up, expected)
 
 
 def _some_places() -> list[Places]:
@@ -70,13 +43,6 @@ def test_gradients_of_first_and_second_order(places: Places) -> None:
     assert (square(table, bias) == 0).any()
     assert th.autograd.gradcheck(square, (table, bias))
     assert th.autograd.gradgradcheck(square, (table, bias))
-
-
-def test_codes_that_occur() -> None:
-    used = used_codes(th.tensor([[7.0, 3.0], [3.0, 200.0]]))
-    assert used.codes.tolist() == [3, 7, 200]
-    assert used.views.tolist() == [[1, 0], [0, 2]]
-    assert used_codes(th.zeros((0, 4), dtype=th.uint8)).views.shape == (0, 4)
 
 
 @pytest.mark.parametrize("encoder_class", [LightEncoder, PaperCNN])

@@ -13,7 +13,7 @@ pytest.importorskip("rliable")
 from rliable import metrics
 
 from sb3_saf import confidence_interval
-from sb3_saf.training.figures import draw_aggregates, draw_curves, draw_differences, draw_levels, method_styles
+from sb3_saf.training.figures import draw_curves, draw_differences, draw_levels, method_styles
 from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import (
     interquartile_means,
@@ -131,27 +131,6 @@ def test_performance_profiles_are_shares_above_thresholds() -> None:
     assert (profile.share <= profile.high).all()
 
 
-def test_aggregates_are_drawn_at_their_values() -> None:
-    scores = {"mappo": np.array([[0.1, 0.2], [0.2, 0.3]]), "saf": np.array([[0.3, 0.5], [0.5, 0.7]])}
-    left, right = draw_aggregates(scores).axes
-    assert [label.get_text() for label in left.get_yticklabels()] == ["saf", "mappo"]
-    marks = [line.get_xdata()[0] for line in left.get_lines()]  # type: ignore[index]
-    assert marks == pytest.approx([0.5, 0.2])
-    assert [line.get_label() for line in right.get_lines()] == ["saf", "mappo"]
-
-
-def test_differences_are_drawn_at_their_values_by_level() -> None:
-    rows = [("ippo", "c=1", 2.0, 1.0, 4.0), ("mappo", "c=1", -1.0, -1.5, -0.5), ("ippo", "c=2", 0.5, np.nan, np.nan)]
-    table = pd.DataFrame(rows, columns=["method", "level", "value", "low", "high"])
-    (axes,) = draw_differences(table).axes
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["c=1", "c=2"]
-    assert axes.get_yticks().tolist() == [0.5, 2.0]
-    drawn = {container.get_label(): container for container in axes.containers}
-    dots, _, (bars,) = drawn["ippo"]
-    assert dots.get_xydata().tolist() == [[2.0, 0.0], [0.5, 2.0]]
-    assert bars.get_segments()[0].tolist() == [[1.0, 0.0], [4.0, 0.0]]
-
-
 def test_pooled_differences_are_diamonds_on_the_band_of_no_difference() -> None:
     rows = [("saf", "a", 1.0, 0.0, 2.0, False), ("saf", "together", 2.0, 1.0, 3.0, True)]
     names = ["method", "level", "value", "low", "high", "pooled"]
@@ -184,13 +163,6 @@ def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
         assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0
         boxes = [axes.get_tightbbox() for axes in figure.axes if axes.axison]
         assert all(each is not None and box.y1 <= each.y0 + 1 for each in boxes)
-
-
-def test_returns_that_are_never_negative_are_drawn_from_zero() -> None:
-    wide = runs(saf=[[1, 2], [3, 9]])  # the interval of two seeds goes far below 0
-    assert draw_curves(wide).axes[0].get_ylim()[0] == 0
-    assert draw_levels(wide.assign(coordination=1), "coordination").axes[0].get_ylim()[0] == 0
-    assert draw_curves(runs(saf=[[-1, 2]])).axes[0].get_ylim()[0] < -1
 
 
 def test_tables_are_checked() -> None:

@@ -115,25 +115,6 @@ def test_another_initial_model_is_refused(tmp_path: Path, capsys: pytest.Capture
     assert "Going on with" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("when", [1, 3])
-def test_a_monitor_that_is_moved_takes_nothing_with_it(
-    when: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Compressing or moving the file of a running training leaves the finished run as it is."""
-    evaluate = SeededEvalCallback._evaluate
-
-    def move(self: SeededEvalCallback) -> bool:
-        if self.n_evaluations == when:
-            (tmp_path / "saf" / f"{ENV}_1" / "monitor.csv").rename(tmp_path / "moved.csv")
-        return evaluate(self)
-
-    monkeypatch.setattr(SeededEvalCallback, "_evaluate", move)
-    train(tmp_path, "saf", "--seed", "3")
-    files = {path.name for path in (tmp_path / "saf" / f"{ENV}_1").iterdir()}
-    assert {f"{ENV}.zip", "best_model.zip", "evaluations.npz", "run.json", "finished.json"} <= files
-    assert (tmp_path / "moved.csv").is_file()
-
-
 def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = failed([*OPTIONS, "-f", str(tmp_path), "--hyperparams", "learning_rate:1.0e30"], capsys)
     # Where the difference first shows depends on the seed.

@@ -70,21 +70,15 @@ def test_exact_although_every_hash_collides(monkeypatch: pytest.MonkeyPatch) -> 
     assert_matches_reference(x, unique_rows(x))
 
 
-class Counter:
-    """An encoder that records its inputs."""
-
-    def __init__(self) -> None:
-        self.calls: list[th.Tensor] = []
-
-    def __call__(self, observations: th.Tensor) -> th.Tensor:
-        self.calls.append(observations)
-        return observations.float().flatten(1) * 2.0
-
-
 @pytest.mark.parametrize(("once", "device"), [(False, "cpu"), (True, "meta")])
 def test_without_a_search_every_row_is_encoded(once: bool, device: str) -> None:
-    counter = Counter()
+    seen: list[th.Tensor] = []
+
+    def encode(observations: th.Tensor) -> th.Tensor:
+        seen.append(observations)
+        return observations.flatten(1)
+
     x = th.zeros(3, 2, device=device)
-    encoder = RowEncoder(counter, once)
-    assert encoder.rows(x).of_rows().shape == (3, 2) and counter.calls[0] is x
+    encoder = RowEncoder(encode, once)
+    assert encoder.rows(x).of_rows().shape == (3, 2) and seen[0] is x
     assert [len(part) for part in encoder.find(x)] == [3, 3]

@@ -17,7 +17,6 @@ from sb3_saf import TeamRolloutBuffer, make_team_env
 from sb3_saf.envs.joint_observation import TimeLimit
 from sb3_saf.networks.value_normalizer import MIN_STD, ValueNormalizer
 from sb3_saf.policies.base import TeamActorCriticPolicy
-from sb3_saf.teams.rows import TeamSpaces
 from tests.probe_envs import DelayedReward
 from tests.test_policies import NAMES, POLICIES, equal_weights, make_policy
 from tests.toy_teams import VECTOR, ToyTeams, team_rows
@@ -225,14 +224,3 @@ def test_statistics_are_saved_and_loaded(tmp_path: Path) -> None:
     model.policy.save(str(tmp_path / "policy"))
     alone = type(model.policy).load(str(tmp_path / "policy"), device="cpu")
     assert th.equal(alone.predict_values(obs), model.policy.predict_values(obs))
-
-
-def test_statistics_are_no_parameters() -> None:
-    space = TeamSpaces(VECTOR, 3).to_dict_space()
-    policies = [
-        POLICIES[1](space, ToyTeams().action_space, lambda _: 1e-3, normalize_values=on) for on in (True, False)
-    ]
-    names = [[name for name, _ in policy.named_parameters()] for policy in policies]
-    assert names[0] == names[1]
-    added = policies[0].state_dict().keys() - policies[1].state_dict().keys()
-    assert added == {f"value_normalizer.{name}" for name in ("mean", "var", "count")}
