@@ -28,7 +28,28 @@ def reward_by_place(game: int, agent: int, step: int) -> float:
     return 100.0 * game + 10.0 * agent + step
 
 
-class TeamVenv(VecEnv):
+class PlainVenv(VecEnv):
+    """A vector environment whose attributes and methods are its own, for every row."""
+
+    render_mode = None
+
+    def close(self) -> None:
+        self.closed = True
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        return [getattr(self, method_name)(*args, **kwargs) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+
+class TeamVenv(PlainVenv):
     """
     Flattened teams with known numbers.
 
@@ -51,7 +72,6 @@ class TeamVenv(VecEnv):
         truncate: bool = True,
         tell_size: bool = True,
     ) -> None:
-        self.render_mode = None
         self.size = n_agents
         if tell_size:
             self.n_agents, self.n_games = n_agents, len(lengths)
@@ -103,21 +123,6 @@ class TeamVenv(VecEnv):
         self.episodes[ended] += 1
         self.steps[ended] = 0
         return self._observe(), self.rewards, self.dones, self.infos
-
-    def close(self) -> None:
-        self.closed = True
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        return [getattr(self, method_name)(*args, **kwargs) for _ in self._get_indices(indices)]
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        return [False for _ in self._get_indices(indices)]
 
 
 def still(venv: VecEnv) -> Array:

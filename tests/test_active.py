@@ -11,11 +11,23 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer
 
-from sb3_saf import IPPOPolicy, MAPPOPolicy, RandomPolicy, SAFPolicy, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import (
+    IPPOPolicy,
+    MAPPOPolicy,
+    RandomPolicy,
+    SAFMaskablePolicy,
+    SAFPolicy,
+    TeamRolloutBuffer,
+    evaluate_team,
+    make_team_env,
+)
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.teams.rows import TeamSpaces
 from tests.team_venv import Array
 from tests.toy_envs import CounterEnv, DictEnv, TellingEnv
@@ -41,8 +53,8 @@ def first_legal(obs: dict[str, Array]) -> Array:
     return np.argmax(obs["action_mask"], axis=1)
 
 
-def telling_env(n_envs: int = 2, **kwargs: Any) -> CentralizedValueWrapper:
-    return make_team_env(TellingEnv, n_envs, seed=0, state=True, **{**LIVES, **kwargs})
+def telling_env(n_envs: int = 2, game: Any = TellingEnv, **kwargs: Any) -> CentralizedValueWrapper:
+    return make_team_env(game, n_envs, seed=0, state=True, **{**LIVES, **kwargs})
 
 
 # --- content of rows --------------------------------------------------------------------------------------------------
@@ -437,9 +449,12 @@ def test_mappos_critic_on_the_state_reads_the_state_alone() -> None:
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
-def make_model(policy: str = "SAFPolicy", env: Any = None, **kwargs: Any) -> PPO:
-    settings = {"n_steps": 10, "batch_size": 30, "n_epochs": 2, "rollout_buffer_class": TeamRolloutBuffer, **kwargs}
-    return PPO(policy, env or telling_env(), seed=3, device="cpu", **settings)
+def make_model(policy: str = "SAFPolicy", env: Any = None, algorithm: Any = PPO, **kwargs: Any) -> Any:
+    """Create a model with rollouts of 10 steps of 6 rows."""
+    settings: dict[str, Any] = {"n_steps": 10, "batch_size": 30, "n_epochs": 2}
+    if algorithm is PPO:
+        settings["rollout_buffer_class"] = TeamRolloutBuffer
+    return algorithm(policy, env or telling_env(), seed=3, device="cpu", **settings | kwargs)
 
 
 @pytest.mark.parametrize(
@@ -505,3 +520,83 @@ def test_sb3s_buffer_warns_once_that_idle_rows_enter_the_loss() -> None:
     told = [str(w.message) for w in caught if "take no part" in str(w.message)]
     assert len(told) == 1
     assert "rollout_buffer_class=sb3_saf.TeamRolloutBuffer" in told[0]
+
+
+# --- masks from two sources, value normalisation ----------------------------------------------------------------------
+
+
+class TwiceMaskedEnv(TellingEnv):
+    """Observations have masks that allow every second action; a method returns masks that forbid the lower of those."""
+
+    def action_masks(self) -> dict[str, Any]:
+        return {agent: np.arange(N_ACTIONS) >= 2 for agent in self.agents}
+
+
+class ShownMasksEnv(TellingEnv):
+    """Masks in observations or infos, without a method that returns them."""
+
+    @property
+    def action_masks(self) -> Any:
+        raise AttributeError("this game has no action_masks()")
+
+
+def test_an_action_must_be_allowed_by_both_masks() -> None:
+    env = telling_env(game=TwiceMaskedEnv, deaths={}, joins={})
+    model = make_model("SAFMaskablePolicy", env, MaskablePPO).learn(60)
+    buffer = model.rollout_buffer
+    taken = buffer.actions.reshape(-1).astype(int)
+    assert (taken >= 2).all(), "the environment's action_masks() forbid 0 and 1"
+    shown = buffer.observations["action_mask"].reshape(-1, N_ACTIONS)
+    assert shown[np.arange(len(taken)), taken].all()
+    assert len(np.unique(taken)) == 2
+
+    policy = model.policy
+    assert isinstance(policy, SAFMaskablePolicy)
+    rows, _ = policy.obs_to_tensor(env.reset())
+    assert isinstance(rows, dict)
+    asked = th.tensor([[False, False, True, True]]).expand(6, -1)
+    distribution = policy.get_distribution(rows, asked)
+    likelihoods = th.stack([distribution.log_prob(th.full((6,), a)).exp() for a in range(N_ACTIONS)], dim=1)
+    both = asked & (rows["action_mask"] != 0)
+    assert both.sum(dim=1).eq(1).all()
+    th.testing.assert_close(likelihoods, both.float())
+
+
+def test_values_are_normalised_by_the_returns_of_those_who_take_part() -> None:
+    """The mean would differ if idle rows, whose returns are 0, were counted."""
+    model = make_model("MAPPOPolicy", policy_kwargs={"normalize_values": True}).learn(60)
+    buffer: Any = model.rollout_buffer
+    is_active = buffer.active.reshape(10, 6) == 1
+    returns = buffer.returns[is_active].astype(np.float64)
+    normalizer = model.policy.value_normalizer
+    assert isinstance(normalizer, ValueNormalizer)
+    assert int(normalizer.count) == is_active.sum() == 2 * 2 * (3 + 3 + 5)
+    assert float(normalizer.mean) == pytest.approx(returns.mean(), rel=1e-5)
+    assert float(normalizer.var) == pytest.approx(returns.var(), rel=1e-4)
+    assert abs(buffer.returns.mean() - returns.mean()) > 1.0
+    obs: Any = telling_env().reset()
+    values = model.policy.predict_values(model.policy.obs_to_tensor(obs)[0]).detach().flatten()
+    assert (values[~is_active({key: th.as_tensor(part) for key, part in obs.items()})] == 0).all(), (
+        "zero on the raw scale, not the mean of returns"
+    )
+
+
+@pytest.mark.parametrize(
+    "policy_kwargs", [{"critic_input": "state"}, {"heads": "per_agent"}, {"agent_identity": False}]
+)
+def test_normalised_values_with_every_critic_and_agents_that_die(policy_kwargs: dict[str, Any]) -> None:
+    env = telling_env(time_limit="bootstrap")
+    model = make_model("MAPPOPolicy", env, policy_kwargs={"normalize_values": True, **policy_kwargs}).learn(120)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize("masks", ["observation", "info"])
+def test_maskable_ppo_finds_the_masks_that_observations_show(masks: str) -> None:
+    """The game has no method action_masks(), and fails the test at the first illegal action."""
+    env = telling_env(game=ShownMasksEnv, masks=masks, deaths={}, joins={})
+    assert is_masking_supported(env)
+    obs: Any = env.reset()
+    np.testing.assert_array_equal(get_action_masks(env), obs["action_mask"] == 1)
+    model = make_model("MAPPOMaskablePolicy", env, MaskablePPO).learn(60)
+    assert evaluate_team(model, env, 2).lengths == [5, 5]
+    assert not is_masking_supported(telling_env(game=ShownMasksEnv, masks=None))

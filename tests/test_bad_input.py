@@ -12,6 +12,7 @@ import hecogrid_envs
 import sb3_saf
 from hecogrid_envs import GameBatch, HECOGridEnv, HECOGridParams
 from hecogrid_envs.params import MAX_AGENTS
+from tests.levels import level
 
 SMALL: dict[str, Any] = {"n_agents": 2, "grid_size": 6, "n_treasures": 3, "clutter_density": 0.0}
 
@@ -53,17 +54,7 @@ def small_env() -> HECOGridEnv:
 
 def state_with(**changes: Any) -> dict[str, Any]:
     """Return a valid state of ``small_env`` with changes; None removes an entry."""
-    walls = np.ones((6, 6), dtype=bool)
-    walls[1:-1, 1:-1] = False
-    state: dict[str, Any] = {
-        "walls": walls,
-        "treasures": np.zeros((6, 6), dtype=np.uint8),
-        "keys": np.zeros((6, 6), dtype=bool),
-        "agent_pos": np.array([[1, 1], [2, 3]]),
-        "agent_dir": np.array([0, 3]),
-        "agent_has_key": np.array([False, False]),
-    }
-    state.update(changes)
+    state = level("######\n#>...#\n#....#\n#.^..#\n#....#\n######") | changes
     return {name: value for name, value in state.items() if value is not None}
 
 

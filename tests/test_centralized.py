@@ -6,11 +6,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
@@ -172,39 +169,6 @@ def test_a_time_limit_is_a_true_end_unless_told_otherwise() -> None:
     env.reset()
     env.step(still(env))
     assert env.step(still(env))[3][3]["TimeLimit.truncated"] is False
-
-
-class SeeRollout(BaseCallback):
-    """Record the rewards of the first rollout, and the values of the last observations before any training."""
-
-    rewards: Array
-
-    def _on_rollout_end(self) -> None:
-        self.rewards = self.model.rollout_buffer.rewards.copy()  # type: ignore[attr-defined]
-        policy = self.model.policy
-        assert isinstance(policy, ActorCriticPolicy)
-        last: dict[str, Array] = {
-            "obs": np.array([[1, agent, 0, 2] for agent in range(3)], dtype=np.float32),
-            "team": np.array([[[1, agent, 0, 2] for agent in range(3)]] * 3, dtype=np.float32),
-            "agent": np.arange(3),
-            "episode_start": np.zeros(3, dtype=np.int64),
-        }
-        with th.no_grad():
-            self.values = policy.predict_values(policy.obs_to_tensor(last)[0])
-
-    def _on_step(self) -> bool:
-        return True
-
-
-@pytest.mark.parametrize(("time_limit", "gamma"), [("terminal", 0.0), ("bootstrap", 0.9)])
-def test_ppo_adds_the_value_of_the_rows_own_last_observation(time_limit: Any, gamma: float) -> None:
-    env = CentralizedValueWrapper(TeamVenv(lengths=(3, 2)), time_limit=time_limit)
-    model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=12, n_epochs=1, gamma=0.9, seed=0, device="cpu")
-    seen = SeeRollout()
-    model.learn(12, callback=seen)
-    expected = np.array([102, 112, 122]) + gamma * seen.values.numpy().flatten()
-    np.testing.assert_allclose(seen.rewards[1, 3:], expected, rtol=1e-6)
-    np.testing.assert_allclose(seen.rewards[1, :3], [2, 12, 22])
 
 
 def test_rows_say_where_episodes_begin_and_last_rows_which_row_they_are_of() -> None:

@@ -56,16 +56,6 @@ def test_the_page(policy: str, tmp_path: Path) -> None:
     assert b"target_update_interval" in told and b"n_kernels" in told
 
 
-def test_training_ends_with_the_same_weights_to_the_last_bit() -> None:
-    alone = model_on(telling(), "QPLEXPoolPolicy").learn(60 * 3)
-    callback = InspectionCallback(telling(), every_game_steps=7, n_eval_episodes=2, pictures=False)
-    watched = model_on(telling(), "QPLEXPoolPolicy")
-    with pytest.warns(UserWarning, match="writes no TensorBoard file"):
-        watched.learn(60 * 3, callback=callback)
-    for name, weights in alone.policy.state_dict().items():
-        assert th.equal(weights, watched.policy.state_dict()[name]), name
-
-
 def rows_of(env: VecEnv) -> dict[str, th.Tensor]:
     obs = env.reset()
     assert isinstance(obs, dict)

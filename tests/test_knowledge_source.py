@@ -29,17 +29,6 @@ def random_team(n_agents: int = N_AGENTS) -> th.Tensor:
     return th.randn(N_TEAMS, n_agents, SIZE)
 
 
-def n_weights(module: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in module.parameters())
-
-
-def test_sizes_of_the_paper() -> None:
-    source = KnowledgeSource(n_agents=10)
-    read = n_weights(source.read_query_norm) + n_weights(source.read_source_norm) + n_weights(source.read_attention)
-    assert read == 16_704
-    assert n_weights(source) - read == 76_096
-
-
 # --- an independent implementation in NumPy, for one team -------------------------------------------------------------
 
 
@@ -101,17 +90,6 @@ def test_agrees_with_an_independent_account(source: KnowledgeSource) -> None:
 
 
 # --- properties -------------------------------------------------------------------------------------------------------
-
-
-def test_agents_permuted_with_their_embeddings_write_the_same(source: KnowledgeSource) -> None:
-    messages, states, order = random_team(), random_team(), th.randperm(N_AGENTS)
-    before, read = source.write(messages), source(messages, states).read
-    with th.no_grad():
-        source.agent_embeddings.copy_(source.agent_embeddings[order])
-    after = source.write(messages[:, order])
-    th.testing.assert_close(after.values, before.values, rtol=0, atol=1e-6)
-    th.testing.assert_close(after.weights, before.weights[:, :, order], rtol=0, atol=1e-6)
-    th.testing.assert_close(source(messages[:, order], states[:, order]).read, read[:, order], rtol=0, atol=1e-6)
 
 
 def test_inactive_agents_are_not_heard(source: KnowledgeSource) -> None:
@@ -181,14 +159,3 @@ def test_critic_on_the_team_reads_everyones_state(heads: str) -> None:
     for agent in range(N_AGENTS):
         gradient = th.autograd.grad(critic.values(states)[:, agent].sum(), states)[0]
         assert (gradient.abs().sum(dim=2) > 0).all()
-
-
-@pytest.mark.parametrize("critic_input", ["own", "team"])
-def test_values_of_active_agents_do_not_depend_on_inactive_ones(critic_input: CriticInput) -> None:
-    critic, views = make_critic(critic_input), th.randn(N_AGENTS, SIZE)
-    teams = th.arange(N_AGENTS).view(1, N_AGENTS)
-    active = th.tensor([[True, True, False, True, True]])
-    before = critic(views, teams, active)
-    views[2] += 10.0
-    assert th.equal(critic(views, teams, active)[active], before[active])
-    assert not th.equal(critic(views, teams)[active], before[active])

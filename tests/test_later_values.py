@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
 from sb3_saf.buffers.later import LaterValues
-from tests.toy_envs import LateEnv
+from tests.toy_envs import late_env
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 
 
@@ -47,7 +47,7 @@ def test_values_of_many_steps_are_those_of_each(policy: str, game: str, normaliz
     venv: Any = {
         "vectors": lambda: ToyTeams(VECTOR),
         "codes": lambda: ToyTeams(CodeSpace()),
-        "agents that join late": lambda: make_team_env(LateEnv, n_envs=2, seed=0),
+        "agents that join late": lambda: make_team_env(late_env, n_envs=2, seed=0),
     }[game]()
     eager = Eager()
     model = PPO(

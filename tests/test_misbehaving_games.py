@@ -352,14 +352,3 @@ def test_observations_are_counted_from_0_and_flattened(
     obs: Any = env.step(np.zeros(4, dtype=int))[0]
     assert obs["obs"][0].tolist() == row
     PPO(policy, env, n_steps=4, batch_size=8, n_epochs=1, rollout_buffer_class=TeamRolloutBuffer).learn(16)
-
-
-@pytest.mark.parametrize(
-    "space", [spaces.MultiBinary(3), spaces.Box(-2, 5, (2,), np.int64), spaces.Discrete(3, start=2)], ids=str
-)
-@pytest.mark.parametrize("policy", ["SAFPolicy", "MAPPOPolicy"])
-def test_actions_of_every_space_reach_the_game(space: spaces.Space[Any], policy: str) -> None:
-    env = make_team_env(MisbehavingEnv, 2, seed=0, action_space=space)
-    PPO(policy, env, n_steps=8, batch_size=16, n_epochs=1, rollout_buffer_class=TeamRolloutBuffer).learn(64)
-    for actions in env.get_attr("last_actions"):
-        assert all(np.asarray(action).dtype == space.dtype and action in space for action in actions.values())

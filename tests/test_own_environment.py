@@ -53,9 +53,8 @@ def test_sb3s_own_buffer_warns_when_the_model_is_made_and_names_the_remedy() -> 
         A2C("SAFPolicy", env, n_steps=4, device="cpu")
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, MaskablePPO])
-@pytest.mark.parametrize("method", ["saf", "mappo", "ippo"])
-def test_settings_fit_the_algorithm(algorithm: Any, method: str) -> None:
+@pytest.mark.parametrize(("method", "algorithm"), [("saf", PPO), ("mappo", A2C), ("ippo", TRPO), ("saf", MaskablePPO)])
+def test_settings_fit_the_algorithm(method: str, algorithm: Any) -> None:
     env = make_team_env("TeamSupport", 2, seed=0, n_agents=2, grid_size=7, n_treasures=2, max_cycles=10)
     settings = ppo_settings(env, method, algorithm, n_steps=8)
     has_own_buffer = algorithm in (PPO, A2C, TRPO)

@@ -126,17 +126,6 @@ def test_the_learning_needs_no_pictures_and_settings_need_neither_rl_zoo_nor_opt
     assert settings.isdisjoint({"rl_zoo3", "optuna", "matplotlib", "pandas"})
 
 
-def _make_commands(text: str) -> list[str]:
-    """Return the targets of the ``make`` calls in a page's code, in order."""
-    code = re.findall(r"```.*?```|`[^`\n]+`", text, flags=re.DOTALL)
-    return [target for piece in code for target in re.findall(r"\bmake ([\w-]+)", piece)]
-
-
-@pytest.mark.skipif(not (ROOT / "README.md").is_file(), reason="README.md is not written yet")
-def test_readme_begins_with_the_two_commands() -> None:
-    assert _make_commands((ROOT / "README.md").read_text(encoding="utf-8"))[:2] == ["train", "test"]
-
-
 @pytest.mark.parametrize("name", INSTALL_FILES)
 def test_no_hosts_indexes_or_machine_paths(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")

@@ -17,6 +17,7 @@ from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.play import HumanWindow
 from hecogrid_envs.rendering import Scene, header_height, render_scene
 from hecogrid_envs.task import TaskName
+from tests.levels import level
 
 pytest.importorskip("PIL")
 
@@ -30,26 +31,14 @@ def make_params(n_agents: int = 1, heterogeneity: int = 1, grid_size: int = SIDE
     )
 
 
-def make_state(agents: list[tuple[int, int, int, bool]], side: int = SIDE) -> dict[str, npt.NDArray[Any]]:
-    """Create an empty room with agents (x, y, direction, has key)."""
-    walls = np.ones((side, side), dtype=bool)
-    walls[1:-1, 1:-1] = False
-    return {
-        "walls": walls,
-        "treasures": np.zeros((side, side), dtype=np.uint8),
-        "keys": np.zeros((side, side), dtype=bool),
-        "agent_pos": np.array([agent[:2] for agent in agents]),
-        "agent_dir": np.array([agent[2] for agent in agents]),
-        "agent_has_key": np.array([agent[3] for agent in agents]),
-    }
-
-
 def make_scene(
     agents: list[tuple[int, int, int, bool]] | None = None, task: TaskName = "TeamSupport", **params: Any
 ) -> Scene:
     agents = [(8, 8, 0, False)] if agents is None else agents
     world = make_params(n_agents=len(agents), **params)
-    return Scene(task, world, make_state(agents, world.grid_size), step=3, collected=1)
+    side = world.grid_size
+    room = "#" * side + ("\n#" + "." * (side - 2) + "#") * (side - 2) + "\n" + "#" * side
+    return Scene(task, world, level(room, agents), step=3, collected=1)
 
 
 def draw(scene: Scene, tile: int = TILE) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:

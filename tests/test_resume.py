@@ -9,26 +9,24 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_saf
 from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
-from sb3_saf.teams.vec_env import TeamVecEnvWrapper
-from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv
+from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv, TellingEnv
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
@@ -129,45 +127,16 @@ def qplex(**parts: Any) -> Any:
     return make(algorithm=QPLEX, policy="QPLEXPolicy", policy_kwargs=LIGHT | parts, **settings)
 
 
-class Masking(TeamVecEnvWrapper):
-    """Forbids each row one action, a different one at each step."""
-
-    def __init__(self, venv: VecEnv) -> None:
-        own, mask = venv.observation_space, spaces.MultiBinary(7)
-        super().__init__(venv, observation_space=spaces.Dict(obs=own, action_mask=mask))
-        self.n_steps = 0
-
-    def _told(self, own: Any) -> dict[str, Any]:
-        return {"obs": own, "action_mask": np.arange(7) != (self.n_steps + np.arange(len(own))[:, np.newaxis]) % 7}
-
-    def reset(self) -> Any:
-        return self._told(self.venv.reset())
-
-    def step_wait(self) -> Any:
-        own, rewards, dones, infos = self.venv.step_wait()
-        self.n_steps += 1
-        for row in np.flatnonzero(dones):
-            last = self._told(infos[row]["terminal_observation"][np.newaxis])
-            infos[row]["terminal_observation"] = {key: part[0] for key, part in last.items()}
-        return self._told(own), rewards, dones, infos
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        return {"n_steps": self.n_steps}
-
-    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        self.n_steps = state["n_steps"]
-
-
 def normalised(**arguments: Any) -> Any:
     rows = sb3_saf.make_team_env("TeamTogether", N_GAMES, **TASK).venv
     return make(env=sb3_saf.CentralizedValueWrapper(VecNormalize(rows, norm_obs=False, **arguments), N_AGENTS))
 
 
 def masked() -> Any:
-    """Create a model whose forbidden actions change from step to step."""
-    native = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=3, **TASK).venv
-    env = sb3_saf.CentralizedValueWrapper(Masking(native))
-    return make(algorithm=MaskablePPO, policy="SAFMaskablePolicy", env=env, batch_size=ROLLOUT, n_epochs=1)
+    """Create a model whose legal actions change from step to step."""
+    env = sb3_saf.make_team_env(TellingEnv, N_GAMES, seed=3)
+    settings = {"batch_size": ROLLOUT, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
+    return make(algorithm=MaskablePPO, policy="SAFMaskablePolicy", env=env, **settings)
 
 
 MODELS: dict[str, Callable[[], Any]] = {

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from benchmarks import scripted
@@ -15,26 +14,16 @@ from benchmarks.scripted_teams import TEAMS
 from hecogrid_envs.batch import GameBatch
 from hecogrid_envs.constants import Direction
 from hecogrid_envs.params import HECOGridParams
-from hecogrid_envs.state import StateMapping
+from tests.levels import State, level
 
-EAST, SOUTH, WEST, NORTH = Direction
+WEST = int(Direction.WEST)
 SCRIPTED = ("7 x 7 views", "full sight")
 
 
-def level(*rows: str, agents: list[tuple[int, int, Direction]]) -> StateMapping:
-    """Draw a level: ``#`` wall, ``T`` treasure, ``K`` key; agents as x, y and direction."""
-    cells = np.array([list(row) for row in rows]).T
-    return StateMapping(
-        walls=cells == "#",
-        treasures=(cells == "T").astype(np.uint8),
-        keys=cells == "K",
-        agent_pos=np.array([agent[:2] for agent in agents], dtype=np.int64),
-        agent_dir=np.array([agent[2] for agent in agents], dtype=np.int64),
-        agent_has_key=np.zeros(len(agents), dtype=np.bool_),
-    )
+Agent = tuple[int, int, int, bool]
 
 
-def collected(name: str, task: str, state: StateMapping, max_cycles: int, **params: Any) -> int:
+def collected(name: str, task: str, state: State, max_cycles: int, **params: Any) -> int:
     """Return what a team has collected after some steps."""
     size, n_agents = len(state["walls"]), len(state["agent_pos"])
     params |= {"n_agents": n_agents, "grid_size": size, "max_cycles": max_cycles}
@@ -44,20 +33,12 @@ def collected(name: str, task: str, state: StateMapping, max_cycles: int, **para
     return scripted.play(name, batch, seed=0)
 
 
-def first_return(name: str, task: str, state: StateMapping, **params: Any) -> int:
+def first_return(name: str, task: str, state: State, **params: Any) -> int:
     """Return the steps after which a team has the first treasure."""
     return next(steps for steps in range(1, 50) if collected(name, task, state, steps, **params))
 
 
-ALONE = level(
-    "######",
-    "#    #",
-    "#    #",
-    "#  #T#",
-    "#    #",
-    "######",
-    agents=[(2, 3, WEST)],
-)
+ALONE = level("######\n#....#\n#....#\n#.<#$#\n#....#\n######")
 
 
 @pytest.mark.parametrize("heterogeneity", [1, 3])
@@ -68,47 +49,45 @@ def test_full_sight_takes_the_shortest_path(heterogeneity: int) -> None:
 
 def test_views_do_not_reach_behind_the_agent() -> None:
     """A treasure two cells behind is not seen; one two cells ahead is, and is reached directly."""
-    rows = ["#######", "#######", "#######", "#T   T#", "#######", "#######", "#######"]
-    seen = level(*rows, agents=[(3, 3, EAST)])
+    wall = "#######\n" * 3
+    seen = level(f"{wall}#$.>.$#\n{wall}")
     batch = GameBatch("TeamSupport", HECOGridParams(1, 7, n_treasures=0, clutter_density=0.0))
     batch.reset(seeds=[0])
     batch.set_state(seen)
     assert batch.fields_of_view()[0, [1, 5], 3].tolist() == [False, True]
     assert first_return("7 x 7 views", "TeamSupport", seen) == 2
-    one_left = level(*[row.replace("T#", " #") for row in rows], agents=[(3, 3, EAST)])
+    one_left = level(f"{wall}#$.>..#\n{wall}")
     assert first_return("full sight", "TeamSupport", one_left) == 4
     assert first_return("7 x 7 views", "TeamSupport", one_left) > 4
 
 
-def beside_a_treasure(other: list[tuple[int, int, Direction]], key: str = " ") -> StateMapping:
+def beside_a_treasure(*others: Agent, key: str = ".") -> State:
     """Return a level with an agent that faces a treasure, optionally others, and optionally a key behind it."""
-    row, empty = f"#{key} T   #", "#      #"
-    return level("########", empty, empty, row, empty, empty, empty, "########", agents=[(2, 3, EAST), *other])
+    empty = "#......#\n"
+    return level(f"########\n{empty * 2}#{key}>$...#\n{empty * 3}########", others)
 
 
 @pytest.mark.parametrize(
     ("task", "coordination", "others", "steps"),
     [
         ("TeamSupport", 1, [], 1),
-        ("TeamSupport", 2, [(5, 3, WEST)], 1),
-        ("TeamSupport", 3, [(5, 3, WEST), (6, 4, WEST)], 2),
-        ("TeamTogether", 2, [(6, 3, WEST)], 3),
-        ("TeamTogether", 3, [(6, 3, WEST), (6, 4, WEST)], 5),
+        ("TeamSupport", 2, [(5, 3, WEST, False)], 1),
+        ("TeamSupport", 3, [(5, 3, WEST, False), (6, 4, WEST, False)], 2),
+        ("TeamTogether", 2, [(6, 3, WEST, False)], 3),
+        ("TeamTogether", 3, [(6, 3, WEST, False), (6, 4, WEST, False)], 5),
     ],
 )
 @pytest.mark.parametrize("name", SCRIPTED)
-def test_agents_meet_at_a_treasure(
-    name: str, task: str, coordination: int, others: list[tuple[int, int, Direction]], steps: int
-) -> None:
+def test_agents_meet_at_a_treasure(name: str, task: str, coordination: int, others: list[Agent], steps: int) -> None:
     """The nearest agent waits for those that are farther away: on the treasure, or within two cells of it."""
-    state = beside_a_treasure(others)
+    state = beside_a_treasure(*others)
     assert first_return(name, task, state, coordination=coordination, agent_order="index") == steps
 
 
 @pytest.mark.parametrize("name", SCRIPTED)
 def test_a_key_comes_first(name: str) -> None:
     """Two turns to the key, pickup, two turns back, one step; views reach one row behind the agent."""
-    assert first_return(name, "KeyForTreasure", beside_a_treasure([], key="K")) == 6
+    assert first_return(name, "KeyForTreasure", beside_a_treasure(key="k")) == 6
 
 
 def test_the_command_writes_its_table(

@@ -360,3 +360,8 @@ def test_every_command_has_help(command: Any, capsys: pytest.CaptureFixture[str]
         main([*before, "--help"])
     assert ended.value.code in (0, None)
     assert "usage: " in capsys.readouterr().out
+
+
+def test_wrong_levels_of_make_train_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = failed(["--coordination", "6", "--output", str(tmp_path)], capsys, quickstart.main)
+    assert "coordination must be an integer from 1 to 5" in line

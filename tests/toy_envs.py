@@ -252,22 +252,6 @@ class BareEnv(ParallelEnv[str, Any, Any]):
         return steps, dict.fromkeys(self.agents, 1.0), terminations, dict.fromkeys(self.agents, False), {}
 
 
-class LateEnv(CounterEnv):
-    """Agent 1 joins with the observation after the first step."""
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        observations, infos = super().reset(seed, options)
-        self.agents = ["agent_0"]
-        return {"agent_0": observations["agent_0"]}, {"agent_0": infos["agent_0"]}
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        observations, *rest = super().step(actions)
-        if self.steps == 1:
-            self.agents = self.possible_agents[:]
-            observations = self._observe()
-        return (observations, *rest)
-
-
 class TellingEnv(CounterEnv):
     """
     Uses everything that rows can contain: agents that join and die, action masks, and a state.
@@ -330,6 +314,11 @@ class TellingEnv(CounterEnv):
 
     def state(self) -> npt.NDArray[Any]:
         return np.array([self.steps, len(self.agents)], np.float32)
+
+
+def late_env() -> TellingEnv:
+    """Agent 1 joins with the observation after the first step."""
+    return TellingEnv(joins={1: 1}, masks=None)
 
 
 class FaultyEnv(CounterEnv):

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.teams.rows import TeamSpaces
+from tests.team_venv import PlainVenv
 
 VECTOR = spaces.Box(-1.0, 1.0, (5,), np.float32)
 PICTURE = spaces.Box(0, 255, (3, 12, 12), np.uint8)
@@ -58,7 +57,7 @@ def to_numpy(obs: dict[str, th.Tensor]) -> dict[str, np.ndarray]:
     return {key: value.numpy() for key, value in obs.items()}
 
 
-class ToyTeams(VecEnv):
+class ToyTeams(PlainVenv):
     """
     Games of ``length`` steps with random views; rewards depend on the first number of an agent's view and its action.
 
@@ -115,20 +114,3 @@ class ToyTeams(VecEnv):
                 info["terminal_observation"] = {key: value[row] for key, value in obs.items()}
                 info["TimeLimit.truncated"] = True
         return obs, rewards, np.full(self.num_envs, done), infos
-
-    def close(self) -> None:
-        pass
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        if attr_name == "render_mode":
-            return [None] * self.num_envs
-        return [getattr(self, attr_name)] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError(method_name)
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
