@@ -364,39 +364,6 @@ def test_equal_views_with_other_agents_active_are_other_teams(kind: Any) -> None
     assert not th.isclose(values[:2], values[3:5], atol=1e-4).any()
 
 
-def enumerated(policy: Any, obs: dict[str, th.Tensor]) -> th.Tensor:
-    """Compute (B, A) probabilities from the networks' outputs."""
-    features = policy.extract_features(obs)
-    mask = obs["action_mask"].double()
-    actor = policy.actor
-    if not hasattr(actor, "policies"):
-        weights, logits = th.ones(len(mask), 1).double(), [actor.head(features)]
-    else:
-        keys = actor.signature_keys
-        weights = (actor.query_net(features) @ keys.t() / keys.shape[1] ** 0.5).double().softmax(dim=1)
-        logits = [head(features) for head in actor.policies]
-    by_policy = [one.double().exp() * mask for one in logits]
-    return sum(w.unsqueeze(1) * p / p.sum(dim=1, keepdim=True) for w, p in zip(weights.t(), by_policy, strict=True))
-
-
-@pytest.mark.parametrize("kind", POLICIES)
-def test_likelihood_and_entropy_under_masks_against_enumeration(kind: Any) -> None:
-    policy = make_policy(kind)
-    obs = random_rows()
-    probabilities = enumerated(policy, obs)
-    distribution = policy.get_distribution(obs)
-    found = th.stack([distribution.log_prob(th.full((18,), a)) for a in range(N_ACTIONS)], dim=1)
-    allowed = obs["action_mask"] == 1
-    assert (found.exp()[~allowed] == 0).all(), "exactly zero"
-    th.testing.assert_close(found.double().exp(), probabilities, rtol=1e-4, atol=1e-6)
-    entropy = -th.special.xlogy(probabilities, probabilities).sum(dim=1)
-    th.testing.assert_close(distribution.entropy().double(), entropy, rtol=1e-4, atol=1e-5)
-    actions, _, log_prob = policy.forward(obs)
-    assert allowed.gather(1, actions.unsqueeze(1)).all()
-    th.testing.assert_close(log_prob, found.gather(1, actions.unsqueeze(1)).squeeze(1))
-    assert (policy.get_distribution(obs).mode() == probabilities.argmax(dim=1)).all()
-
-
 @pytest.mark.parametrize(
     "kwargs", [{"selection": "gumbel"}, {"n_policies": 1, "heads": "per_agent"}, {"n_policies": 2}]
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,13 +13,13 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy
+from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy, TeamRolloutBuffer
 from sb3_saf.networks.layers import Linear
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
@@ -521,51 +522,29 @@ def test_malformed_observations_are_refused() -> None:
 # --- in PPO -----------------------------------------------------------------------------------------------------------
 
 
-class FirstRatios(BaseCallback):
-    """Collects PPO's probability ratios of each first epoch, as PPO computes them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.ratios: list[th.Tensor] = []
-
-    def _on_training_start(self) -> None:
-        assert isinstance(self.model, PPO)
-        buffer, policy = self.model.rollout_buffer, self.model.policy
-        get, evaluate, old = buffer.get, policy.evaluate_actions, []
-
-        def get_and_note(batch_size: int | None = None) -> Any:
-            for samples in get(batch_size):
-                old.append(samples.old_log_prob)
-                yield samples
-
-        def evaluate_and_note(*args: Any) -> Any:
-            results = evaluate(*args)
-            self.ratios.append((results[1].detach() - old[-1]).exp())
-            return results
-
-        buffer.get, policy.evaluate_actions = get_and_note, evaluate_and_note  # type: ignore[method-assign, assignment]
-
-    def _on_step(self) -> bool:
-        return True
-
-
-def first_epochs_ratios(batch_size: int, **kwargs: Any) -> th.Tensor:
+def first_ratios(batch_size: int, **kwargs: Any) -> th.Tensor:
+    """Return PPO's probability ratios in a first epoch, whose weights are those of the rollout."""
     model = make_model(batch_size=batch_size, n_epochs=1, learning_rate=0.0, **kwargs)
-    callback = FirstRatios()
-    model.learn(240, callback=callback)
-    return th.cat(callback.ratios)
+    model.learn(240)
+    ratios = []
+    for samples in model.rollout_buffer.get(batch_size):
+        actions = (
+            samples.actions.long().flatten() if isinstance(model.action_space, spaces.Discrete) else samples.actions
+        )
+        ratios.append((model.policy.evaluate_actions(samples.observations, actions)[1] - samples.old_log_prob).exp())
+    return th.cat(ratios).detach()
 
 
 @pytest.mark.parametrize("action_space", ACTIONS.values(), ids=list(ACTIONS))
 def test_the_ratio_is_one_before_the_weights_change(action_space: spaces.Space[Any]) -> None:
-    ratios = first_epochs_ratios(24, venv=ToyTeams(action_space=action_space))
-    assert len(ratios) == 240
+    ratios = first_ratios(24, venv=ToyTeams(action_space=action_space))
+    assert len(ratios) == 120
     assert (ratios - 1).abs().max() < 1e-6
 
 
 def test_with_gumbel_it_is_not() -> None:
     # Newly sampled policies are compared with those that acted. (They are initially equal, so make them differ.)
-    ratios = first_epochs_ratios(120, policy_kwargs={"selection": "gumbel", "ortho_init": False})
+    ratios = first_ratios(120, policy_kwargs={"selection": "gumbel", "ortho_init": False})
     assert (ratios - 1).abs().max() > 1e-2
 
 
@@ -598,6 +577,42 @@ def test_ppo_learns_and_no_weight_is_dead(name: str, kwargs: dict[str, Any], act
         assert parameter.isfinite().all()
         assert parameter.grad is not None, parameter_name
         assert parameter.grad.flatten(1 if parameter.dim() > 1 else 0).abs().sum(dim=-1).min() > 0, parameter_name
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "own", "action"),
+    [
+        ("IPPOPolicy", {"actor_identity": True}, VECTOR, "discrete"),
+        ("MAPPOPolicy", {}, CodeSpace(), "box"),
+        ("SAFPolicy", {}, VECTOR, "discrete"),
+        ("SAFPolicy", {"critic_input": "team", "heads": "per_agent"}, CodeSpace(), "box"),
+    ],
+)
+def test_an_update_is_the_same_with_both_buffers_and_encodings(
+    name: str, kwargs: dict[str, Any], own: spaces.Space[Any], action: str
+) -> None:
+    """Loss and gradients of one step on all of a rollout, with SB3's buffer and ours, encoding equal views once or not."""
+    models, gradients = [], []
+    for buffer_class, encode_once in product((None, TeamRolloutBuffer), (True, False)):
+        parts = kwargs | {"encode_once": encode_once, "chunk_size": 7 if encode_once else None}
+        settings: dict[str, Any] = {"ent_coef": 0.01, "clip_range_vf": 0.2, "max_grad_norm": 1e6}  # no clipping
+        settings |= {"batch_size": 120, "n_epochs": 1, "rollout_buffer_class": buffer_class, "policy_kwargs": parts}
+        model = make_model(name, ToyTeams(own, ACTIONS[action]), **settings)
+        models.append(model.learn(120, log_interval=None))  # type: ignore[arg-type]  # None keeps what was logged
+        gradients.append({key: p.grad for key, p in model.policy.named_parameters() if p.grad is not None})
+    reference, expected = models[0], gradients[0]
+    assert type(reference.rollout_buffer) is DictRolloutBuffer
+    assert expected.keys() == dict(reference.policy.named_parameters()).keys()
+    for model, found in zip(models[1:], gradients[1:], strict=True):
+        # The same rollout: rewards depend on views and actions. (SB3's buffer reorders the other arrays.)
+        rewards, same = model.rollout_buffer.rewards, reference.rollout_buffer.rewards
+        np.testing.assert_allclose(rewards, same, rtol=1e-5, atol=5e-6)  # bootstrapped values in float32
+        for tag in ("train/loss", "train/value_loss", "train/policy_gradient_loss", "train/entropy_loss"):
+            logged, right = (m.logger.name_to_value[tag] for m in (model, reference))
+            assert logged == pytest.approx(right, rel=1e-5, abs=1e-6), tag
+        for key, gradient in found.items():
+            scale = expected[key].abs().max().clamp_min(1.0)
+            assert (gradient - expected[key]).abs().max() <= 1e-5 * scale, key
 
 
 # --- saving -----------------------------------------------------------------------------------------------------------

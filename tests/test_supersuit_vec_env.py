@@ -28,14 +28,12 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_saf import game_seeds
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-from tests import toy_envs
 from tests.toy_envs import (
     BareEnv,
     CounterEnv,
     DictEnv,
     EagerEnv,
     FaultyEnv,
-    LockedFactory,
     OuterWrapper,
     ReusingEnv,
     TracingEnv,
@@ -481,6 +479,9 @@ def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -
 # ---- bad input
 
 
+SAME = CounterEnv()
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -491,7 +492,7 @@ def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -
         ("counter", "got an object of type str"),
         (SimpleNamespace(__name__="games.tag", parallel_env=CounterEnv), "pass games.tag.parallel_env(...)"),
         (UnpicklableEnv(), "pass a function that makes the environment instead"),
-        (toy_envs.same_env_again, "got one that returned the same object for 3 games"),
+        (lambda: SAME, "got one that returned the same object for 3 games"),
     ],
 )  # fmt: skip
 def test_wrong_environment(bridge: Bridge, make: Any, message: str) -> None:
@@ -507,7 +508,7 @@ def test_what_cannot_be_pickled_stays_in_this_process(bridge: Bridge) -> None:
         def observation_space(self, agent: str) -> spaces.Space[Any]:
             return super().observation_space(agent)
 
-    for make in (LockedFactory(), CachedEnv, lambda: CachedEnv(), CachedEnv()):
+    for make in (CachedEnv, lambda: CachedEnv(), CachedEnv()):
         venv = bridge(make, n_games=3, seed=0)
         draws = np.asarray(venv.reset())[::2, 2]
         assert len(set(draws.tolist())) == 3, "each game has its own generator"
@@ -734,9 +735,14 @@ def test_game_that_can_only_be_closed_after_a_reset(bridge: Bridge, n_cpus: int)
 
 def test_every_game_that_was_made_is_closed(bridge: Bridge) -> None:
     """SuperSuit makes spare copies and drops them; none of them may keep a game open."""
-    toy_envs.MADE.clear()
-    bridge(toy_envs.recorded_env, n_games=3).close()
-    assert [env.closed for env in toy_envs.MADE] == [True] * 4  # one was made for the spaces
+    made: list[CounterEnv] = []
+
+    def make() -> CounterEnv:
+        made.append(CounterEnv())
+        return made[-1]
+
+    bridge(make, n_games=3).close()
+    assert [env.closed for env in made] == [True] * 4  # one was made for the spaces
 
 
 SCRIPT = """

@@ -433,30 +433,3 @@ class OuterWrapper(BaseParallelWrapper[str, Any, Any]):
     def __init__(self, env: ParallelEnv[str, Any, Any]):
         super().__init__(env)
         self.colour = "red"
-
-
-class LockedFactory:
-    """A factory that cannot be pickled."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-
-    def __call__(self) -> CounterEnv:
-        return CounterEnv()
-
-
-MADE: list[CounterEnv] = []
-
-
-def recorded_env() -> CounterEnv:
-    """Record what was created in ``MADE``."""
-    MADE.append(CounterEnv())
-    return MADE[-1]
-
-
-SINGLETON = CounterEnv()
-
-
-def same_env_again() -> CounterEnv:
-    """Return the same environment every time."""
-    return SINGLETON
