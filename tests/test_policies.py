@@ -526,11 +526,9 @@ def first_ratios(batch_size: int, **kwargs: Any) -> th.Tensor:
     """Return PPO's probability ratios in a first epoch, whose weights are those of the rollout."""
     model = make_model(batch_size=batch_size, n_epochs=1, learning_rate=0.0, **kwargs)
     model.learn(240)
-    ratios = []
+    is_discrete, ratios = isinstance(model.action_space, spaces.Discrete), []
     for samples in model.rollout_buffer.get(batch_size):
-        actions = (
-            samples.actions.long().flatten() if isinstance(model.action_space, spaces.Discrete) else samples.actions
-        )
+        actions = samples.actions.long().flatten() if is_discrete else samples.actions
         ratios.append((model.policy.evaluate_actions(samples.observations, actions)[1] - samples.old_log_prob).exp())
     return th.cat(ratios).detach()
 
@@ -591,7 +589,7 @@ def test_ppo_learns_and_no_weight_is_dead(name: str, kwargs: dict[str, Any], act
 def test_an_update_is_the_same_with_both_buffers_and_encodings(
     name: str, kwargs: dict[str, Any], own: spaces.Space[Any], action: str
 ) -> None:
-    """Loss and gradients of one step on all of a rollout, with SB3's buffer and ours, encoding equal views once or not."""
+    """Loss and gradients of one step, with SB3's buffer and ours, encoding equal views once or not."""
     models, gradients = [], []
     for buffer_class, encode_once in product((None, TeamRolloutBuffer), (True, False)):
         parts = kwargs | {"encode_once": encode_once, "chunk_size": 7 if encode_once else None}
