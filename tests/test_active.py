@@ -548,15 +548,6 @@ def test_values_are_normalised_by_the_returns_of_those_who_take_part() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "policy_kwargs", [{"critic_input": "state"}, {"heads": "per_agent"}, {"agent_identity": False}]
-)
-def test_normalised_values_with_every_critic_and_agents_that_die(policy_kwargs: dict[str, Any]) -> None:
-    env = telling_env(time_limit="bootstrap")
-    model = make_model("MAPPOPolicy", env, policy_kwargs={"normalize_values": True, **policy_kwargs}).learn(120)
-    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-
-
 @pytest.mark.parametrize("masks", ["observation", "info"])
 def test_maskable_ppo_finds_the_masks_that_observations_show(masks: str) -> None:
     """The game has no method action_masks(), and fails the test at the first illegal action."""

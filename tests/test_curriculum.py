@@ -121,8 +121,6 @@ def test_settings_give_shares_of_the_run() -> None:
     ("stages", "message"),
     [
         ([{"coordination": 1}], "share, between 0 and 1"),
-        ([{"share": 0.5}], "share, between 0 and 1"),
-        ([{"share": 2, "coordination": 1}], "share, between 0 and 1"),
         ([{"share": 0.6, "coordination": 1}, {"share": 0.4, "coordination": 2}], "must leave game steps"),
         ([{"share": 0.5, "coordination": 9}], "coordination"),
         ([{"share": 0.5, "cordination": 1}], "cordination"),

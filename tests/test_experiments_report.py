@@ -113,16 +113,6 @@ def test_losses_are_shares_of_the_first_level(page: str) -> None:
     assert losses(table, EXPERIMENTS["ood-coordination"].views[0]) == ""
 
 
-def test_parts_of_an_experiment(folder: Path, tmp_path: Path) -> None:
-    part = shutil.copytree(folder, tmp_path / "part")
-    page = report(part, "--methods", "ippo", "--tasks", "TeamSupport", "--seeds", "1", "--levels", "1", "3")
-    page = page.split("## Run it again")[0]
-    assert "ippo and a random team, seeds 1." in page
-    assert "| TeamSupport | c=1, h=1 | c=3, h=1 | seeds |" in page
-    assert "curve-TeamSupport-c3-h1.png" in page and "curve-TeamSupport-c2-h1.png" not in page
-    assert "TeamTogether" not in page
-
-
 def test_results_as_tables(folder: Path) -> None:
     tests, curves = read_results(folder, "coordination")
     stored = pd.read_csv(folder / "coordination" / "runs.csv", float_precision="round_trip")

@@ -15,7 +15,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_saf import QPLEX, InspectionCallback, evaluate_team, make_team_env
 from sb3_saf.inspection.reading import QReader
 from sb3_saf.inspection.recording import record_episodes
-from sb3_saf.networks.actor import PolicyPool
 from tests.probe_envs import ConstantReward
 from tests.toy_envs import TellingEnv
 
@@ -99,18 +98,3 @@ def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> No
         return
     assert (recording.last_values[1] != 0).all() and (recording.last_values[0] == 0).all()
     np.testing.assert_allclose(returns[1], 2 + 0.5 * recording.last_values[1])
-
-
-@th.no_grad()
-def test_heads_of_a_pool_differ_where_their_best_actions_do() -> None:
-    env = telling(masks=None, joins={}, deaths={})
-    team = model_on(env, "QPLEXPoolPolicy", n_policies=2).policy
-    obs = rows_of(env)
-    view = QReader(team).step(obs, np.ones(12, dtype=bool))
-    assert view.pool_weights is not None and view.pool_actions is not None
-    np.testing.assert_allclose(view.pool_weights.sum(dim=1), 1, rtol=1e-5)
-    assert isinstance(team.actor, PolicyPool)
-    log_weights, of_heads = team.actor.evaluate(team.extract_features(obs))
-    np.testing.assert_allclose(view.pool_weights, log_weights.exp())
-    assert th.equal(view.pool_actions.argmax(dim=2), of_heads.argmax(dim=2))
-    assert (view.pool_actions == 0).sum(dim=2).eq(1).all()

@@ -224,15 +224,6 @@ def test_selection_by_signature_keys() -> None:
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_pool_of_mixture_is_the_mixture_of_what_it_evaluates(space: spaces.Space[Any]) -> None:
-    pool, features = make_pool(space, "mixture"), th.randn(N_ROWS, 6)
-    found, expected = pool.distribution(pool(features)), mixture_of(space, *pool.evaluate(features))
-    actions = expected.sample()
-    th.testing.assert_close(found.log_prob(actions), expected.log_prob(actions))
-    assert th.equal(found.mode(), expected.mode())
-
-
-@pytest.mark.parametrize("space", SPACES)
 def test_gumbel_is_one_policy_at_a_time_and_its_mode_the_favourites(space: spaces.Space[Any]) -> None:
     pool, features = make_pool(space, "gumbel"), th.randn(N_ROWS, 6)
     output, parameters = pool.evaluate(features), pool(features)

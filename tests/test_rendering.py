@@ -174,20 +174,6 @@ def test_views_are_outlined_and_change_nothing_else() -> None:
     assert (drawn - plain)[4, 5, 10, 0, 0] < 16
 
 
-# --- the bar above the map
-
-
-def test_step_score_and_treasures_are_in_the_header() -> None:
-    scene = make_scene()
-    scene.state["treasures"][2, 2:5] = 1
-    pages = {
-        draw(scene._replace(step=step, collected=collected))[0].tobytes() for step in (3, 4) for collected in (1, 2)
-    }
-    assert len(pages) == 4
-    scene.state["treasures"][2, 2] = 2
-    assert draw(scene._replace(step=3, collected=1))[0].tobytes() not in pages
-
-
 # --- missing packages
 
 
@@ -209,31 +195,6 @@ def pygame(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     module = pytest.importorskip("pygame")
     yield module
     module.display.quit()
-
-
-def test_window_shows_the_picture(pygame: Any) -> None:
-    picture = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    with closing(HumanWindow("title")) as window:
-        assert not window.is_open
-        window.show(picture)
-        assert window.is_open
-        assert pygame.display.get_caption()[0] == "title"
-        shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
-        np.testing.assert_array_equal(shown, picture)
-        window.show(np.zeros((8, 10, 3), dtype=np.uint8))
-        assert pygame.display.get_surface().get_size() == (10, 8)
-    assert not window.is_open
-    assert not pygame.display.get_init()
-
-
-def test_window_hands_over_keys_once(pygame: Any) -> None:
-    with closing(HumanWindow()) as window:
-        assert window.poll() == []
-        window.show(np.zeros((4, 4, 3), dtype=np.uint8))
-        for key in (pygame.K_LEFT, pygame.K_SPACE, pygame.K_p, pygame.K_3, pygame.K_KP4, pygame.K_TAB, pygame.K_ESCAPE):
-            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key))
-        assert window.poll() == ["left", "space", "p", "3", "4", "tab", "escape"]
-        assert window.poll() == []
 
 
 def test_closed_window_stays_closed(pygame: Any) -> None:

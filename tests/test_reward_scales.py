@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import CallbackList
 
 from sb3_saf import TeamRolloutBuffer, make_team_env, ppo_settings
 from sb3_saf.networks.value_normalizer import ValueNormalizer
@@ -107,22 +106,6 @@ def test_statistics_of_each_agent() -> None:
             assert th.equal(normalizer(outputs, agents=agents)[rows], one(outputs[rows]))
         after = normalizer(outputs, agents=agents)
         th.testing.assert_close(after, (before * scale[agents] + shift[agents]).float(), rtol=1e-4, atol=1e-3)
-
-
-def test_the_critic_starts_from_the_old_values_after_an_update() -> None:
-    """PPO's old values are converted with the statistics of their own agents."""
-    model = make("MAPPO", (1.0, 1000.0), normalize_values=True, clip_range_vf=1e-6, n_epochs=1, batch_size=256)
-    model.learn(32 * 4 * 2)
-    policy: Any = model.policy
-    policy.set_training_mode(True)
-    callback = CallbackList([])
-    callback.init_callback(model)
-    assert model.env is not None
-    model.collect_rollouts(model.env, callback, model.rollout_buffer, 32)
-    policy.set_training_mode(True)
-    (minibatch,) = model.rollout_buffer.get(None)
-    values, _, _ = policy.evaluate_actions(minibatch.observations, minibatch.actions.long().flatten())
-    th.testing.assert_close(minibatch.old_values, values.flatten(), rtol=1e-3, atol=1e-2)
 
 
 def test_choices_are_named() -> None:

@@ -108,20 +108,6 @@ def test_what_is_said_of_packages_that_are_missing_or_of_another_version() -> No
     assert "another version of Python" in str(Suite("x", requires=('a; python_version < "3"',), **one).problem())
 
 
-@_needs("lbf")
-def test_unknown_ids_name_the_nearest() -> None:
-    for name, expected in (
-        ("lbf/Foraging-8x8-2p-3f", "did you mean lbf/Foraging-8x8-2p-3f-v3, .*sb3_saf.suites lbf lists all 1920"),
-        ("lbf/zzz", "there are lbf/Foraging-8x8-2p-3f-v3, "),
-    ):
-        with pytest.raises(ValueError, match=expected):
-            make_team_env(name)
-        with pytest.raises(ValueError, match=expected):
-            find_environment(name)
-    with pytest.raises(ValueError, match=r"cannot be made with \{'colour': 1\}"):
-        make_team_env("lbf/Foraging-8x8-2p-3f-v3", colour=1)
-
-
 def test_an_engine_that_does_not_take_a_parameter_says_so() -> None:
     def engine(task: str, n_envs: int, seed: int | None, *, size: int) -> None:
         raise AssertionError
@@ -435,6 +421,7 @@ def test_the_tasks_of_hecogrid_are_a_suite_and_have_short_names() -> None:
     [
         ("TeemSupport", "'TeamSupport'"),
         ("lfb/Foraging-8x8-2p-3f-v3", "'lbf/Foraging-8x8-2p-3f-v3'"),
+        ("lbf/Foraging-8x8-2p-3f", "lbf/Foraging-8x8-2p-3f-v3"),
         ("simple_spread", "'mpe/simple_spread_v3'"),
         ("hecogrid/TeamSuport", "hecogrid/TeamSupport-v0"),
     ],

@@ -65,15 +65,6 @@ def test_what_is_not_known_is_left_out() -> None:
     assert render_text(make_state(), step=0, legend=False).splitlines() == ["step 0", *lines[2:-1]]
 
 
-def test_every_direction_with_and_without_key() -> None:
-    state = make_state()
-    state["agent_pos"] = np.array([(x, y) for y in (1, 2) for x in (1, 2, 3, 4)])
-    state["agent_dir"] = np.array([0, 1, 2, 3] * 2)
-    state["agent_has_key"] = np.array([False] * 4 + [True] * 4)
-    rows = render_text(state).splitlines()
-    assert rows[1:3] == ["#>v<^.#", "#ESWN.#"]
-
-
 @pytest.mark.parametrize(("number", "character"), [(1, "v"), (2, "2"), (9, "9"), (10, "+"), (40, "+")])
 def test_crowds_are_counted(number: int, character: str) -> None:
     state = make_state()

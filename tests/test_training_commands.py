@@ -310,7 +310,6 @@ def failed(
     ("options", "words"),
     [
         (["--env-kwargs", "coordination"], ("expects key:value", "coordination:2")),
-        (["--env-kwargs", "coordination:{"], ("not valid YAML",)),
         (["-params", "policy_kwargs:{n_slots:2}"], ("write a space after the colon of 'n_slots:2'",)),
         (["--eval-env-kwargs", "n_agents:5"], ("evaluation needs the 4 agents of training",)),
         (["-params", "algorithm:MaskablePPO"], ("TeamTogether-v0 has no action masks",)),
@@ -318,7 +317,6 @@ def failed(
         (["--trial-id", "1"], ("--trial-id needs the --storage and --study-name",)),
         (["--trial-id", "x", "--storage", "s.log", "--study-name", "s"], ("a trial's number or 'best'",)),
         (["--trial-id", "1", "--storage", "s.log", "--study-name", "s"], ("there is no study file s.log",)),
-        (["--sampler", "grid"], ("invalid choice", "--help")),
         (["-f", "/dev/null/logs"], ("Not a directory", "/dev/null/logs")),
         (["--game-step", "5"], ("unrecognized arguments", "--help")),
         (["--env", "tests.toy_envs:BareEnv", "--env-kwargs", "size:3"], ("cannot be made with {'size': 3}",)),

@@ -6,14 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
-from matplotlib.patches import Rectangle
 
 pytest.importorskip("rliable")
 
 from rliable import metrics
 
 from sb3_saf import confidence_interval
-from sb3_saf.training.figures import draw_curves, draw_differences, draw_levels, method_styles
+from sb3_saf.training.figures import draw_curves, draw_levels, method_styles
 from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import (
     interquartile_means,
@@ -131,38 +130,11 @@ def test_performance_profiles_are_shares_above_thresholds() -> None:
     assert (profile.share <= profile.high).all()
 
 
-def test_pooled_differences_are_diamonds_on_the_band_of_no_difference() -> None:
-    rows = [("saf", "a", 1.0, 0.0, 2.0, False), ("saf", "together", 2.0, 1.0, 3.0, True)]
-    names = ["method", "level", "value", "low", "high", "pooled"]
-    (axes,) = draw_differences(pd.DataFrame(rows, columns=names), band=2.0).axes
-    diamonds = [np.asarray(line.get_xdata()).tolist() for line in axes.get_lines() if str(line.get_marker()) == "D"]
-    assert diamonds == [[2.0]]
-    (band,) = axes.patches
-    assert isinstance(band, Rectangle) and (band.get_x(), band.get_width()) == (-2, 4)
-
-
 def test_methods_keep_their_styles_and_none_looks_like_another() -> None:
     assert method_styles(["ippo", "saf"])["saf"] == method_styles(["saf", "other"])["saf"]
     methods = [*ALGOS, "random", "saf gamma=0.9", "saf, variant 1"]
     assert len(set(method_styles(methods).values())) == len(methods)
     assert method_styles(methods)["saf-lstm"].colour == method_styles(methods)["saf"].colour
-
-
-@pytest.mark.parametrize("n_panels", [1, 2, 9])
-def test_legends_lie_inside_the_figure_and_cover_nothing(n_panels: int) -> None:
-    """Constrained layout only warns if it does not fit; warnings are errors here."""
-    long_names = runs(**{f"saf with_a_setting_of_a_long_name={index}": [[0.0, 1.0]] for index in range(12)})
-    table = pd.concat([long_names.assign(task=f"task {index}") for index in range(n_panels)])
-    for figure in (
-        draw_curves(table, panel="task"),
-        draw_levels(table.assign(coordination=1), "coordination", panel="task"),
-    ):
-        figure.draw_without_rendering()
-        (legend,) = figure.legends
-        box = legend.get_window_extent()
-        assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0
-        boxes = [axes.get_tightbbox() for axes in figure.axes if axes.axison]
-        assert all(each is not None and box.y1 <= each.y0 + 1 for each in boxes)
 
 
 def test_tables_are_checked() -> None:

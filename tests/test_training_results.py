@@ -123,7 +123,6 @@ def test_a_window_needs_a_display(
         (["--algo", "safe"], "did you mean 'saf'"),
         (["--algo", "ippo"], "python -m sb3_saf.train --algo ippo"),
         (["-f", "nowhere"], "there is no folder nowhere/saf; train first"),
-        (["--exp-id", "9"], "there is no run 9 of TeamTogether-v0"),
         (["--env", "TeamSupport-v0"], "there is no run of TeamSupport-v0"),
         (["--load-checkpoint", "81"], "has no rl_model_81_steps.zip"),
         (["--gif", "film.mp4"], "a file that ends with .gif"),
@@ -298,8 +297,6 @@ def test_plots_of_rl_zoo3_read_the_folders(logs: Path, tmp_path: Path) -> None:
     ("options", "words"),
     [
         (["curves", "-f", "nowhere", "-o", "a.png"], "there is no folder nowhere"),
-        (["curves", "--env", "TeamSupport-v0", "-o", "a.png"], "there are no runs of TeamSupport-v0"),
-        (["curves", "--algos", "mapo", "-o", "a.png"], "did you mean 'mappo'"),
         (["curves", "-o", "a.txt"], "Format 'txt' is not supported (supported formats: "),
         (["levels", "--level", "cordination", "-o", "a.png"], "did you mean 'coordination'"),
         (["aggregate", "-o", "a.png"], "aggregates"),

@@ -20,7 +20,7 @@ from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ALGOS, load_settings, saved_settings
-from sb3_saf.training.yaml_files import SIZES, Size, config_names, read_settings
+from sb3_saf.training.yaml_files import SIZES, Size
 
 ENV = "TeamTogether-v0"
 ENV_IDS = suites()["hecogrid"].tasks
@@ -77,16 +77,6 @@ def test_paper_optimizer() -> None:
 def _defaults(algorithm: type) -> dict[str, Any]:
     parameters = inspect.signature(algorithm).parameters.values()
     return {parameter.name: parameter.default for parameter in parameters}
-
-
-@pytest.mark.parametrize("config", [name for name in config_names() if name != "levels"])
-def test_files_have_only_what_differs(config: str) -> None:
-    content = read_settings(config)
-    assert {key for key in content if "/" not in key} <= {"default", "hecogrid", *ENV_IDS, *suites()}
-    algorithm = next((spec.algorithm for spec in ALGOS.values() if spec.config == config), PPO)
-    defaults = _defaults(algorithm)
-    repeated = {key for key, value in content["default"].items() if key in defaults and value == defaults[key]}
-    assert repeated == set()
 
 
 def test_sizes_are_those_of_the_experiments() -> None:
@@ -169,18 +159,15 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"algo": "sfa"}, "did you mean 'saf'"),
-        ({"size": "smal"}, "did you mean 'small'"),
         ({"env_kwargs": {"coordinaton": 2}}, "did you mean 'coordination'"),
         ({"overrides": {"learning_rat": 1}}, "did you mean 'learning_rate'"),
         ({"overrides": {"seed": 1}}, "'seed'"),  # set per run
         ({"overrides": {"algo": "MaskablePPO"}}, "'algo'"),  # the method; its algorithm has another name
         ({"overrides": {"n_timesteps": 1, "game_steps": 1}}, "say the same thing"),
-        ({"overrides": {"batch_size": 500, "n_minibatches": 2}}, "say the same thing"),
         ({"overrides": {"normalize": "yes"}}, "normalize='yes'"),
         ({"overrides": {"policy": "MlpPolicy"}}, "--algo"),
         ({"overrides": {"learning_rate": "fast"}}, "learning_rate='fast': .*lin_7e-4"),
         ({"overrides": {"gamma": 50}}, "gamma=50"),
-        ({"overrides": {"n_steps": 1.5}}, "n_steps=1.5"),
         ({"overrides": {"n_envs": 0}}, "n_envs=0"),
         ({"overrides": {"time_limit": "end"}}, "time_limit='end'"),
         ({"overrides": {"policy_kwargs": "dict(n_slots=8)"}}, "policy_kwargs='dict"),
@@ -201,11 +188,9 @@ def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
     [
         ("default: {n_envs: 2", "not valid YAML"),
         ("- 1", "must map 'default'"),
-        ("default: 3", "'default' must map"),
         ("default: {n_envs: 2, n_envs: 3}", "'n_envs' is there twice"),
         ("default: {sizes: {tiny: {}}}", "unknown size 'tiny'"),
         ("TeamTogeter-v0: {}", "did you mean 'TeamTogether-v0'"),
-        ("default: {n_env: 2}", "did you mean 'n_envs'"),
         ("base: sfa", "did you mean 'saf'"),
         ("default: {n_envs: !!python/object/apply:os.getcwd []}", "not valid YAML"),
     ],
