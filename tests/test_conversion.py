@@ -147,27 +147,6 @@ def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: P
         observations = {agent: observations[agent] for agent in game.agents}
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "policy", "kwargs"),
-    [
-        (QPLEX, "QPLEXPolicy", {}),
-        (QPLEX, "QPLEXPolicy", {"memory": "gru"}),
-        (PPO, "IPPOPolicy", {"memory": "lstm"}),
-        (PPO, "MAPPOPolicy", {}),
-    ],
-)
-def test_every_algorithm_acts_on_the_games_observations(algorithm: Any, policy: str, kwargs: dict[str, Any]) -> None:
-    model = make(algorithm, policy, make_team_env(partial(Kinds, "vectors", "info"), seed=0), policy_kwargs=kwargs)
-    game: Any = Kinds("vectors", "info")
-    state = None
-    given = game.reset(seed=0)
-    for step in range(2):
-        actions, state = model.predict(given, state, np.full(3, step == 0))
-        observations, _, _, _, infos = game.step(actions)
-        given = observations, infos
-        assert (state is None) == (not kwargs)
-
-
 def test_masks_are_passed_by_agent() -> None:
     env = make_team_env(partial(Kinds, "equal"), seed=0, action_masks=False)
     model = make(MaskablePPO, "MAPPOMaskablePolicy", env)

@@ -19,21 +19,24 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
 from sb3_saf import (
+    QPLEX,
     CentralizedValueWrapper,
     GameStepsCallback,
     InspectionCallback,
     TeamMonitor,
     TeamRolloutBuffer,
+    evaluate_team,
     inspect_team,
     make_team_env,
 )
+from sb3_saf.inspection.reading import QReader
 from sb3_saf.inspection.recording import EpisodeRecording, lambda_returns, record_episodes, zones_by_attribute
-from sb3_saf.inspection.scalars import calibrate, critic_scalars, message_scalars
+from sb3_saf.inspection.scalars import critic_scalars, message_scalars
 from sb3_saf.inspection.tensorboard import Line, line_of
 from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.ippo import IPPOPolicy
@@ -261,20 +264,6 @@ class Critic(nn.Module):
 
 
 class TestCritic:
-    def test_an_exact_critic_is_calibrated(self) -> None:
-        env = make_team_env(DelayedReward(length=3), n_envs=8)
-        policy = hand_made(IPPOPolicy, env)
-        # Exact for three steps: gamma ** steps_left times the number seen.
-        policy.value_net = Critic(lambda seen: seen[:, 0] * 0.5 ** (2 - seen[:, 1] - 2 * seen[:, 2]))
-        game = play(env, policy)
-        returns = game.returns
-        assert set(np.abs(returns[game.counted]).tolist()) == {0.25, 0.5, 1.0}
-        found = calibrate(game.values[game.counted], returns[game.counted])
-        assert found == pytest.approx((1, 1, 0, 0))
-        scalars = critic_scalars(game, 0.9)
-        assert scalars["critic/td_error"] == pytest.approx(0)
-        assert scalars["critic/explained_variance_of_target"] == pytest.approx(1)
-
     @pytest.mark.parametrize(("time_limit", "bias"), [("bootstrap", 0.0), ("terminal", 2 - (1.5 + 1) / 2)])
     def test_time_limits_are_those_of_training(self, time_limit: Any, bias: float) -> None:
         """Reward 1 at every step: the value is 2 if the time limit does not terminate, otherwise 1.5 and then 1."""
@@ -356,6 +345,89 @@ class TestMessages:
             "message/value_error",
             "message/value_error_zeroed",
         }
+
+
+# --- QPLEX: values of teams, best actions -----------------------------------------------------------------------------
+
+
+NETS: dict[str, Any] = {"net_arch": [8], "mixer_hidden": 8, "kernel_arch": (8,), "features_extractor_kwargs": {}}
+QUICK: dict[str, Any] = {"buffer_size": 200, "learning_starts": 8, "batch_size": 8, "train_freq": 4, "gamma": 0.5}
+
+
+def telling(**kwargs: Any) -> VecEnv:
+    """Create four games whose agents join and die, with legal actions and a state; illegal actions fail."""
+    settings: dict[str, Any] = {"n_agents": 3, "max_cycles": 5, "deaths": {1: 3}, "joins": {2: 1}} | kwargs
+    return make_team_env(TellingEnv(**settings), n_envs=4, seed=0, state=True)
+
+
+def model_on(env: VecEnv, policy: str = "QPLEXPolicy", folder: Path | None = None, **parts: Any) -> QPLEX:
+    nets = NETS | parts
+    policy, _, memory = policy.partition("-")
+    if memory:
+        nets |= {"memory": memory, "memory_size": 8, "sequence_length": 4, "burn_in": 2}
+    logs = None if folder is None else str(folder)
+    return QPLEX(policy, env, seed=1, device="cpu", policy_kwargs=nets, tensorboard_log=logs, **QUICK)
+
+
+@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
+def test_the_page_of_qplex(policy: str, tmp_path: Path) -> None:
+    callback = InspectionCallback(telling(), every_game_steps=20, n_eval_episodes=4)
+    model_on(telling(), policy, tmp_path).learn(40 * 3, log_interval=4, callback=callback)
+    found = events(tmp_path)
+    scalars, pool = found.Tags()["scalars"], policy == "QPLEXPoolPolicy"
+    assert groups(scalars) == {"team", "critic", "lambda"} | ({"pool"} if pool else set())
+    pictures = {"pool/by_agent", "pool/differences"} if pool else set()
+    assert set(found.Tags()["images"]) == {"critic/calibration"} | pictures
+    assert all(math.isfinite(event.value) for tag in scalars for event in found.Scalars(tag))
+    layout = found.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0].decode(errors="replace")
+    assert "Mixer" in layout and "Knowledge source" not in layout
+    told = found.PluginTagToContent("hparams")["_hparams_/session_start_info"]
+    assert b"target_update_interval" in told and b"n_kernels" in told
+
+
+def rows_of(env: VecEnv) -> dict[str, th.Tensor]:
+    obs = env.reset()
+    assert isinstance(obs, dict)
+    return {key: th.as_tensor(value) for key, value in obs.items()}
+
+
+@th.no_grad()
+def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
+    env = telling()
+    policy = model_on(env, mixer="vdn").policy
+    obs = rows_of(env)
+    view = QReader(policy).step(obs, np.ones(12, dtype=bool))
+    best = policy.own_q_values(obs).max(dim=1).values.view(4, 3)
+    best[:, 2] = 0  # joins later
+    np.testing.assert_allclose(view.values.view(4, 3), best.sum(dim=1, keepdim=True).expand(4, 3), rtol=1e-6)
+    assert view.actions.tolist() == policy.predict({key: value.numpy() for key, value in obs.items()})[0].tolist()
+
+
+@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
+def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
+    env = telling()
+    team = model_on(env, policy).policy
+    recording = record_episodes(team, env, 8, seed=3, gamma=0.5)
+    env.seed(3)
+    assert recording.episode_returns == evaluate_team(team, env, 8).returns
+    assert recording.of_team  # so an agent's end is not the team's
+    assert recording.ends.all(axis=1).tolist() == recording.ends.any(axis=1).tolist()
+
+
+@pytest.mark.parametrize(("time_limit", "mean_return"), [("terminal", 2 * (1.5 + 1) / 2), ("bootstrap", None)])
+def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> None:
+    """Two agents get 1 each at both steps; a time limit that does not terminate is followed by the next value."""
+    env = make_team_env(ConstantReward(n_agents=2, length=2), n_envs=4, time_limit=time_limit)
+    team = model_on(env).policy
+    recording = record_episodes(team, env, 4, seed=0, gamma=0.5)
+    assert recording.episode_returns == [4.0] * 4
+    assert (recording.rewards == 2).all()
+    returns = recording.returns
+    if mean_return is not None:
+        assert returns.mean() == mean_return
+        return
+    assert (recording.last_values[1] != 0).all() and (recording.last_values[0] == 0).all()
+    np.testing.assert_allclose(returns[1], 2 + 0.5 * recording.last_values[1])
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------

@@ -84,17 +84,7 @@ def test_hecogrid_through_supersuit_has_the_games_state_and_signals() -> None:
     env.close()
 
 
-def test_staggered_games_end_at_different_times_and_play_whole_episodes_then() -> None:
-    env = make_team_env(
-        "TeamSupport", n_envs=5, seed=0, stagger=True, n_agents=2, grid_size=8, n_treasures=2, max_cycles=10
-    )
-    env.reset()
-    ends: list[list[int]] = [[] for _ in range(5)]
-    for step in range(1, 21):
-        env.step_async(np.zeros(10, dtype=np.int64))
-        dones = env.step_wait()[2]
-        for game in np.flatnonzero(dones[::2]):
-            ends[game].append(step)
-    assert ends == [[10, 20], [8, 18], [6, 16], [4, 14], [2, 12]]
-    result = evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7)
-    assert result.lengths == [10] * 7  # short episodes do not count
+def test_short_first_episodes_of_staggered_games_do_not_count() -> None:
+    level = {"n_agents": 2, "grid_size": 8, "n_treasures": 2, "max_cycles": 10}
+    env = make_team_env("TeamSupport", n_envs=5, seed=0, stagger=True, **level)
+    assert evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7).lengths == [10] * 7

@@ -183,21 +183,10 @@ def test_zone_action_with_a_pool_of_linear_policies() -> None:
 
 def test_roles_are_learned_by_actors_that_read_who_acts() -> None:
     """All see the same and are rewarded for different actions."""
-    model = PPO(
-        "MAPPOPolicy",
-        make_team_env(Buttons(n_agents=3, length=10), n_envs=4, seed=0),
-        n_steps=50,
-        batch_size=150,
-        n_epochs=8,
-        learning_rate=3e-3,
-        rollout_buffer_class=TeamRolloutBuffer,
-        policy_kwargs={"actor_identity": True, "net_arch": [32]},
-        seed=0,
-        device="cpu",
-    )
-    model.learn(6_000)
+    probe = Buttons(n_agents=3, length=10)
+    policy = train("MAPPOPolicy", probe, n_updates=10, n_games=4, n_steps=50, actor_identity=True)
     rows: dict[str, np.ndarray] = {"obs": np.ones((900, 10), np.float32), "agent": np.arange(900) % 3}
-    actions, _ = model.predict(rows, deterministic=False)
+    actions, _ = policy.predict(rows, deterministic=False)
     assert (actions == rows["agent"]).mean() > 0.9  # without actor_identity a third
 
 

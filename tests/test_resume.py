@@ -355,15 +355,6 @@ def test_other_conditions_are_told_and_the_run_goes_on(tmp_path: Path, monkeypat
     assert weights(model) == undisturbed()
 
 
-def test_a_damaged_checkpoint_costs_a_rollout_and_no_bit(tmp_path: Path) -> None:
-    struck(tmp_path / "run", make(), 30)
-    newest = max((tmp_path / "run").glob("*.ckpt"))
-    newest.write_bytes(newest.read_bytes()[:1000])
-    with pytest.warns(UserWarning, match="Going back to"):
-        model = go_on(tmp_path / "run", make())
-    assert weights(model) == undisturbed()
-
-
 def test_ctrl_c_stops_qplex_at_the_next_step_and_the_second_one_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,7 @@ from sb3_saf import (
     export_actors,
     inspect_team,
     make_team_env,
+    ppo_settings,
     resumable_learn,
 )
 from sb3_saf.envs.gymnasium_team import GymnasiumTeam
@@ -153,16 +154,7 @@ def test_the_table_of_results_is_that_of_the_raw_data(tmp_path: Path) -> None:
 @pytest.mark.parametrize("env_id", _examples())
 def test_a_task_is_trained_on_and_played(env_id: str) -> None:
     env = make_team_env(env_id, n_envs=2, seed=0)
-    model = PPO(
-        "SAFPolicy",
-        env,
-        n_steps=8,
-        batch_size=16 * env.n_agents,
-        n_epochs=1,
-        rollout_buffer_class=TeamRolloutBuffer,
-        seed=0,
-    )
-    model.learn(8 * env.num_envs)
+    PPO("SAFPolicy", env, **ppo_settings(env, n_steps=8, n_epochs=1), seed=0).learn(8 * env.num_envs)
     assert env.observation_space.contains({key: value[0] for key, value in env.reset().items()})
     env.close()
 
