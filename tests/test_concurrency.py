@@ -1,4 +1,4 @@
-"""Several vector environments and models in threads, processes and copies do not affect each other."""
+"""Copies of games continue like the originals; environments in threads and processes do not affect each other."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import copy
 import gc
 import multiprocessing
 import pickle
+import random
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numba
@@ -17,11 +19,125 @@ import numpy as np
 import psutil
 import pytest
 import torch as th
+from gymnasium import spaces
 
 import sb3_saf
-from sb3_saf import make_vec_env
-from tests.test_game_copies import played
-from tests.toy_envs import LazyEnv
+from hecogrid_envs.tasks import TASKS
+from sb3_saf import CheckpointError, make_vec_env
+from sb3_saf.envs import game_copies
+from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
+from tests.toy_envs import CounterEnv, GlobalEnv, LazyEnv, OuterWrapper, StateEnv, UnpicklableEnv
+
+
+class MaskedChoicesEnv(CounterEnv):
+    """Each agent makes two choices, of which masks in infos allow some."""
+
+    def _make_action_space(self) -> spaces.Space[Any]:
+        return spaces.MultiDiscrete([3, 2])
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        observations, infos = super().reset(seed, options)
+        return observations, self._masked(infos)
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        *results, infos = super().step(actions)
+        return *results, self._masked(infos)
+
+    def _masked(self, infos: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        return {agent: {**info, "action_mask": np.array([1, 0, 1, 1, 1], np.int8)} for agent, info in infos.items()}
+
+
+GAMES: dict[str, Any] = {
+    "a lazily made generator": LazyEnv,
+    "global generators": GlobalEnv,
+    "a lock": UnpicklableEnv,
+    "agents that die": partial(CounterEnv, deaths={0: 2}, max_cycles=7),
+    "masks of several choices": MaskedChoicesEnv,
+    "a wrapper": lambda: OuterWrapper(LazyEnv()),
+    "HECOGrid": partial(TASKS["TeamTogether"], n_agents=2, grid_size=9, n_treasures=4, max_cycles=9),
+    "its own methods": StateEnv,
+    "own methods that forget": partial(StateEnv, forgets=True),
+}
+BY_METHODS = {"its own methods"}
+
+
+def played(venv: Any, n_steps: int = 20) -> list[bytes]:
+    """Return observations, rewards and dones of fixed actions."""
+    rng = np.random.default_rng(0)
+    n_choices, shape = getattr(venv.action_space, "n", 2), (venv.num_envs, *(venv.action_space.shape or ()))
+    steps = [venv.step(rng.integers(0, n_choices, shape)) for _ in range(n_steps)]
+    return [serialised(part) for step in steps for part in step[:3]]
+
+
+def serialised(part: Any) -> bytes:
+    arrays = part.values() if isinstance(part, dict) else [part]
+    return b"".join(np.asarray(array).tobytes() for array in arrays)
+
+
+@pytest.mark.parametrize("n_cpus", [1, 2])
+@pytest.mark.parametrize("name", GAMES)
+def test_copies_play_on_as_the_games(name: str, n_cpus: int) -> None:
+    venv, other = (SuperSuitVecEnv(GAMES[name], 3, seed, n_cpus) for seed in (0, 1))
+    try:
+        venv.reset()
+        played(venv, 4)
+        state = venv.checkpoint_state()
+        other.load_checkpoint_state(state)
+        assert all(("state" in game) == (name in BY_METHODS) for game in state["games"])
+        if name == "global generators" and n_cpus == 1:
+            before = random.getstate(), np.random.get_state()  # noqa: NPY002
+            expected = played(venv, 20)
+            random.setstate(before[0])
+            np.random.set_state(before[1])  # noqa: NPY002
+        else:
+            expected = played(venv, 20)
+        assert played(other, 20) == expected
+    finally:
+        venv.close()
+        other.close()
+
+
+def test_a_slow_game_is_tried_for_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(10**6))
+    monkeypatch.setattr("sb3_saf.envs.game_copies.time.monotonic", lambda: next(clock) ** 2 / 40)  # slower and slower
+    venv = SuperSuitVecEnv(LazyEnv, 1, seed=0)
+    venv.reset()
+    assert "pickled" in venv.checkpoint_state()["games"][0]
+
+
+def test_taking_a_state_draws_no_global_numbers() -> None:
+    venv = SuperSuitVecEnv(GlobalEnv, 1, seed=0)
+    venv.reset()
+    before = repr(np.random.get_state())  # noqa: NPY002
+    venv.checkpoint_state()
+    assert repr(np.random.get_state()) == before  # noqa: NPY002
+
+
+@pytest.mark.parametrize(("part", "value"), [("pickled", b"other"), ("pickled", None), ("signature", "0" * 64)])
+def test_games_without_this_users_signature_are_refused(part: str, value: Any) -> None:
+    venv = SuperSuitVecEnv(LazyEnv, 2, seed=0)
+    venv.reset()
+    state = venv.checkpoint_state()
+    state["games"][1][part] = np.frombuffer(value, dtype=np.uint8) if isinstance(value, bytes) else value
+    with pytest.raises(CheckpointError, match="not signed with this user's key"):
+        venv.load_checkpoint_state(state)
+
+
+def test_a_key_is_made_once_and_is_the_users_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    data = np.arange(9, dtype=np.uint8)
+    signed = game_copies.signature(data)
+    game_copies._key.cache_clear()
+    assert game_copies.signature(data) == signed
+    assert game_copies.key_file().stat().st_mode & 0o777 == 0o600
+    assert [path.name for path in game_copies.key_file().parent.iterdir()] == ["key"]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))  # no folder can be created there
+    assert game_copies.signature(data) == game_copies.signature(data) != signed
+
+
+# --- threads, processes and copies ------------------------------------------------------------------------------------
+
 
 LEVEL: Final[dict[str, Any]] = {
     "n_agents": 2,

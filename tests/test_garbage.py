@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import sb3_saf
 from sb3_saf import QPLEX, FiniteCallback, NonFiniteError, TeamEvalCallback, resumable_learn
+from tests.weights import weights_of
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 4
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
@@ -60,10 +61,6 @@ def ppo(env: VecEnv | None = None, **settings: Any) -> PPO:
     return PPO("SAFPolicy", env or games(), rollout_buffer_class=buffer, **{**defaults, **settings})
 
 
-def weights(model: Any) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in model.policy.state_dict().items()}
-
-
 CAUSES: dict[str, tuple[Any, str]] = {
     "loss": (lambda: ppo(ent_coef=float("nan")), r"the gradient of \S+ must be finite, got nan at game step 12, .*"),
     "reward": (
@@ -99,11 +96,11 @@ def test_training_stops_with_step_name_and_last_good_checkpoint_and_good_weights
 
 def test_nothing_is_learned_from_bad_losses_and_those_of_before_are_named() -> None:
     model = ppo().learn(ROLLOUT)
-    before = weights(model)
+    before = weights_of(model)
     model.ent_coef = float("nan")
     with pytest.raises(NonFiniteError, match=r"the gradient of \S+ must be finite, got nan at game step \d+, after 0"):
         model.learn(ROLLOUT, FiniteCallback())
-    assert weights(model) == before
+    assert weights_of(model) == before
     with pytest.raises(NonFiniteError, match=r"\(the update before had .*train/value_loss \d.*train/loss -?\d.*\)"):
         ppo().learn(3 * ROLLOUT, [FiniteCallback(), SpoiledLater()])
 
@@ -145,7 +142,7 @@ def test_weights_and_losses_are_looked_at_after_updates() -> None:
 
 def test_looking_changes_nothing_and_leaves_nothing() -> None:
     model, plain = ppo().learn(3 * ROLLOUT, FiniteCallback()), ppo().learn(3 * ROLLOUT)
-    assert weights(model) == weights(plain)
+    assert weights_of(model) == weights_of(plain)
     assert not model.policy.optimizer._optimizer_step_pre_hooks
     assert not any(parameter._post_accumulate_grad_hooks for parameter in model.policy.parameters())
 

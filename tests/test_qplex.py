@@ -23,6 +23,7 @@ from sb3_saf.qplex.parts import q_values
 from tests.probe_envs import ONE_STEP, MatrixGame, TwoStates
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams
+from tests.weights import weights_of
 
 #: Policies, with the kind of their memory.
 POLICIES = ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru", "QPLEXPolicy-lstm"]
@@ -58,14 +59,6 @@ def make_model(env: Any = None, policy: str = "QPLEXPolicy", **kwargs: Any) -> Q
     if memory:
         nets = {"memory": memory, "memory_size": 8, "sequence_length": 4, "burn_in": 2} | nets
     return QPLEX(policy, toy_env() if env is None else env, **(QUICK | {"seed": 0, "policy_kwargs": nets} | kwargs))
-
-
-def weights(model: QPLEX) -> list[th.Tensor]:
-    return [tensor.clone() for tensor in model.policy.state_dict().values()]
-
-
-def same(one: list[th.Tensor], other: list[th.Tensor]) -> bool:
-    return all(map(th.equal, one, other))
 
 
 # --- games with known answers -----------------------------------------------------------------------------------------
@@ -232,9 +225,9 @@ def test_agents_learn_where_some_die_join_and_may_not_do_everything(policy: str)
     """TellingEnv fails at an illegal action."""
     env = telling_env(time_limit="bootstrap")
     model = make_model(env, policy)
-    before = weights(model)
+    before = weights_of(model)
     model.learn(60 * 3)
-    assert not same(before, weights(model))
+    assert before != weights_of(model)
     assert evaluate_team(model, env, 4, deterministic=False).lengths == [5] * 4
 
 
@@ -305,13 +298,13 @@ def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path
     again = QPLEX.load(tmp_path / "model", env=games, force_reset=False, device="cpu")
     with pytest.warns(UserWarning, match="buffer is unpickled, which runs code from it"):
         again.load_replay_buffer(tmp_path / "buffer")
-    before = weights(model)
+    before = weights_of(model)
     for each in (model, again):
         random.setstate(numbers[0])
         np.random.set_state(numbers[1])  # noqa: NPY002
         th.set_rng_state(numbers[2])
         each.learn(60 * 3, reset_num_timesteps=False)
-    assert same(weights(model), weights(again)) and not same(before, weights(again))
+    assert weights_of(model) == weights_of(again) != before
     assert again.num_timesteps == 120 * 3
 
 

@@ -27,6 +27,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import sb3_saf
 from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
 from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv, TellingEnv
+from tests.weights import weights_of
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 8
 ROLLOUT = N_AGENTS * N_GAMES * N_STEPS
@@ -87,10 +88,6 @@ def make(
     return MADE[-1]
 
 
-def weights(model: BaseAlgorithm) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in model.policy.state_dict().items()}
-
-
 def evaluation(folder: Path | None = None, seed: int = 50, **arguments: Any) -> TeamEvalCallback:
     env = sb3_saf.make_team_env("TeamTogether", 2, seed=seed, **TASK)
     path = None if folder is None else str(folder)
@@ -117,7 +114,7 @@ def go_on(folder: Path, model: Any, *others: BaseCallback) -> Any:
 @functools.cache
 def undisturbed() -> dict[str, bytes]:
     """Return the weights of a whole run of PPO without checkpoints."""
-    return weights(make().learn(WHOLE))
+    return weights_of(make().learn(WHOLE))
 
 
 def qplex(**parts: Any) -> Any:
@@ -167,9 +164,9 @@ def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: 
     th.manual_seed(77)
     model = go_on(tmp_path / "run", MODELS[name]())
     assert model.num_timesteps == WHOLE and model._n_updates == whole._n_updates
-    assert weights(model) == weights(whole) != weights(MODELS[name]())
+    assert weights_of(model) == weights_of(whole) != weights_of(MODELS[name]())
     if name == "PPO":
-        assert weights(model) == undisturbed()
+        assert weights_of(model) == undisturbed()
 
 
 def test_evaluations_monitor_and_tensorboard_go_on_without_gap_or_repetition(tmp_path: Path) -> None:
@@ -203,7 +200,7 @@ def test_resume_alone(tmp_path: Path) -> None:
     path = resume(tmp_path, model)
     assert path.name == f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt"
     model.learn(WHOLE - model.num_timesteps, TeamCheckpointCallback(tmp_path), reset_num_timesteps=False)
-    assert weights(model) == undisturbed()
+    assert weights_of(model) == undisturbed()
 
 
 def fingerprint(folder: Path) -> dict[str, bytes]:
@@ -313,7 +310,7 @@ def test_a_run_that_is_killed_before_its_second_checkpoint_resumes(name: str, tm
     with pytest.raises(RuntimeError):
         run("killed", 3)
     assert [path.name for path in (tmp_path / "killed").glob("*.ckpt")] == [f"checkpoint-{0:012d}.ckpt"]
-    assert weights(run("killed", -1)) == weights(run("whole", -1))
+    assert weights_of(run("killed", -1)) == weights_of(run("whole", -1))
 
 
 def test_ctrl_c_in_an_update_leaves_the_models_settings(tmp_path: Path) -> None:
@@ -331,7 +328,7 @@ def test_ctrl_c_in_an_update_leaves_the_models_settings(tmp_path: Path) -> None:
     assert model.ent_coef == 0.01
     resumable_learn(model, WHOLE, tmp_path, sb3_saf.EntropySchedule())
     whole = resumable_learn(make(ent_coef=0.01), WHOLE, tmp_path / "whole", sb3_saf.EntropySchedule())
-    assert weights(model) == weights(whole)
+    assert weights_of(model) == weights_of(whole)
 
 
 def test_folders_and_algorithms_that_cannot_be_resumed(tmp_path: Path) -> None:
@@ -352,7 +349,7 @@ def test_other_conditions_are_told_and_the_run_goes_on(tmp_path: Path, monkeypat
     monkeypatch.setattr("sb3_saf.checkpoints.runs.package_version", lambda: "9.9")
     with pytest.warns(UserWarning, match=r"sb3_saf was .*, now '9\.9'"):
         model = resumable_learn(make(), WHOLE, tmp_path)
-    assert weights(model) == undisturbed()
+    assert weights_of(model) == undisturbed()
 
 
 def test_ctrl_c_stops_qplex_at_the_next_step_and_the_second_one_at_once(
@@ -379,7 +376,7 @@ def foreign(game: type[CounterEnv], n_cpus: int = 1, seed: int | None = 3) -> An
 
 @functools.cache
 def undisturbed_foreign(game: Any) -> dict[str, bytes]:
-    return weights(foreign(game).learn(WHOLE))
+    return weights_of(foreign(game).learn(WHOLE))
 
 
 @pytest.mark.parametrize("n_cpus", [1, 2])
@@ -392,7 +389,7 @@ def test_games_of_others_go_on_bit_for_bit(game: Any, n_cpus: int, tmp_path: Pat
     going_on.logger.close()
     is_pickled = "they were unpickled from it" in (tmp_path / "log" / "log.txt").read_text()
     assert is_pickled == (game is LazyEnv)
-    assert weights(model) == undisturbed_foreign(game)
+    assert weights_of(model) == undisturbed_foreign(game)
     assert model.num_timesteps == WHOLE
 
 
@@ -429,7 +426,7 @@ def test_pickled_games_of_strangers_are_not_read(tmp_path: Path, monkeypatch: py
     monkeypatch.undo()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
     model = resumable_learn(foreign(LazyEnv), WHOLE, tmp_path / "trusted", [Lightning(-1)], trust_games=True)
-    assert weights(model) == undisturbed_foreign(LazyEnv)
+    assert weights_of(model) == undisturbed_foreign(LazyEnv)
 
 
 @pytest.mark.parametrize(
@@ -447,7 +444,7 @@ def test_what_ends_it_saves_and_says_how_to_go_on(
         f"checkpoint-{2 * N_STEPS * N_GAMES:012d}.ckpt is saved; start the same command again"
         in capsys.readouterr().out
     )
-    assert weights(go_on(tmp_path, make())) == undisturbed()
+    assert weights_of(go_on(tmp_path, make())) == undisturbed()
 
 
 #: One after another in one process, whose children have its imports and compiled code.

@@ -32,6 +32,7 @@ from sb3_saf.training.folders import Run
 from sb3_saf.training.run import RunOptions
 from sb3_saf.training.run import train as train_settings
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
+from tests.weights import weights_of
 
 ENV = "TeamTogether-v0"
 
@@ -45,39 +46,29 @@ def train(folder: Path, *options: str, algo: str = "saf") -> Path:
     return run
 
 
-def weights(model: Any) -> dict[str, th.Tensor]:
-    return {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
-
-
-def equal(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:
-    return one.keys() == other.keys() and all(one[name].equal(other[name]) for name in one)
-
-
 @pytest.fixture(scope="module")
 def settings() -> Settings:
     return load_settings("saf", ENV, "smoke")
 
 
 @pytest.fixture(scope="module")
-def by_hand(settings: Settings) -> dict[str, th.Tensor]:
+def by_hand(settings: Settings) -> dict[str, bytes]:
     model = settings.make_model(settings.make_env(3), 3)
     model.learn(settings.total_timesteps)
-    return weights(model)
+    return weights_of(model)
 
 
-def test_the_command_trains_what_settings_train(by_hand: dict[str, th.Tensor], tmp_path: Path) -> None:
+def test_the_command_trains_what_settings_train(by_hand: dict[str, bytes], tmp_path: Path) -> None:
     run = train(tmp_path, "--eval-freq", "-1")
-    assert equal(by_hand, weights(PPO.load(run / f"{ENV}.zip")))
+    assert by_hand == weights_of(PPO.load(run / f"{ENV}.zip"))
 
 
-def test_options_do_not_change_what_is_learned(
-    settings: Settings, by_hand: dict[str, th.Tensor], tmp_path: Path
-) -> None:
-    assert equal(by_hand, weights(train_settings(settings, 3)))
+def test_options_do_not_change_what_is_learned(settings: Settings, by_hand: dict[str, bytes], tmp_path: Path) -> None:
+    assert by_hand == weights_of(train_settings(settings, 3))
     frequencies: dict[str, Any] = {"eval_freq": 60, "save_freq": 100, "inspect_freq": 10_000, "checkpoint_freq": None}
     options = RunOptions(eval_episodes=4, tensorboard_log=tmp_path, **frequencies)
     folder = tmp_path / "run"
-    assert equal(by_hand, weights(train_settings(settings, 3, folder, options)))
+    assert by_hand == weights_of(train_settings(settings, 3, folder, options))
     assert {"model.zip", "best_model.zip", "evaluations.npz", "monitor.csv", "rl_model_400_steps.zip"} <= {
         path.name for path in folder.iterdir()
     }
@@ -90,7 +81,7 @@ def test_tensorboard_has_the_inside_of_the_policy_and_training_does_not_notice(a
     plain = train(tmp_path, *quick, algo=algo)
     watched = train(tmp_path, *quick, "-tb", str(tmp_path / "tb"), "--inspect-freq", "100", algo=algo)
     load = ALGOS[algo].algorithm.load
-    assert equal(weights(load(plain / f"{ENV}.zip")), weights(load(watched / f"{ENV}.zip")))
+    assert weights_of(load(plain / f"{ENV}.zip")) == weights_of(load(watched / f"{ENV}.zip"))
     (file,) = (tmp_path / "tb").glob("*/*/events.*")
     found = EventAccumulator(str(file)).Reload()
     assert [event.step for event in found.Scalars("team/return")] == [0, 40]
@@ -174,7 +165,7 @@ def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str
     damaged.write_bytes(first.read_bytes()[:-100])
     assert "damaged.zip does not hold the tensors of a saved model" in failed([*other, "-i", str(damaged)], capsys)
     assert "another algorithm's" in failed([*other, "--algo", "saf", "-params", "algorithm:A2C"], capsys)
-    pairs = zip(*(weights(PPO.load(path)).values() for path in (first, second)), strict=True)
+    pairs = zip(*(PPO.load(path).policy.state_dict().values() for path in (first, second)), strict=True)
     assert all(th.allclose(a.float(), b.float(), atol=1e-5) for a, b in pairs)
 
 

@@ -124,11 +124,16 @@ TRAININGS: Final[dict[str, Callable[[], Any]]] = {
 }
 
 
+def weights_of(model: Any) -> dict[str, bytes]:
+    """Return the weights of a model's policy, to compare them to the last bit."""
+    return {name: value.cpu().numpy().tobytes() for name, value in model.policy.state_dict().items()}
+
+
 def digest(model: Any) -> str:
     """Return the first digits of a hash of all weights."""
     weights = hashlib.sha256()
-    for name, value in sorted(model.policy.state_dict().items()):
-        weights.update(name.encode() + value.cpu().numpy().tobytes())
+    for name, value in sorted(weights_of(model).items()):
+        weights.update(name.encode() + value)
     return weights.hexdigest()[:16]
 
 
