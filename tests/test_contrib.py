@@ -93,17 +93,6 @@ def test_every_weight_is_trained(name: str, action: str) -> None:
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_agents_that_see_the_same_act_differently_only_with_actor_identity(name: str) -> None:
-    obs = team_rows(VECTOR, n_views=1)
-    for identity in (False, True):
-        policy = make_policy(name, actor_identity=identity)
-        by_agent = policy.get_distribution(obs).log_prob(th.zeros(12)).view(4, 3)
-        th.testing.assert_close(by_agent, by_agent[:1].expand(4, 3), rtol=0, atol=1e-6)
-        differences = (by_agent[0] - by_agent[0].roll(1)).abs()
-        assert (differences > 1e-4).all() if identity else (differences < 1e-6).all()
-
-
 # --- TRPO -------------------------------------------------------------------------------------------------------------
 
 

@@ -1,7 +1,7 @@
 """
 Native and SuperSuit backends give the same numbers, row by row, bit for bit.
 
-``test_advance`` compares the native backend with ``parallel_env``, including ends of episodes.
+``test_batch`` compares the native backend with ``parallel_env``, including ends of episodes.
 """
 
 from __future__ import annotations

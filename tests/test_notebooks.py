@@ -80,19 +80,6 @@ def save(path: Path, *cells: str) -> Path:
     return path
 
 
-def test_runs_with_other_numbers_in_an_empty_folder(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.ipynb", "n = 3", "import os\nprint(n, os.listdir())")
-    assert written_by(execute(path, {"n": 5}).cells[-1]) == "5 []\n"
-    assert written_by(read(path).cells[-1]) == ""
-
-
 def test_warnings_are_errors(tmp_path: Path) -> None:
     with pytest.raises(NotebookError, match="UserWarning: old"):
         execute(save(tmp_path / "a.ipynb", "n = 3", "import warnings\nwarnings.warn('old', stacklevel=1)"), {})
-
-
-def test_numbers_need_a_parameters_cell(tmp_path: Path) -> None:
-    path = tmp_path / "a.ipynb"
-    nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("n = 3")]), path)
-    with pytest.raises(NotebookError, match="one cell with the tag 'parameters', got 0"):
-        execute(path, {"n": 5})
