@@ -94,15 +94,6 @@ def test_rows_lie_in_the_space_and_do_not_change_later(own_space: spaces.Space[A
             np.testing.assert_array_equal(row["team"][row["agent"]], row["obs"])
 
 
-def test_what_a_caller_writes_does_not_come_back() -> None:
-    env = CentralizedValueWrapper(TeamVenv())
-    expected = {key: part.copy() for key, part in env.reset().items()}
-    for part in env.reset().values():
-        part.fill(0)
-    for key, part in env.reset().items():
-        np.testing.assert_array_equal(part, expected[key])
-
-
 def test_images_are_transposed_once() -> None:
     venv = TeamVenv(own_space=spaces.Box(0, 255, (9, 8, 3), np.uint8), see=bytes_of((9, 8, 3)))
     env = CentralizedValueWrapper(venv)

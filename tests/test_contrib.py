@@ -238,17 +238,6 @@ def test_masks_that_allow_nothing_teach_nothing() -> None:
         assert all(p.grad is None or p.grad.abs().max() < 1e-6 for p in policy.actor.parameters())
 
 
-def test_the_mask_leaves_the_choice_among_policies_as_it_is() -> None:
-    # Two policies, equally likely: one always takes action 0, one is undecided between 1 and 2. Masking 1 makes the
-    # second one always take 2, and both actions equally likely. Masking the mixture (1/2, 1/4, 1/4) gives 2/3, 1/3.
-    parameters = th.tensor([[[50.0, 0.0, 0.0], [-50.0, 0.0, 0.0]]])
-    masked = masked_parameters(ACTIONS["discrete"], parameters, th.tensor([[True, False, True]]))
-    log_weights = th.full((1, 2), 0.5).log()
-    found = mixture_of(ACTIONS["discrete"], log_weights, masked).distribution
-    assert isinstance(found, th.distributions.Categorical)
-    th.testing.assert_close(found.probs, th.tensor([[0.5, 0.0, 0.5]]))
-
-
 @pytest.mark.parametrize(("policy_class", "kwargs"), VARIANTS)
 def test_masked_actions_depend_on_own_observation_and_own_mask_only(policy_class: Any, kwargs: dict[str, Any]) -> None:
     name = policy_class.__name__.replace("Policy", "MaskablePolicy")

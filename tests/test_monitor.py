@@ -60,13 +60,6 @@ def test_an_unfinished_episode_is_forgotten_at_reset() -> None:
     assert infos[2][0]["episode"]["l"] == 3
 
 
-def test_infos_of_the_environment_are_left_alone() -> None:
-    venv = TeamVenv(lengths=(2,))
-    play(TeamMonitor(venv), 2)
-    assert venv.dones.all()
-    assert "episode" not in venv.infos[0]
-
-
 def test_small_rewards_beside_large_ones_are_not_lost() -> None:
     # float32 cannot tell 2**24 from 2**24 + 1.
     venv = TeamVenv(lengths=(101,), n_agents=2, reward=lambda game, agent, step: 2.0**24 if step + agent == 1 else 1.0)

@@ -89,46 +89,6 @@ def test_full_episodes_stay_in_their_spaces(task: str, params: dict[str, Any]) -
         assert steps == params["max_cycles"]
 
 
-@pytest.mark.parametrize("params", VARIANTS)
-def test_one_seed_gives_one_sequence_of_episodes(task: str, params: dict[str, Any]) -> None:
-    def history(env: HECOGridEnv) -> list[Any]:
-        rng = np.random.default_rng(1)
-        frames: list[Any] = []
-        for episode in range(2):
-            frames.append(env.reset(seed=7 if episode == 0 else None)[0])
-            while env.agents:
-                result = env.step(random_actions(env, rng))
-                frames.append((result.observations, result.rewards))
-        return frames
-
-    env = hecogrid_envs.parallel_env(task, **params)
-    first, again, other = history(env), history(env), history(hecogrid_envs.parallel_env(task, **params))
-    np.testing.assert_equal(first, again)
-    np.testing.assert_equal(first, other)
-    levels = {env.reset(seed=seed)[0]["agent_0"].tobytes() for seed in range(20)}
-    assert len(levels) > 15, "seeds must matter"
-
-
-@pytest.mark.parametrize("params", VARIANTS)
-def test_a_stored_state_replays(task: str, params: dict[str, Any]) -> None:
-    env = hecogrid_envs.parallel_env(task, **{**params, "agent_order": "index"})
-    env.reset(seed=3)
-    level = env.get_state()
-    actions = np.random.default_rng(2).integers(0, 7, size=(10, 4))
-
-    def replay() -> list[Any]:
-        frames: list[Any] = [env.reset(options={"state": level})[0]]
-        for row in actions:
-            result = env.step(dict(zip(env.agents, row.tolist(), strict=True)))
-            frames.append((result.observations, result.rewards, env.get_state()))
-        return frames
-
-    np.testing.assert_equal(replay(), replay())
-    env.set_state(level)
-    np.testing.assert_equal(env.get_state(), level)
-    np.testing.assert_equal(env.observations(), replay()[0])
-
-
 def test_documentation_page(task: str) -> None:
     page = TASKS[task].__doc__
     assert page is not None

@@ -166,17 +166,6 @@ def test_no_other_agents_observation_changes_an_action_by_a_bit(
             th.testing.assert_close(stacked, probabilities(policy, one), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("policy_class", [MAPPOPolicy, SAFPolicy])
-def test_the_team_reaches_values_but_not_actions(policy_class: type[TeamActorCriticPolicy]) -> None:
-    policy, obs = make_policy(policy_class), gather_rows(team_rows(VECTOR, n_views=50), [7])
-    obs["team"].requires_grad_()
-    values, log_prob, entropy = policy.evaluate_actions(obs, th.zeros(1, dtype=th.int64))
-    assert entropy is not None
-    to_actions = th.autograd.grad((log_prob + entropy).sum(), obs["team"], allow_unused=True, retain_graph=True)[0]
-    assert to_actions is None
-    assert th.autograd.grad(values.sum(), obs["team"])[0].abs().max() > 0
-
-
 def test_ippos_values_do_not_read_the_team() -> None:
     policy, obs = make_policy(IPPOPolicy), team_rows(VECTOR)
     del obs["team"]

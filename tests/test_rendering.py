@@ -151,13 +151,6 @@ def test_key_carriers_show_their_key() -> None:
     assert golden(cells[4, 2]) == 0
 
 
-def test_selected_agent_is_marked() -> None:
-    scene = make_scene([(2, 2, 0, False), (4, 2, 0, False)])
-    plain, marked = draw(scene)[1], draw(scene._replace(selected=0))[1]
-    changed = (plain != marked).any(axis=(2, 3, 4))
-    assert np.argwhere(changed).tolist() == [[2, 2]]
-
-
 # --- fields of view
 
 

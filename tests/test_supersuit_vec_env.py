@@ -352,23 +352,6 @@ def test_masks_by_row(bridge: Bridge, n_cpus: int) -> None:
 # ---- images
 
 
-@one_and_two_cpus
-def test_pictures(bridge: Bridge, n_cpus: int) -> None:
-    assert bridge(CounterEnv, n_games=2, n_cpus=n_cpus).get_images() == [None] * 4
-    venv = bridge(lambda: CounterEnv(2, render_mode="rgb_array"), n_games=4, n_cpus=n_cpus)
-    assert venv.render_mode == "rgb_array"
-    assert VecMonitor(venv).render_mode == "rgb_array"
-    assert venv.get_attr("render_mode") == ["rgb_array"] * 8
-    venv.reset()
-    venv.step(zeros(venv))
-    images = venv.get_images()
-    assert len(images) == 8
-    assert all(np.array_equal(np.asarray(image), np.full((4, 6, 3), 1)) for image in images)
-    mosaic = venv.render()
-    assert mosaic is not None
-    assert mosaic.shape == (8, 12, 3)  # one picture per game, not per row
-
-
 # ---- trap: agents that die
 
 
@@ -479,7 +462,18 @@ def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -
 # ---- bad input
 
 
-SAME = CounterEnv()
+MADE: list[CounterEnv] = []
+
+
+def recorded_env() -> CounterEnv:
+    """Record what was created."""
+    MADE.append(CounterEnv())
+    return MADE[-1]
+
+
+def same_env_again() -> CounterEnv:
+    """Return the last one again."""
+    return MADE[-1] if MADE else recorded_env()
 
 
 @pytest.mark.parametrize(
@@ -492,7 +486,7 @@ SAME = CounterEnv()
         ("counter", "got an object of type str"),
         (SimpleNamespace(__name__="games.tag", parallel_env=CounterEnv), "pass games.tag.parallel_env(...)"),
         (UnpicklableEnv(), "pass a function that makes the environment instead"),
-        (lambda: SAME, "got one that returned the same object for 3 games"),
+        (same_env_again, "got one that returned the same object for 3 games"),
     ],
 )  # fmt: skip
 def test_wrong_environment(bridge: Bridge, make: Any, message: str) -> None:
@@ -735,14 +729,9 @@ def test_game_that_can_only_be_closed_after_a_reset(bridge: Bridge, n_cpus: int)
 
 def test_every_game_that_was_made_is_closed(bridge: Bridge) -> None:
     """SuperSuit makes spare copies and drops them; none of them may keep a game open."""
-    made: list[CounterEnv] = []
-
-    def make() -> CounterEnv:
-        made.append(CounterEnv())
-        return made[-1]
-
-    bridge(make, n_games=3).close()
-    assert [env.closed for env in made] == [True] * 4  # one was made for the spaces
+    MADE.clear()
+    bridge(recorded_env, n_games=3).close()
+    assert [env.closed for env in MADE] == [True] * 4  # one was made for the spaces
 
 
 SCRIPT = """
