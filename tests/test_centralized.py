@@ -256,6 +256,7 @@ def step_twice(env: VecEnv) -> None:
         (last_view(None), r"'terminal_observation'.* game 1, whose episode ended at step 2, got none for agents \[1\]"),
         (last_view([1, 1, np.nan, 2]), "terminal observations .* nan at step 2 for agent 1 of game 1"),
         (last_view([0, 0, 0]), r"terminal observations of one shape .* game 1, got \[\(3,\), \(4,\)\]"),
+        (lambda venv: setattr(venv, "obs", venv.obs[:5]), r"shape \(6, 4\) and dtype float32 .*, got shape \(5, 4\)"),
         (lambda venv: setattr(venv, "obs", venv.obs.astype(np.complex64)), "float32 .* and dtype complex64"),
     ],
 )

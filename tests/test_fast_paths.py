@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 from sb3_saf import QPLEX, LightEncoder, PaperCNN, TeamRolloutBuffer, make_team_env, make_vec_env
-from sb3_saf.buffers.later import LaterValues
+from sb3_saf.buffers.later import LaterValues, compute_together
 from sb3_saf.networks import row_encoder
 from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.distributions import LeanCategorical
@@ -310,3 +310,17 @@ def test_values_of_many_steps_are_those_of_each(policy: str, make: Callable[[], 
     active = expected != 0  # the buffer's values of other rows are those of the wait until the agent acts again
     np.testing.assert_allclose(values[active], expected[active], rtol=1e-5, atol=1e-5)
     assert np.ptp(values[active]) > 1e-3
+
+
+def test_a_step_whose_values_are_used_is_computed_alone_and_once() -> None:
+    asked: list[int] = []
+
+    def compute(steps: Any) -> list[th.Tensor]:
+        asked.append(len(steps))
+        return [th.full((3, 1), step) for step in steps]
+
+    steps: Any = (1.0, 2.0, 3.0)
+    one, *others = (LaterValues.of(step, th.zeros(3), compute) for step in steps)
+    assert (one + one).tolist() == [[2.0]] * 3 and th.cat([one, one]).sum() == 6.0
+    assert [float(values.mean()) for values in compute_together([one, *others])] == [1.0, 2.0, 3.0]
+    assert asked == [1, 2]

@@ -246,6 +246,14 @@ def test_leaving(key: str) -> None:
     assert real_session().press("tab") is True
 
 
+def test_help_and_unknown_keys_are_answered() -> None:
+    session = real_session()
+    session.press("x")
+    assert "key 'x' does nothing" in session.status
+    session.press("h")
+    assert session.status.endswith(play.KEYS_HELP)
+
+
 def test_new_games_continue_the_seed() -> None:
     session, game = noted_session(seed=5)
     session.press("r")

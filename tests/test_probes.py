@@ -184,7 +184,7 @@ def test_zone_action_with_a_pool_of_linear_policies() -> None:
 def test_roles_are_learned_by_actors_that_read_who_acts() -> None:
     """All see the same and are rewarded for different actions."""
     probe = Buttons(n_agents=3, length=10)
-    policy = train("MAPPOPolicy", probe, n_updates=10, n_games=4, n_steps=50, actor_identity=True)
+    policy = train("MAPPOPolicy", probe, n_updates=20, n_games=4, n_steps=50, actor_identity=True)
     rows: dict[str, np.ndarray] = {"obs": np.ones((900, 10), np.float32), "agent": np.arange(900) % 3}
     actions, _ = policy.predict(rows, deterministic=False)
     assert (actions == rows["agent"]).mean() > 0.9  # without actor_identity a third

@@ -349,9 +349,6 @@ def test_masks_by_row(bridge: Bridge, n_cpus: int) -> None:
     assert [mask.tolist() for mask in masks] == [[True, False, False, False], [True] * 4]  # agent 1 has ended
 
 
-# ---- images
-
-
 # ---- trap: agents that die
 
 

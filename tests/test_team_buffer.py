@@ -151,6 +151,10 @@ def swap_games(obs: dict[str, Array]) -> None:
     obs["team"][:3], obs["team"][3:6] = obs["team"][3:6].copy(), obs["team"][:3].copy()
 
 
+def larger_team(obs: dict[str, Array]) -> None:
+    obs["team"] = np.concatenate([obs["team"], obs["team"][:, :1]], axis=1)
+
+
 def fewer_rows(obs: dict[str, Array]) -> None:
     for key in obs:
         obs[key] = obs[key][:-1]
@@ -161,6 +165,7 @@ def fewer_rows(obs: dict[str, Array]) -> None:
     [
         (swap_rows, r"'agent' 0 to 2 in each team, got \[1, 0, 2, 0, 1, 2\] .*CentralizedValueWrapper"),
         (swap_games, "'team' to hold the 'obs' .* below CentralizedValueWrapper only"),
+        (larger_team, r"'team' to hold the 'obs' .* got another one of shape \(12, 4, 4\)"),
         (fewer_rows, r"expected 'obs' of shape \(12, 4\) and dtype float32, got \(11, 4\) and float32"),
     ],
 )

@@ -19,7 +19,7 @@ from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ALGOS, load_settings, saved_settings
-from sb3_saf.training.yaml_files import SIZES, Size
+from sb3_saf.training.yaml_files import SIZES, Size, config_names, read_settings
 
 ENV = "TeamTogether-v0"
 ENV_IDS = suites()["hecogrid"].tasks
@@ -76,6 +76,16 @@ def test_paper_optimizer() -> None:
 def _defaults(algorithm: type) -> dict[str, Any]:
     parameters = inspect.signature(algorithm).parameters.values()
     return {parameter.name: parameter.default for parameter in parameters}
+
+
+@pytest.mark.parametrize("config", [name for name in config_names() if name != "levels"])
+def test_files_have_only_what_differs(config: str) -> None:
+    content = read_settings(config)
+    assert {key for key in content if "/" not in key} <= {"default", "hecogrid", *ENV_IDS, *suites()}
+    algorithm = next((spec.algorithm for spec in ALGOS.values() if spec.config == config), PPO)
+    defaults = _defaults(algorithm)
+    repeated = {key for key, value in content["default"].items() if key in defaults and value == defaults[key]}
+    assert repeated == set()
 
 
 def test_sizes_are_those_of_the_experiments() -> None:
