@@ -39,14 +39,15 @@ from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.teams.rows import TeamSpaces
 from tests import test_contrib
 from tests.contrib_teams import random_masks
-from tests.lone_agent import ABSENT
 from tests.test_conversion import Kinds
 from tests.test_policies import ACTIONS, SMALL, constant, equal_weights, make_model, make_policy
-from tests.toy_envs import CounterEnv, TellingEnv
+from tests.toy_envs import CounterEnv
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, samples
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+#: Packages that an exported actor needs not, nor what these are made of.
+ABSENT = ("stable_baselines3", "sb3_contrib", "gymnasium", "pettingzoo", "supersuit", "cloudpickle", "torch", "onnx")
 AGENT = 2
 GREY = spaces.Box(0, 255, (40, 36), np.uint8)
 
@@ -319,60 +320,20 @@ def test_acts_on_what_the_game_gives(kind: str, masks: str | None, tmp_path: Pat
 # --- programs with nothing but the files ------------------------------------------------------------------------------
 
 
-class LoneAgent:
-    """A process with one agent, in which everything but NumPy and onnxruntime is hidden."""
-
-    def __init__(self, folder: Path, agent: int):
-        command = [sys.executable, str(ROOT / "tests" / "lone_agent.py"), str(folder), str(agent)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def ask(self, observation: np.ndarray, **more: Any) -> None:
-        assert self.process.stdin
-        question = {"observation": observation.tolist(), "dtype": str(observation.dtype), **more}
-        self.process.stdin.write(json.dumps(question) + "\n")
-        self.process.stdin.flush()
-
-    def answer(self) -> dict[str, Any]:
-        assert self.process.stdout
-        return json.loads(self.process.stdout.readline())
-
-
-def test_agents_in_processes_of_their_own_play_as_the_model_would(tmp_path: Path) -> None:
-    """With masks and memory."""
-    env = make_team_env(lambda: TellingEnv(n_agents=2, max_cycles=6), n_envs=1, seed=0)
-    model: Any = PPO("SAFPolicy", env, seed=0, device="cpu", policy_kwargs={"memory": "gru", "memory_size": 8})
-    with th.no_grad():
-        for parameter in model.policy.actor.parameters():
-            parameter.add_(0.3 * th.randn_like(parameter))
-    folder = export_actors(model, tmp_path / "actor")
-    agents = [LoneAgent(folder, agent) for agent in range(2)]
-    rows: Any = env.reset()
-    state, starts, chosen = None, np.ones(2, bool), []
-    for _ in range(12):  # two episodes
-        own = {key: rows[key] for key in ("obs", "agent", "action_mask")}
-        for agent, lone in enumerate(agents):
-            mask = own["action_mask"][agent].tolist()
-            lone.ask(own["obs"][agent], action_mask=mask, start=bool(starts[agent]))
-        expected, state = model.predict(own, state, starts, deterministic=True)
-        answers = [lone.answer() for lone in agents]
-        assert [answer["action"] for answer in answers] == expected.tolist()
-        assert all(own["action_mask"][agent, action] == 1 for agent, action in enumerate(expected))
-        chosen += expected.tolist()
-        rows, _, starts, _ = env.step(expected)
-    assert len(set(chosen)) > 1
-    for lone in agents:
-        lone.process.communicate(timeout=60)
-        assert lone.process.returncode == 0
-
-
 @pytest.mark.parametrize("name", ["heads, grey pictures", "heads with memory", "masked rows"])
-def test_the_script_prints_the_models_actions(name: str, exports: Callable[[str], Exported], tmp_path: Path) -> None:
+def test_the_script_prints_the_models_actions_with_numpy_and_onnxruntime_alone(
+    name: str, exports: Callable[[str], Exported], tmp_path: Path
+) -> None:
     policy, folder, actor = exports(name)
     obs, masks = samples(policy.team_spaces.own, 7), random_masks(spaces.Discrete(3), 7, np.random.default_rng(0))
     np.save(tmp_path / "obs.npy", obs)
     np.save(tmp_path / "masks.npy", masks)
     options = ["--action-mask", str(tmp_path / "masks.npy")] if "mask" in name else []
-    command = [sys.executable, str(folder / "act.py"), str(tmp_path / "obs.npy"), "--agent", str(AGENT), *options]
+    words = ["act.py", str(tmp_path / "obs.npy"), "--agent", str(AGENT), *options]
+    hidden = (*ABSENT, "sb3_saf", "hecogrid_envs", "safetensors", "msgspec")
+    code = f"import sys, runpy; sys.modules.update(dict.fromkeys({hidden})); sys.argv = {words}; "
+    code += f"runpy.run_path({str(folder / 'act.py')!r}, run_name='__main__')"
+    command = [sys.executable, "-c", code]
     answer = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
     if actor.has_memory:  # the steps of one episode
         memory = actor.new_memory()

@@ -362,15 +362,6 @@ def test_an_extractor_for_another_space_is_refused_with_those_that_fit(
         make_policy(MAPPOPolicy, own, features_extractor_class=extractor, features_extractor_kwargs={})
 
 
-@pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW])
-def test_adam_steps_all_weights_at_once_unless_told_otherwise(optimizer_class: type[th.optim.Optimizer]) -> None:
-    for kwargs, is_fused in (({"eps": 1.0}, True), ({"foreach": False}, None)):
-        policy = make_policy(IPPOPolicy, optimizer_class=optimizer_class, optimizer_kwargs=kwargs)
-        assert policy.optimizer.defaults["fused"] is is_fused
-    other = make_policy(IPPOPolicy, optimizer_class=th.optim.SGD, optimizer_kwargs={"momentum": 0.5})
-    assert other.optimizer.defaults["momentum"] == 0.5 and not other.optimizer.defaults["fused"]
-
-
 def test_net_arch_for_actor_and_critic() -> None:
     policy = make_policy(IPPOPolicy, net_arch={"pi": [5], "vf": [6, 7]})
     sizes = [tuple(p.shape) for name, p in policy.named_parameters() if name.endswith("weight") and "head" in name]

@@ -1,7 +1,9 @@
-"""The kernels equal the plain-Python reference world, step by step, on random configurations of both rule sets."""
+"""The kernels equal the plain-Python reference world step by step, and recorded episodes bit for bit."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import hecogrid_envs
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE
 from hecogrid_envs.state import StateMapping
 from hecogrid_envs.tiles import TileSpace, observation_space
+from tests import golden_episodes
 from tests.reference_world import ReferenceWorld
 
 STATE_ENTRIES = ("walls", "treasures", "keys", "agent_pos", "agent_dir", "agent_has_key")
@@ -130,3 +134,38 @@ def test_fields_of_view_are_the_reference_visibility(params: dict[str, Any], see
             if 0 <= x < size and 0 <= y < size:
                 expected[x, y] = True
         np.testing.assert_array_equal(fields[agent], expected)
+
+
+# --- recorded episodes, and our golden ones ---------------------------------------------------------------------------
+
+
+TRACES = Path(__file__).parents[2] / "shared" / "traces"
+RECORDINGS = sorted(TRACES.glob("*.npz"))
+
+
+@pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings are not kept in this repository")
+def test_there_are_recordings() -> None:
+    assert len(RECORDINGS) >= 6
+
+
+@pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
+def test_released_episodes(path: Path) -> None:
+    with np.load(path) as recording:
+        data: dict[str, Any] = {name: recording[name] for name in recording}
+    config = json.loads(str(data["config"]))
+    config.update(rules="released", agent_order="index")
+    env = hecogrid_envs.parallel_env(**config)
+    observations, _ = env.reset(options={"state": {name: data[name][0] for name in STATE_ENTRIES}})
+    np.testing.assert_array_equal(list(observations.values()), data["observations"][0])
+    for step, actions in enumerate(data["actions"]):
+        result = env.step(dict(zip(env.agents, actions, strict=True)))
+        state: Any = env.get_state()
+        for name in STATE_ENTRIES:
+            np.testing.assert_array_equal(state[name], data[name][step + 1], err_msg=f"{name} after step {step}")
+        assert list(result.rewards.values()) == data["rewards"][step].tolist()
+        pixels = list(result.observations.values())
+        np.testing.assert_array_equal(pixels, data["observations"][step + 1], err_msg=f"step {step}")
+
+
+def test_golden_episodes() -> None:
+    assert golden_episodes.digests() == json.loads(golden_episodes.PATH.read_text())
