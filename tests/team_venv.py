@@ -124,6 +124,12 @@ class TeamVenv(PlainVenv):
         self.steps[ended] = 0
         return self._observe(), self.rewards, self.dones, self.infos
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        return {"steps": self.steps.copy(), "episodes": self.episodes.copy()}
+
+    def load_checkpoint_state(self, state: dict[str, Any]) -> None:
+        self.steps, self.episodes = state["steps"], state["episodes"]
+
 
 def still(venv: VecEnv) -> Array:
     """Actions of agents that do nothing."""

@@ -14,20 +14,16 @@ from sb3_saf import CentralizedValueWrapper, game_seeds, make_team_env
 from sb3_saf.checkpoints.states import environment_state, load_environment_state
 from sb3_saf.inspection.recording import picture
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
-from sb3_saf.suites.registry import find_environment, suites
+from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.trees import decode, encode
 from sb3_saf.training.settings import load_settings
+from tests.test_suites import needs
 
 Array = npt.NDArray[Any]
 
 
-def _needs(name: str) -> pytest.MarkDecorator:
-    problem = suites()[name].problem()
-    return pytest.mark.skipif(problem is not None, reason=str(problem))
-
-
-needs_jaxmarl, needs_vmas = _needs("jaxmarl"), _needs("vmas")
+needs_jaxmarl, needs_vmas = needs("jaxmarl"), needs("vmas")
 
 
 def rows_of(env_id: str, n_envs: int, seed: int = 0, **params: Any) -> Any:

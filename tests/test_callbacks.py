@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf
 from sb3_saf import (
@@ -35,35 +34,23 @@ TASK: dict[str, Any] = {"n_agents": N_AGENTS, "grid_size": 7, "n_treasures": 3, 
 LIGHT: dict[str, Any] = {"features_extractor_class": sb3_saf.LightEncoder, "net_arch": [8]}
 
 
-class Spoiled(VecEnvWrapper):
-    """Games whose observations (numbers, not bytes) or rewards have an invalid value from a given step on."""
-
-    def __init__(self, venv: VecEnv, what: str, value: float, step: int) -> None:
-        shape = venv.observation_space.shape
-        super().__init__(venv, observation_space=spaces.Box(-np.inf, np.inf, shape, np.float32))
-        self.what, self.value, self.steps_left = what, value, step
-
-    def reset(self) -> Any:
-        return np.asarray(self.venv.reset(), dtype=np.float32)
-
-    def step_wait(self) -> Any:
-        obs, rewards, dones, infos = self.venv.step_wait()
-        obs = np.asarray(obs, dtype=np.float32)
-        self.steps_left -= 1
-        if self.steps_left <= 0:
-            (obs if self.what == "observations" else rewards)[3:4] = self.value
-        return obs, rewards, dones, infos
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        return {}
-
-    def load_checkpoint_state(self, state: object) -> None:
-        pass
+def games(seed: int = 0) -> CentralizedValueWrapper:
+    return sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=seed, **TASK)
 
 
-def games(seed: int = 0, **spoiled: Any) -> sb3_saf.CentralizedValueWrapper:
-    native = sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=seed, **TASK).venv
-    return sb3_saf.CentralizedValueWrapper(Spoiled(native, **spoiled) if spoiled else native)
+def spoiled(what: str, value: float, step: int) -> CentralizedValueWrapper:
+    """Games in which agent 1 of game 1 sees, or is paid, an invalid value from a step on."""
+
+    def is_bad(which: str, game: int, agent: int, now: int) -> bool:
+        return which == what and (game, agent) == (1, 1) and now >= step
+
+    def see(game: int, agent: int, episode: int, now: int) -> np.ndarray:
+        return np.full(4, value if is_bad("observations", game, agent, now) else agent, dtype=np.float32)
+
+    def pay(game: int, agent: int, now: int) -> float:
+        return value if is_bad("rewards", game, agent, now) else 1.0
+
+    return CentralizedValueWrapper(TeamVenv((10,) * N_GAMES, N_AGENTS, see=see, reward=pay))
 
 
 def ppo(env: VecEnv | None = None, **settings: Any) -> PPO:
@@ -76,15 +63,15 @@ def ppo(env: VecEnv | None = None, **settings: Any) -> PPO:
 CAUSES: dict[str, tuple[Any, str]] = {
     "loss": (lambda: ppo(ent_coef=float("nan")), r"the gradient of \S+ must be finite, got nan at game step 12, .*"),
     "reward": (
-        lambda: ppo(games(what="rewards", value=float("nan"), step=6)),
+        lambda: ppo(spoiled("rewards", float("nan"), 6)),
         "rewards must be finite, got nan at step 6 for agent 1 of game 1.*",
     ),
     "observation": (
-        lambda: ppo(games(what="observations", value=float("-inf"), step=7)),
+        lambda: ppo(spoiled("observations", float("-inf"), 7)),
         "observations must be finite, got -inf at step 7 for agent 1 of game 1.*",
     ),
     "returns": (
-        lambda: ppo(games(what="rewards", value=3e38, step=2)),
+        lambda: ppo(spoiled("rewards", 3e38, 2)),
         "returns of the rollout must be finite, got inf at game step 12, after 0 steps of the optimizer.*",
     ),
     "values of QPLEX": (

@@ -14,11 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numba
 import numpy as np
 import psutil
 import pytest
-import torch as th
 from gymnasium import spaces
 
 import sb3_saf
@@ -231,18 +229,3 @@ def test_games_in_worker_processes_end_with_a_killed_owner() -> None:
     for worker in left:
         worker.kill()
     assert len(workers) == 4 and not left
-
-
-@MAKERS
-def test_numbers_of_threads_that_change_in_between(make: Callable[[int], Any]) -> None:
-    expected = play_alone(make, 0)
-    before = th.get_num_threads(), numba.get_num_threads()
-    venv = begun(make)
-    try:
-        th.set_num_threads(2)
-        numba.set_num_threads(1)
-        assert played(venv) == expected
-    finally:
-        th.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
-        venv.close()

@@ -22,7 +22,7 @@ from sb3_saf.networks import row_encoder
 from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.distributions import LeanCategorical
 from sb3_saf.networks.encoders import PixelInput
-from sb3_saf.networks.layers import gather, gather_agents, mlp
+from sb3_saf.networks.layers import mlp
 from sb3_saf.networks.row_encoder import RowEncoder, UniqueRows, unique_rows
 from sb3_saf.networks.tanh import Tanh
 from sb3_saf.networks.tile_sums import Places, places_of_convolution, places_of_linear, rectified_sums, used_codes
@@ -49,11 +49,6 @@ def test_the_tanh_is_the_tanh() -> None:
     for found, expected in zip(gradients(Tanh(), of_columns), gradients(th.tanh, of_columns), strict=True):
         th.testing.assert_close(found, expected, rtol=0, atol=2e-6)
     assert [type(mlp([2, 3, 1], activation)[1]) for activation in (nn.Tanh, nn.ReLU)] == [Tanh, nn.ReLU]
-
-
-def test_the_tanh_of_a_number_does_not_depend_on_its_place() -> None:
-    x = th.randn(100)
-    assert all(th.equal(Tanh()(x[i:]), Tanh()(x)[i:]) for i in range(100))
 
 
 def test_the_tanh_can_be_differentiated_twice() -> None:
@@ -105,17 +100,6 @@ def two_threads() -> Iterator[None]:
     th.set_num_threads(2)
     yield
     th.set_num_threads(before)
-
-
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
-def test_gather_is_indexing(shape: tuple[int, ...]) -> None:
-    x = th.randn(4, *shape, dtype=th.float64, requires_grad=True)
-    rows = th.tensor([[0, 3, 3], [1, 0, 3]])
-    assert th.equal(gather(x, rows), x[rows])
-    assert th.autograd.gradcheck(lambda x: gather(x, rows), (x,))
-    of_agents = th.randn(3, 4, *shape, dtype=th.float64)
-    teams, agent = th.tensor([2, 0, 2]), th.tensor([3, 1, 3])
-    assert th.equal(gather_agents(of_agents, teams, agent), of_agents[teams, agent])
 
 
 def _trained(algorithm: type[Any], policy: str, memory: str | None = None, **kwargs: Any) -> th.Tensor:

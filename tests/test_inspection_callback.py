@@ -24,7 +24,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn
 
 from sb3_saf import (
-    QPLEX,
     CentralizedValueWrapper,
     GameStepsCallback,
     InspectionCallback,
@@ -47,6 +46,8 @@ from tests.team_venv import TeamVenv
 from tests.test_active import ACTIVE, LIVES
 from tests.test_monitor import RETURN_OF_GAME_0, RETURN_OF_GAME_1
 from tests.test_probes import train as train_on_probe
+from tests.test_qplex import make_model as make_qplex
+from tests.test_qplex import telling_env
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams
 
@@ -350,29 +351,12 @@ class TestMessages:
 # --- QPLEX: values of teams, best actions -----------------------------------------------------------------------------
 
 
-NETS: dict[str, Any] = {"net_arch": [8], "mixer_hidden": 8, "kernel_arch": (8,), "features_extractor_kwargs": {}}
-QUICK: dict[str, Any] = {"buffer_size": 200, "learning_starts": 8, "batch_size": 8, "train_freq": 4, "gamma": 0.5}
-
-
-def telling(**kwargs: Any) -> VecEnv:
-    """Create four games whose agents join and die, with legal actions and a state; illegal actions fail."""
-    settings: dict[str, Any] = {"n_agents": 3, "max_cycles": 5, "deaths": {1: 3}, "joins": {2: 1}} | kwargs
-    return make_team_env(TellingEnv(**settings), n_envs=4, seed=0, state=True)
-
-
-def model_on(env: VecEnv, policy: str = "QPLEXPolicy", folder: Path | None = None, **parts: Any) -> QPLEX:
-    nets = NETS | parts
-    policy, _, memory = policy.partition("-")
-    if memory:
-        nets |= {"memory": memory, "memory_size": 8, "sequence_length": 4, "burn_in": 2}
-    logs = None if folder is None else str(folder)
-    return QPLEX(policy, env, seed=1, device="cpu", policy_kwargs=nets, tensorboard_log=logs, **QUICK)
-
-
 @pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
 def test_the_page_of_qplex(policy: str, tmp_path: Path) -> None:
-    callback = InspectionCallback(telling(), every_game_steps=20, n_eval_episodes=4)
-    model_on(telling(), policy, tmp_path).learn(40 * 3, log_interval=4, callback=callback)
+    callback = InspectionCallback(telling_env(), every_game_steps=20, n_eval_episodes=4)
+    make_qplex(telling_env(), policy, gamma=0.5, tensorboard_log=str(tmp_path)).learn(
+        40 * 3, log_interval=4, callback=callback
+    )
     found = events(tmp_path)
     scalars, pool = found.Tags()["scalars"], policy == "QPLEXPoolPolicy"
     assert groups(scalars) == {"team", "critic", "lambda"} | ({"pool"} if pool else set())
@@ -393,8 +377,8 @@ def rows_of(env: VecEnv) -> dict[str, th.Tensor]:
 
 @th.no_grad()
 def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
-    env = telling()
-    policy = model_on(env, mixer="vdn").policy
+    env = telling_env()
+    policy = make_qplex(env, mixer="vdn").policy
     obs = rows_of(env)
     view = QReader(policy).step(obs, np.ones(12, dtype=bool))
     best = policy.own_q_values(obs).max(dim=1).values.view(4, 3)
@@ -405,8 +389,8 @@ def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
 
 @pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
 def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
-    env = telling()
-    team = model_on(env, policy).policy
+    env = telling_env()
+    team = make_qplex(env, policy).policy
     recording = record_episodes(team, env, 8, seed=3, gamma=0.5)
     env.seed(3)
     assert recording.episode_returns == evaluate_team(team, env, 8).returns
@@ -418,7 +402,7 @@ def test_the_team_plays_as_when_it_is_evaluated(policy: str) -> None:
 def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> None:
     """Two agents get 1 each at both steps; a time limit that does not terminate is followed by the next value."""
     env = make_team_env(ConstantReward(n_agents=2, length=2), n_envs=4, time_limit=time_limit)
-    team = model_on(env).policy
+    team = make_qplex(env).policy
     recording = record_episodes(team, env, 4, seed=0, gamma=0.5)
     assert recording.episode_returns == [4.0] * 4
     assert (recording.rewards == 2).all()

@@ -16,9 +16,7 @@ from sb3_saf.inspection.scalars import (
     calibrate,
     policy_distances,
     pool_scalars,
-    selection_by_group,
     team_scalars,
-    zone_dependence,
 )
 
 Array = npt.NDArray[Any]
@@ -94,20 +92,6 @@ class TestCalibration:
 
 
 class TestSelection:
-    #: Zone 0 uses policy 0, zone 2 policies 0 and 1 equally; zone 1 is empty, one row is in no zone.
-    WEIGHTS = np.array([[1, 0], [1, 0], [0.5, 0.5], [0, 1]])
-    ZONES = np.array([0, 0, 2, -1])
-
-    def test_the_table_of_zones(self) -> None:
-        table = selection_by_group(self.WEIGHTS, self.ZONES, 3)
-        np.testing.assert_array_equal(table, [[1, 0], [np.nan, np.nan], [0.5, 0.5]])
-
-    def test_dependence_on_zones(self) -> None:
-        zones = np.array([0, 0, 1, 1])
-        assert zone_dependence(np.array([[1, 0], [1, 0], [0, 1], [0, 1]]), zones) == pytest.approx(1)
-        assert zone_dependence(np.array([[1, 0], [0, 1], [1, 0], [0, 1]]), zones) == pytest.approx(0)
-        assert zone_dependence(self.WEIGHTS, np.zeros(4, dtype=int)) is None
-
     def test_a_pool_with_known_choices_has_these_scalars(self) -> None:
         weights = np.array([[[0.75, 0.25], [0, 1]], [[0.25, 0.75], [0, 1]], [[1, 0], [1, 0]]])
         counted = np.array([[True] * 2, [True] * 2, [False] * 2])

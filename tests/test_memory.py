@@ -22,7 +22,7 @@ from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.memory import Memory
 from tests.team_venv import TeamVenv
 from tests.test_policies import NAMES as POLICIES
-from tests.weights import DyingGame
+from tests.weights import DyingGame, weights_of
 
 KINDS = ("gru", "lstm")
 SMALL: dict[str, Any] = {"net_arch": [16], "memory_size": 8}
@@ -62,10 +62,6 @@ def collected(model: Any) -> Any:
 
 def weights(model: Any) -> dict[str, th.Tensor]:
     return {name: value.clone() for name, value in model.policy.state_dict().items()}
-
-
-def equal(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:
-    return one.keys() == other.keys() and all(th.equal(one[name], other[name]) for name in one)
 
 
 # --- sequences --------------------------------------------------------------------------------------------------------
@@ -303,15 +299,15 @@ def test_two_runs_of_one_seed_end_alike_and_evaluation_between_changes_nothing()
             return True
 
     found = [make_model().learn(40 * 9, callback=callback) for callback in (None, None, Evaluate())]
-    assert equal(weights(found[0]), weights(found[1]))
-    assert equal(weights(found[0]), weights(found[2]))
+    assert weights_of(found[0]) == weights_of(found[1])
+    assert weights_of(found[0]) == weights_of(found[2])
 
 
 def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tmp_path: Any) -> None:
     callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=1, pictures=False)
     plain = make_model(env=make_env((5, 5, 5))).learn(48 * 9)
     watched = make_model(env=make_env((5, 5, 5)), tensorboard_log=str(tmp_path)).learn(48 * 9, callback=callback)
-    assert equal(weights(plain), weights(watched))
+    assert weights_of(plain) == weights_of(watched)
     recorded = record_episodes(watched.policy, make_env(), 6, gamma=0.9)
     assert np.isfinite(recorded.values).all()
 

@@ -302,29 +302,13 @@ def test_playing_in_a_window(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 
 def test_every_parameter_is_an_option() -> None:
-    words = (
-        "TeamTogether --n-agents 4 --grid-size 12 --coordination 2 --heterogeneity 3 --n-treasures 9 --n-keys 1 "
-        "--clutter-density 0.2 --view-size 5 --view-offset 2 --support-radius 3 --max-cycles 20 --rules released "
-        "--agent-order index --seed 3 --raw --others random --tile-size 9"
-    )
-    session, options = make_session(words.split())
+    params: dict[str, Any] = {"n_agents": 4, "grid_size": 12, "coordination": 2, "heterogeneity": 3, "n_treasures": 9}
+    params |= {"n_keys": 1, "clutter_density": 0.2, "view_size": 5, "view_offset": 2, "support_radius": 3}
+    params |= {"max_cycles": 20, "rules": "released", "agent_order": "index"}
+    words = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in params.items())
+    session, options = make_session(f"TeamTogether {words} --seed 3 --raw --others random --tile-size 9".split())
     assert session.env.task == "TeamTogether"
-    assert session.env.params == HECOGridParams(
-        n_agents=4,
-        grid_size=12,
-        coordination=2,
-        heterogeneity=3,
-        n_treasures=9,
-        n_keys=1,
-        clutter_density=0.2,
-        view_size=5,
-        view_offset=2,
-        support_radius=3,
-        max_cycles=20,
-        rules="released",
-        agent_order="index",
-        observation="tiles",
-    )
+    assert session.env.params == HECOGridParams(**params, observation="tiles")
     assert (session.raw, session.others, options.tile_size) == (True, "random", 9)
 
 

@@ -526,13 +526,6 @@ def test_with_gumbel_it_is_not() -> None:
     assert (ratios - 1).abs().max() > 1e-2
 
 
-def test_two_runs_of_one_seed_end_alike_also_where_policies_are_drawn() -> None:
-    kwargs = {"selection": "gumbel"}
-    one, other, third = (make_model(seed=seed, policy_kwargs=kwargs).learn(120) for seed in (1, 1, 2))
-    assert equal_weights(one.policy, other.policy)
-    assert not equal_weights(one.policy, third.policy)
-
-
 @pytest.mark.parametrize(
     ("name", "kwargs", "action"),
     [

@@ -52,14 +52,14 @@ _MANY_AGENTS = ("magent",)
 
 def _examples() -> list[Any]:
     return [
-        pytest.param(f"{suite.name}/{task}", marks=[_needs(suite.name)])
+        pytest.param(f"{suite.name}/{task}", marks=[needs(suite.name)])
         for suite in suites().values()
         for task in suite.examples
         if suite.name not in _MANY_AGENTS
     ]
 
 
-def _needs(name: str) -> pytest.MarkDecorator:
+def needs(name: str) -> pytest.MarkDecorator:
     problem = suites()[name].problem()
     return pytest.mark.skipif(problem is not None, reason=str(problem))
 
@@ -118,7 +118,7 @@ def test_an_engine_that_does_not_take_a_parameter_says_so() -> None:
         TeamEnvironment("x/y", None, suite, "y").count_agents({"colour": 1})
 
 
-@_needs("mpe")
+@needs("mpe")
 def test_competitive_games_are_said_to_be_trained_as_one_team() -> None:
     with pytest.warns(UserWarning, match="simple_tag_v3 play against each other; .* one team"):
         make_team_env("mpe/simple_tag_v3")
@@ -173,8 +173,8 @@ def test_seeds_decide_what_happens(env_id: str) -> None:
 @pytest.mark.parametrize(
     "env_id",
     [
-        pytest.param("lbf/Foraging-5x5-2p-1f-v3", marks=_needs("lbf")),
-        pytest.param("jaxmarl/switch_riddle", marks=_needs("jaxmarl")),
+        pytest.param("lbf/Foraging-5x5-2p-1f-v3", marks=needs("lbf")),
+        pytest.param("jaxmarl/switch_riddle", marks=needs("jaxmarl")),
     ],
 )
 def test_a_struck_run_goes_on_bit_for_bit_and_its_team_is_exported_and_inspected(env_id: str, tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_a_struck_run_goes_on_bit_for_bit_and_its_team_is_exported_and_inspected
     assert look.scalars and np.isfinite([value for value in look.scalars.values() if value is not None]).all()
 
 
-@_needs("magent")
+@needs("magent")
 def test_groups_with_other_spaces_are_one_team() -> None:
     with pytest.warns(UserWarning, match="one team"):
         env = make_team_env("magent/tiger_deer_v4", n_envs=1, seed=0, state=True, map_size=14, max_cycles=30)
@@ -259,7 +259,7 @@ def test_a_gymnasium_environment_of_several_agents_is_taken_as_it_is() -> None:
         GymnasiumTeam(gym.make("CartPole-v1"))
 
 
-@_needs("lbf")
+@needs("lbf")
 def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
     env: Any = find_environment("lbf/Foraging-8x8-2p-3f-v3").make_game({})
     env.reset(seed=0)
@@ -274,7 +274,7 @@ def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
     assert infos["agent_0"]["is_success"] is True
 
 
-@_needs("mpe")
+@needs("mpe")
 def test_agents_with_other_spaces_are_padded_and_masked() -> None:
     game = EqualSpaces(find_environment("mpe/simple_speaker_listener_v4").make_game({}))
     observations, infos = game.reset(seed=0)

@@ -418,19 +418,6 @@ def rollout(venv: SuperSuitVecEnv, n_steps: int) -> list[Any]:
     return record
 
 
-def same(one: Any, other: Any) -> bool:
-    """Compare types and bits."""
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, dict):
-        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(same(*pair) for pair in zip(one, other, strict=True))
-    if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and np.array_equal(one, other)
-    return bool(one == other)
-
-
 def kaz() -> Any:
     """Knights, archers, zombies: agents die, and its surfaces cannot be pickled."""
     from pettingzoo.butterfly.knights_archers_zombies import knights_archers_zombies
@@ -451,7 +438,7 @@ def test_processes_make_no_difference(bridge: Bridge, make: Callable[[], Any]) -
         pytest.importorskip("pygame")
     n_steps = 150 if make is kaz else 12
     one, two = (rollout(bridge(make, n_games=3, seed=1, n_cpus=n_cpus), n_steps) for n_cpus in (1, 2))
-    assert same(one, two)
+    np.testing.assert_equal(one, two)
     if make is kaz:
         assert any(info.get("active") is False for part in one[5::5] for info in part)
 

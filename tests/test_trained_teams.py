@@ -65,6 +65,14 @@ def change(teams: Path, edit: Callable[[dict[str, Any]], object], name: str = f"
     write_json(teams / name / "run.json", content)
 
 
+def change_returns(teams: Path, edit: Callable[[list[float]], list[float]]) -> None:
+    """Change the returns in the row of a team."""
+    path = teams / LEVEL / "ippo" / "run.json"
+    content = read_json(path)
+    returns = edit([float(text) for text in content["row"]["returns"].split()])
+    write_json(path, {**content, "row": {**content["row"], "returns": " ".join(map(repr, returns))}})
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_team_plays_its_games_again(published: Path, method: str) -> None:
     model = load_team(LEVEL, method, published)
@@ -137,12 +145,7 @@ def test_exchanged_weights_are_found_by_their_games(teams: Path, experiments: Pa
 )
 def test_few_games_may_differ(teams: Path, n_changed: int, shift: float, message: str) -> None:
     """As on another kind of processor."""
-    path = teams / LEVEL / "ippo" / "run.json"
-    content = read_json(path)
-    returns = [float(text) for text in content["row"]["returns"].split()]
-    returns[:n_changed] = [value + shift for value in returns[:n_changed]]
-    content["row"]["returns"] = " ".join(map(repr, returns))
-    write_json(path, content)
+    change_returns(teams, lambda returns: [*(value + shift for value in returns[:n_changed]), *returns[n_changed:]])
     if message:
         with pytest.raises(ValueError, match=message):
             check_team(f"{LEVEL}/ippo", teams, batches=1)
@@ -152,18 +155,11 @@ def test_few_games_may_differ(teams: Path, n_changed: int, shift: float, message
 
 def test_games_of_other_packages_may_differ_by_chance(teams: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trained_teams, "EQUAL_GAMES", 0.0)
-    path = teams / LEVEL / "ippo" / "run.json"
-    content = read_json(path)
-    returns = [float(text) for text in content["row"]["returns"].split()]
-    for shift, sign in ((1.0, -1), (5.0, 1)):
-        moved = [value + shift * (1 if index % 2 else sign) for index, value in enumerate(returns)]
-        content["row"]["returns"] = " ".join(map(repr, moved))
-        write_json(path, content)
-        if sign < 0:
-            assert "0% of the games are equal" in check_team(f"{LEVEL}/ippo", teams)
-        else:
-            with pytest.raises(ValueError, match="expected no difference but by chance, got -5 to -5"):
-                check_team(f"{LEVEL}/ippo", teams)
+    change_returns(teams, lambda returns: [value + (1 if index % 2 else -1) for index, value in enumerate(returns)])
+    assert "0% of the games are equal" in check_team(f"{LEVEL}/ippo", teams)
+    change_returns(teams, lambda returns: [value + (4 if index % 2 else 6) for index, value in enumerate(returns)])
+    with pytest.raises(ValueError, match="expected no difference but by chance, got -5 to -5"):
+        check_team(f"{LEVEL}/ippo", teams)
 
 
 @pytest.mark.parametrize(
