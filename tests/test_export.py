@@ -321,7 +321,7 @@ def test_acts_on_what_the_game_gives(kind: str, masks: str | None, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["heads, grey pictures", "heads with memory", "masked rows"])
-def test_the_script_prints_the_models_actions_with_numpy_and_onnxruntime_alone(
+def test_the_script_acts_as_the_model_without_other_packages(
     name: str, exports: Callable[[str], Exported], tmp_path: Path
 ) -> None:
     policy, folder, actor = exports(name)
