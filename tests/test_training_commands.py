@@ -351,6 +351,7 @@ def test_every_command_has_help(command: Any, capsys: pytest.CaptureFixture[str]
     assert "usage: " in capsys.readouterr().out
 
 
-def test_wrong_levels_of_make_train_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = failed(["--coordination", "6", "--output", str(tmp_path)], capsys, quickstart.main)
-    assert "coordination must be an integer from 1 to 5" in line
+def test_wrong_levels_of_make_train_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        quickstart.main(["--coordination", "6", "--output", str(tmp_path)])
+    assert "coordination must be an integer from 1 to 5" in capsys.readouterr().err.splitlines()[-1]
