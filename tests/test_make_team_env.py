@@ -90,7 +90,7 @@ def test_hecogrid_through_supersuit_has_the_games_state_and_signals() -> None:
 
 
 def test_short_first_episodes_of_staggered_games_do_not_count() -> None:
-    level = {"n_agents": 2, "grid_size": 8, "n_treasures": 2, "max_cycles": 10}
+    level: dict[str, Any] = {"n_agents": 2, "grid_size": 8, "n_treasures": 2, "max_cycles": 10}
     env = make_team_env("TeamSupport", n_envs=5, seed=0, stagger=True, **level)
     assert evaluate_team(RandomPolicy(env.action_space, seed=0), env, 7).lengths == [10] * 7
 

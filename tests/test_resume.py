@@ -132,7 +132,7 @@ def normalised(**arguments: Any) -> Any:
 def masked() -> Any:
     """Create a model whose legal actions change from step to step."""
     env = sb3_saf.make_team_env(TellingEnv, N_GAMES, seed=3)
-    settings = {"batch_size": ROLLOUT, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
+    settings: dict[str, Any] = {"batch_size": ROLLOUT, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
     return make(algorithm=MaskablePPO, policy="SAFMaskablePolicy", env=env, **settings)
 
 
