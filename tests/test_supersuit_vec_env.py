@@ -349,6 +349,13 @@ def test_masks_by_row(bridge: Bridge, n_cpus: int) -> None:
     assert [mask.tolist() for mask in masks] == [[True, False, False, False], [True] * 4]  # agent 1 has ended
 
 
+def test_no_pictures(bridge: Bridge) -> None:
+    venv = bridge(CounterEnv, n_games=2)
+    assert venv.get_images() == [None] * 4
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert venv.render() is None
+
+
 # ---- trap: agents that die
 
 
@@ -700,6 +707,19 @@ def test_close_that_breaks(bridge: Bridge, n_cpus: int, stepping: bool, tmp_path
         venv.close()
     assert trace.read_text() == "closed\n" * 2
     assert not any(is_running(pid) for pid in pids)
+
+
+@pytest.mark.timeout(60)
+def test_close_when_a_worker_is_gone(bridge: Bridge, tmp_path: Path) -> None:
+    trace = tmp_path / "closed"
+    venv = bridge(lambda: TracingEnv(str(trace)), n_games=2, n_cpus=2)
+    venv.reset()
+    first, second = venv.get_attr("pid", indices=[0, 2])
+    kill(first)
+    start = time.monotonic()
+    venv.close()
+    assert time.monotonic() - start < 5
+    assert not is_running(second)
 
 
 @one_and_two_cpus
