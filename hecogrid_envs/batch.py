@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from threading import Timer
@@ -75,9 +74,15 @@ class GameBatch:
         from hecogrid_envs.core.play import play
 
         arguments = (self._games, self._world, self._buffers, 0, _NO_VIEWS, _NO_VIEWS, 0, 0)
-        with _announced_compilation():
+        # Said if it takes long, that is if numba's cache does not have the code.
+        text = "hecogrid_envs: loading the kernels; once on this machine they are compiled, about 10 seconds"
+        timer = Timer(_SECONDS_WITHOUT_A_WORD, partial(print, text, file=sys.stderr, flush=True))
+        timer.start()
+        try:
             # Compiled for these types and called directly: saves the type dispatch on some 40 arrays in each call.
             kernel: Callable[..., None] = play.compile(tuple(map(typeof, arguments)))
+        finally:
+            timer.cancel()
         return kernel
 
     def __getstate__(self) -> dict[str, Any]:
@@ -341,15 +346,3 @@ def _positive(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
     return int(value)
-
-
-@contextmanager
-def _announced_compilation() -> Iterator[None]:
-    """Print a message on standard error if compiling takes long, that is if numba's cache does not have the code."""
-    text = "hecogrid_envs: loading the kernels; once on this machine they are compiled, about 10 seconds"
-    timer = Timer(_SECONDS_WITHOUT_A_WORD, partial(print, text, file=sys.stderr, flush=True))
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()

@@ -13,7 +13,7 @@ from hecogrid_envs import TeamSupportEnv, play
 from hecogrid_envs.parallel_env import StepResult
 from hecogrid_envs.params import HECOGridParams
 from hecogrid_envs.play import HumanWindow, Others, Session, make_session, play_window
-from hecogrid_envs.text import parse_level
+from tests.levels import level
 
 #: Zone 0 is columns 0 to 4, zone 1 columns 5 to 9.
 LEVEL = """
@@ -55,7 +55,7 @@ def noted_session(
     world = {"n_agents": 3, "grid_size": 10, "n_treasures": 1, "n_keys": 0, "clutter_density": 0.0} | params
     game = NotedGame(observation="tiles", agent_order="index", **world)
     session = Session(game, seed, raw, others)
-    game.set_state(parse_level(LEVEL))
+    game.set_state(level(LEVEL))
     return session, game
 
 
