@@ -20,8 +20,7 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.callbacks.evaluation import TeamEvalCallback
     from sb3_saf.callbacks.finite import FiniteCallback
     from sb3_saf.callbacks.game_steps import GameStepsCallback
-    from sb3_saf.checkpoints.callback import TeamCheckpointCallback
-    from sb3_saf.checkpoints.learning import resumable_learn, resume
+    from sb3_saf.checkpoints.learning import TeamCheckpointCallback, resumable_learn, resume
     from sb3_saf.envs.audit import check_team_env
     from sb3_saf.envs.curriculum import Curriculum, Stage
     from sb3_saf.envs.game_reader import EqualSpaces
@@ -38,8 +37,7 @@ if find_spec("stable_baselines3") is not None:
     )
     from sb3_saf.export.weights import load_weights, save_weights
     from sb3_saf.export.writer import export_actors
-    from sb3_saf.inspection.callback import InspectionCallback
-    from sb3_saf.inspection.inspection import Inspection, inspect_team
+    from sb3_saf.inspection.callback import Inspection, InspectionCallback, inspect_team
     from sb3_saf.inspection.replay import replay
     from sb3_saf.make import make_team_env, make_vec_env
     from sb3_saf.networks.encoders import (

@@ -9,8 +9,8 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.distributions import LeanCategorical
+from sb3_saf.networks.knowledge_source import Attention
 from sb3_saf.networks.layers import mlp, side_by_side
 from sb3_saf.networks.tanh import Tanh
 from sb3_saf.teams.errors import NonFiniteError

@@ -13,8 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_saf import QPLEX, InspectionCallback, evaluate_team, make_team_env
-from sb3_saf.inspection.reading import QReader
-from sb3_saf.inspection.recording import record_episodes
+from sb3_saf.inspection.recording import QReader, record_episodes
 from sb3_saf.networks.actor import PolicyPool
 from tests.probe_envs import ConstantReward
 from tests.toy_envs import TellingEnv

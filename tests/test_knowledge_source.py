@@ -10,8 +10,7 @@ from gymnasium.spaces import Discrete
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_saf.networks.attention import Attention
-from sb3_saf.networks.knowledge_source import KnowledgeSource
+from sb3_saf.networks.knowledge_source import Attention, KnowledgeSource
 from sb3_saf.networks.layers import NetworkSpec
 from sb3_saf.policies.parts import CriticInput
 from sb3_saf.policies.saf import SAFCritic, SAFParts

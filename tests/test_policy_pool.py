@@ -13,11 +13,17 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import make_proba_distribution
 from torch import nn
 
-from sb3_saf.networks import mixtures
+from sb3_saf.networks import distributions as mixtures
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy
-from sb3_saf.networks.distributions import distribution_of, n_action_parameters
+from sb3_saf.networks.distributions import (
+    PoolDistribution,
+    SelectedDistribution,
+    distribution_of,
+    draw_policy,
+    mixture_of,
+    n_action_parameters,
+)
 from sb3_saf.networks.layers import NetworkSpec
-from sb3_saf.networks.mixtures import PoolDistribution, SelectedDistribution, draw_policy, mixture_of
 
 N_ROWS, N_POLICIES = 4, 3
 DISCRETE = spaces.Discrete(5)

@@ -29,7 +29,7 @@ from sb3_saf import (
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import MixerName
-from sb3_saf.qplex.parts import q_values
+from sb3_saf.qplex.policies import q_values
 from tests.probe_envs import ONE_STEP, MatrixGame, TwoStates
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams

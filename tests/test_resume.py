@@ -396,7 +396,7 @@ def test_a_folder_that_is_removed_while_a_run_writes_is_made_again(tmp_path: Pat
 
 def test_other_conditions_are_told_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     resumable_learn(make(), ROLLOUT, tmp_path)
-    monkeypatch.setattr("sb3_saf.checkpoints.runs.package_version", lambda: "9.9")
+    monkeypatch.setattr("sb3_saf.checkpoints.states.package_version", lambda: "9.9")
     with pytest.warns(UserWarning, match=r"sb3_saf was .*, now '9\.9'"):
         model = resumable_learn(make(), WHOLE, tmp_path)
     assert weights(model) == undisturbed()

@@ -22,7 +22,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
 from sb3_saf.callbacks.game_steps import game_steps
-from sb3_saf.checkpoints.runs import constructor_arguments
+from sb3_saf.checkpoints.states import constructor_arguments
 from sb3_saf.policies.memory import RememberingPolicy
 from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.teams.errors import CheckpointError

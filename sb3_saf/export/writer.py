@@ -28,14 +28,15 @@ from sb3_saf.networks.distributions import (
     is_one_hot,
     likeliest_action,
     masked_parameters,
+    mixture_log_prob,
     mixture_log_probs,
+    mixture_mode,
     n_action_parameters,
+    policy_parameters,
 )
 from sb3_saf.networks.encoders import encoded
-from sb3_saf.networks.mixtures import mixture_log_prob, mixture_mode, policy_parameters
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
-from sb3_saf.qplex.parts import AgentMemory
-from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.qplex.policies import AgentMemory, QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.errors import ExportError
 from sb3_saf.teams.files import atomic_file, write_text

@@ -15,8 +15,7 @@ import torch as th
 from sb3_saf.buffers.replay import TeamReplaySamples, TeamSteps
 from sb3_saf.networks.layers import gather
 from sb3_saf.qplex.mixers import JointChoice, Mixed
-from sb3_saf.qplex.parts import q_values
-from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
+from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy, q_values
 
 
 class TeamError(NamedTuple):

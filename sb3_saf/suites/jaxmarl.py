@@ -16,13 +16,13 @@ JAXMARL: Final = ('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; p
 
 
 def _tasks() -> list[str]:
-    from sb3_saf.suites.engines.jaxmarl_envs import registered
+    from sb3_saf.suites.engines.jaxmarl import registered
 
     return registered()
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+    from sb3_saf.suites.engines.jaxmarl import vec_env
 
     return vec_env(task, n_envs, seed, **params)
 

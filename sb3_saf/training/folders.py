@@ -24,7 +24,7 @@ import subprocess
 import sys
 import uuid
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -96,15 +96,9 @@ def finish_run(folder: Path, **cost: Any) -> None:
     path = folder / FINISHED
     if not cost:
         cost = {name: value for name, value in read_json(path).items() if name != "files"}
-    files = {name: digest(folder / name) for name in sorted(_files(folder))}
-    write_json(path, {**cost, "files": files})
-
-
-def _files(folder: Path) -> Iterator[str]:
-    """Yield the names of the files of a run and of its tests."""
-    for path in (*folder.iterdir(), *folder.glob("tests/*")):
-        if path.is_file() and path.name not in _UNLISTED and not path.name.startswith("."):
-            yield path.relative_to(folder).as_posix()
+    files = [one for one in (*folder.iterdir(), *folder.glob("tests/*")) if one.is_file()]
+    listed = sorted(one for one in files if one.name not in _UNLISTED and not one.name.startswith("."))
+    write_json(path, {**cost, "files": {one.relative_to(folder).as_posix(): digest(one) for one in listed}})
 
 
 def software_versions() -> dict[str, str]:

@@ -54,8 +54,7 @@ def ppo_settings(
     from sb3_saf.networks.encoders import LightEncoder
     from sb3_saf.suites.registry import HOME
     from sb3_saf.teams.checks import unknown_name
-    from sb3_saf.training.settings import ALGOS, find_algorithm
-    from sb3_saf.training.values import algorithm_arguments, convert
+    from sb3_saf.training.settings import ALGOS, algorithm_arguments, convert, find_algorithm
     from sb3_saf.training.yaml_files import entry_of, read_settings
 
     trained = [name for name, spec in ALGOS.items() if spec.algorithm is PPO]

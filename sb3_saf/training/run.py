@@ -132,7 +132,18 @@ class Training:
             th.set_num_threads(self.options.num_threads)
         with ExitStack() as self._open:  # closes the parts already made if a later one fails
             self.games = self._games(settings, monitor_dir=folder, n_cpus=self.options.n_cpus)
-            self.model = self._make_model()
+            if (log := self.options.tensorboard_log) is not None:
+                log.mkdir(parents=True, exist_ok=True)
+            self.model = settings.make_model(
+                self.games,
+                seed,
+                device=self.options.device,
+                tensorboard_log=None if log is None else str(log),
+                verbose=self.options.verbose,
+            )
+            if (initial := self.options.initial_model) is not None:
+                load_parameters(self.model, initial)
+                load_normalization(self.games, initial.parent)
             self.clock = TrainingClock(settings.game_steps / (2 * CURVE_POINTS))
             self.evaluation: SeededEvalCallback | None = None
             self.callbacks = [self.clock, *callbacks, *self._make_callbacks()]
@@ -192,25 +203,9 @@ class Training:
         self._open.callback(games.close)
         return games
 
-    def _make_model(self) -> BaseAlgorithm:
-        options, log = self.options, self.options.tensorboard_log
-        if log is not None:
-            log.mkdir(parents=True, exist_ok=True)
-        model = self.settings.make_model(
-            self.games,
-            self.seed,
-            device=options.device,
-            tensorboard_log=None if log is None else str(log),
-            verbose=options.verbose,
-        )
-        if options.initial_model is not None:
-            load_parameters(model, options.initial_model)
-            load_normalization(self.games, options.initial_model.parent)
-        return model
-
     def _make_callbacks(self) -> list[BaseCallback]:
-        options = self.options
-        callbacks = make_callbacks(self.settings.wrapping)
+        options, settings = self.options, self.settings
+        callbacks = make_callbacks(settings.wrapping)
         if options.progress:
             bar = GameStepsProgressBar()
             self._open.callback(bar.close)
@@ -218,32 +213,30 @@ class Training:
         if self.folder is not None and options.save_freq > 0:
             callbacks.append(CheckpointInGameSteps(options.save_freq, self.folder, options.verbose))
         if eval_freq := self._every(options.eval_freq, EVALUATIONS_PER_RUN):
-            self.evaluation = self._evaluation(eval_freq)
+            of_evaluation, folder = options.eval_settings or settings, None if self.folder is None else str(self.folder)
+            if of_evaluation.n_agents != settings.n_agents:
+                raise ValueError(
+                    f"evaluation needs the {settings.n_agents} agents of training, got "
+                    f"n_agents={of_evaluation.n_agents}"
+                )
+            n_games = min(options.n_eval_envs, options.eval_episodes)
+            self.evaluation = SeededEvalCallback(
+                self._games(of_evaluation, evaluation=True, n_envs=n_games),
+                seed=self.seed,
+                settings=of_evaluation,
+                callback_after_eval=options.after_evaluation,
+                best_model_save_path=folder,
+                log_path=folder,
+                n_eval_episodes=options.eval_episodes,
+                eval_freq=eval_freq,
+                deterministic=options.deterministic_eval or not of_evaluation.spec.draws_actions,
+                verbose=options.verbose,
+            )
             callbacks.append(self.evaluation)
         inspect_freq = self._every(options.inspect_freq, INSPECTIONS_PER_RUN)
-        if options.tensorboard_log is not None and inspect_freq and "normalize" not in self.settings.wrapping:
+        if options.tensorboard_log is not None and inspect_freq and "normalize" not in settings.wrapping:
             callbacks.append(self._inspection(inspect_freq))
         return callbacks
-
-    def _evaluation(self, eval_freq: int) -> SeededEvalCallback:
-        options, settings = self.options, self.options.eval_settings or self.settings
-        if settings.n_agents != self.settings.n_agents:
-            raise ValueError(
-                f"evaluation needs the {self.settings.n_agents} agents of training, got n_agents={settings.n_agents}"
-            )
-        folder = None if self.folder is None else str(self.folder)
-        return SeededEvalCallback(
-            self._games(settings, evaluation=True, n_envs=min(options.n_eval_envs, options.eval_episodes)),
-            seed=self.seed,
-            settings=settings,
-            callback_after_eval=options.after_evaluation,
-            best_model_save_path=folder,
-            log_path=folder,
-            n_eval_episodes=options.eval_episodes,
-            eval_freq=eval_freq,
-            deterministic=options.deterministic_eval or not settings.spec.draws_actions,
-            verbose=options.verbose,
-        )
 
     def _inspection(self, every_game_steps: int) -> InspectionCallback:
         """Make the callback that inspects the policy for TensorBoard, on games not used in training."""
