@@ -13,9 +13,9 @@ import pytest
 import torch as th
 
 from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.teams import trees
-from sb3_saf.teams.errors import CheckpointError, DamagedCheckpointError
-from sb3_saf.teams.trees import decode, encode, write_tree
+from sb3_saf.teams import files as trees
+from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError
+from sb3_saf.teams.files import decode, encode, write_tree
 
 TREE: dict[str, Any] = {
     "numbers": [1, -1.5, float("-inf"), True, None, 2**127, "text"],

@@ -11,8 +11,7 @@ import pytest
 
 from benchmarks import diagnosis
 from hecogrid_envs.constants import Command
-from sb3_saf.experiments.definitions import Level
-from sb3_saf.experiments.grid import Cell, RunConfig
+from sb3_saf.experiments.definitions import Cell, Level, RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.folders import write_run
 from sb3_saf.training.settings import load_settings

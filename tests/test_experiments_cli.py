@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, find_experiment
-from sb3_saf.experiments.grid import RunConfig, Selection
+from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, find_experiment
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from tests.experiments_jobs import InlineEngine

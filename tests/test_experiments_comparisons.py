@@ -8,7 +8,7 @@ import pytest
 from rliable import metrics
 from scipy import stats
 
-from sb3_saf.experiments.comparisons import compare, holm, mean_difference, pooled, shares
+from sb3_saf.experiments.tables import compare, holm, mean_difference, pooled, shares
 from sb3_saf.training.statistics import Estimate, mean_over_seeds, optimality_gaps, probability_of_improvement
 
 

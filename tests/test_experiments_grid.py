@@ -7,8 +7,20 @@ from dataclasses import replace
 
 import pytest
 
-from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Level, find_experiment, own_experiment
-from sb3_saf.experiments.grid import Cell, Grid, RunConfig, Selection, Shard, expand, merge
+from sb3_saf.experiments.definitions import (
+    EXPERIMENTS,
+    RANDOM,
+    Cell,
+    Grid,
+    Level,
+    RunConfig,
+    Selection,
+    Shard,
+    expand,
+    find_experiment,
+    merge,
+    own_experiment,
+)
 
 THREE_SEEDS = Selection((0, 1, 2))
 PAPER = RunConfig("paper")

@@ -14,8 +14,16 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, Level, View, find_experiment, own_experiment
-from sb3_saf.experiments.grid import RunConfig, Selection, expand
+from sb3_saf.experiments.definitions import (
+    EXPERIMENTS,
+    Level,
+    RunConfig,
+    Selection,
+    View,
+    expand,
+    find_experiment,
+    own_experiment,
+)
 from sb3_saf.experiments.report import Content, known, losses, means
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run

@@ -13,7 +13,7 @@ from sb3_saf.networks.distributions import LeanCategorical
 from sb3_saf.networks.knowledge_source import Attention
 from sb3_saf.networks.layers import mlp, side_by_side
 from sb3_saf.networks.tanh import Tanh
-from sb3_saf.teams.errors import NonFiniteError
+from sb3_saf.teams.checks import NonFiniteError
 
 
 def gradients(function: Callable[..., th.Tensor], *inputs: th.Tensor) -> list[th.Tensor]:

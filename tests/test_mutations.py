@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 import hecogrid_envs
-from sb3_saf.experiments.definitions import find_experiment
-from sb3_saf.experiments.grid import Selection
+from sb3_saf.experiments.definitions import Selection, find_experiment
 from sb3_saf.training.settings import ALGOS, load_settings
 from sb3_saf.training.yaml_files import SIZES
 

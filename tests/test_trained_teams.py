@@ -13,8 +13,7 @@ import pytest
 
 from sb3_saf import ExportError, evaluate_team, load_team, load_weights, save_weights
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import find_experiment
-from sb3_saf.experiments.grid import RunConfig, Selection
+from sb3_saf.experiments.definitions import RunConfig, Selection, find_experiment
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.suites.registry import suites

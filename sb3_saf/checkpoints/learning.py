@@ -20,35 +20,31 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf.callbacks.finite import FiniteCallback
-from sb3_saf.callbacks.game_steps import GameStepsCallback, show_game_steps, team_steps
-from sb3_saf.checkpoints.models import (
+from sb3_saf.callbacks import FiniteCallback, GameStepsCallback, show_game_steps, team_steps
+from sb3_saf.checkpoints.states import (
+    all_callbacks,
+    callback_states,
+    check_description,
     continue_logs,
+    description,
+    environment_state,
     generator_states,
     is_off_policy,
+    load_callback_states,
+    load_environment_state,
     load_generator_states,
     load_model_state,
     logger_state,
     model_state,
     require_resumable,
     settings_restored_on_error,
-)
-from sb3_saf.checkpoints.states import (
-    all_callbacks,
-    callback_states,
-    check_description,
-    description,
-    environment_state,
-    load_callback_states,
-    load_environment_state,
     software,
     warn_of_differences,
 )
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.envs.game_copies import ForeignGamesError, check_signatures, pickled_games, sign_games
-from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.errors import CheckpointError, NonFiniteError
-from sb3_saf.teams.trees import Tree, encode, write_tree
+from sb3_saf.teams.checks import CheckpointError, NonFiniteError, check_count
+from sb3_saf.teams.files import Tree, encode, write_tree
 from sb3_saf.teams.vec_env import require_n_agents
 
 

@@ -12,9 +12,8 @@ from typing import BinaryIO, Final, NamedTuple
 
 import filelock
 
-from sb3_saf.teams.errors import CheckpointError, DamagedCheckpointError
-from sb3_saf.teams.files import atomic_file, remove_leftovers, try_lock
-from sb3_saf.teams.trees import Tree, read_tree
+from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError
+from sb3_saf.teams.files import Tree, atomic_file, read_tree, remove_leftovers, try_lock
 
 _NAME: Final = re.compile(r"checkpoint-(\d{12,})\.ckpt")
 

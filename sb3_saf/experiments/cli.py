@@ -12,9 +12,18 @@ from pathlib import Path
 from typing import Final
 
 from sb3_saf.checkpoints.learning import handled
-from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, MODULE, PROGRAM, Experiment, own_experiment
+from sb3_saf.experiments.definitions import (
+    DEFAULT_SEEDS,
+    EXPERIMENTS,
+    MODULE,
+    PROGRAM,
+    Experiment,
+    RunConfig,
+    Selection,
+    Shard,
+    own_experiment,
+)
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
-from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.suites.registry import find_environment, folder_name
 from sb3_saf.teams.checks import check_seed, unknown_name

@@ -18,11 +18,35 @@ from typing import Final, NamedTuple
 import pandas as pd
 from matplotlib.figure import Figure
 
-from sb3_saf.experiments.comparisons import MARGIN, comparisons, holm
-from sb3_saf.experiments.definitions import EXPERIMENTS, METHODS, PROGRAM, RANDOM, Experiment, Level, View, find_method
-from sb3_saf.experiments.grid import Cell, LeftOut, RunConfig, Selection
+from sb3_saf.experiments.definitions import (
+    EXPERIMENTS,
+    METHODS,
+    PROGRAM,
+    RANDOM,
+    Cell,
+    Experiment,
+    LeftOut,
+    Level,
+    RunConfig,
+    Selection,
+    View,
+    find_method,
+)
 from sb3_saf.experiments.results import Results
-from sb3_saf.experiments.tables import Frames, beside, complete, marl_eval, of_view, requested, strata, write_tables
+from sb3_saf.experiments.tables import (
+    MARGIN,
+    Frames,
+    beside,
+    comparisons,
+    complete,
+    holm,
+    keys_of,
+    marl_eval,
+    of_view,
+    requested,
+    strata,
+    write_tables,
+)
 from sb3_saf.suites.references import standing
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.commands import option_words
@@ -63,7 +87,13 @@ def write_report(
     assert config is not None
     asked, shown = requested(experiment, results), experiment.at(wanted.levels)
     cells = [cell for cell in asked.cells if wanted.has(cell, experiment)]
-    frames = _of_cells(write_tables(experiment, results), cells)
+    tests, curves = write_tables(experiment, results)
+    names = [(cell.id, level.slug) for cell in cells for level in cell.tests]
+    tests = tests[keys_of(tests, "cell", "level").isin(names)] if len(tests) else tests
+    if len(curves):
+        runs = [(cell.method, cell.task, cell.level.slug, cell.seed) for cell in cells]
+        curves = curves[keys_of(curves, "method", "task", "level", "seed").isin(runs)]
+    frames = Frames(tests, curves)
     if frames.tests.empty:
         raise ValueError(f"{results.folder} has no finished cell of {experiment.name!r} among those to be shown")
     for others in published:
@@ -83,17 +113,6 @@ def write_report(
         for file in (*figures, "marl_eval.json", "report.md"):
             os.replace(fresh / file, folder / file)
     return Report(folder / "report.md", [folder / file for file in figures], missing, len(cells))
-
-
-def _of_cells(frames: Frames, cells: Sequence[Cell]) -> Frames:
-    """Return the part of some tables that belongs to some cells and their tests."""
-    tests = {(cell.id, level.slug) for cell in cells for level in cell.tests}
-    runs = {(cell.method, cell.task, cell.level.slug, cell.seed) for cell in cells}
-    is_test = [row in tests for row in frames.tests[["cell", "level"]].itertuples(index=False, name=None)]
-    if frames.curves.empty:
-        return Frames(frames.tests[is_test], frames.curves)
-    names = frames.curves[["method", "task", "level", "seed"]].itertuples(index=False, name=None)
-    return Frames(frames.tests[is_test], frames.curves[[row in runs for row in names]])
 
 
 def _maximum(tests: pd.DataFrame) -> float | None:

@@ -18,9 +18,8 @@ from filelock import BaseFileLock
 from tqdm import tqdm
 
 from sb3_saf.experiments.cell import Job
-from sb3_saf.experiments.definitions import Experiment
+from sb3_saf.experiments.definitions import Cell, Experiment, RunConfig, Selection, Shard, expand
 from sb3_saf.experiments.engines import Engine
-from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
 from sb3_saf.experiments.results import BEST_MODEL, MODEL, Results
 from sb3_saf.experiments.tables import write_tables
 from sb3_saf.teams.files import write_text

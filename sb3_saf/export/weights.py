@@ -13,7 +13,7 @@ from safetensors.torch import load, save
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.checks import ExportError
 from sb3_saf.teams.files import atomic_file
 
 

@@ -38,7 +38,7 @@ from sb3_saf.networks.encoders import encoded
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
 from sb3_saf.qplex.policies import AgentMemory, QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
-from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.checks import ExportError
 from sb3_saf.teams.files import atomic_file, write_text
 
 #: Policies whose actors read only one agent's own observation, index, mask and memory.

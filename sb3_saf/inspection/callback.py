@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
-from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
+from sb3_saf.callbacks import show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection import figures
 from sb3_saf.inspection import scalars as numbers

@@ -96,17 +96,6 @@ def require_our_policy(policy: BasePolicy) -> OurPolicy:
     )
 
 
-def reader_of(policy: OurPolicy, n_rows: int, deterministic: bool = False) -> PolicyReader | QReader:
-    """
-    Make the reader of a policy.
-
-    :param deterministic: whether it takes its most likely actions; value-based policies always take their best ones
-    """
-    if isinstance(policy, QPLEXPolicy):
-        return QReader(policy)
-    return PolicyReader(policy, deterministic)
-
-
 class PolicyReader:
     """
     Act with an actor-critic policy and read its outputs. Its memory of the games of a training is left alone.
@@ -141,7 +130,16 @@ class PolicyReader:
             values = values.flatten()
         if self.policy.actor_memory is not None:
             latents, _ = self.policy.remember(latents, before, obs[EPISODE_START_KEY] != 0)
-        return self._reading(obs, actions, values, latents, action_masks)
+        policy, space = self.policy, self.policy.action_space
+        log_weights, parameters = policy.evaluate_pool(obs, latents, action_masks)
+        is_discrete = isinstance(space, spaces.Discrete)
+        probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
+        array = actions.cpu().numpy()
+        clipped = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
+        reading = StepReading(clipped, values, probabilities)
+        if isinstance(policy.actor, PolicyPool):
+            reading = reading._replace(pool_weights=log_weights.exp(), pool_actions=parameters)
+        return reading if self.source is None else self._with_messages(self.source, reading, obs)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """
@@ -155,28 +153,16 @@ class PolicyReader:
             values: th.Tensor = self.policy.predict_values(TerminalRow(obs, rows))
         return values.flatten()
 
-    def _reading(
-        self, obs: Tensors, actions: th.Tensor, values: th.Tensor, latent: th.Tensor, action_masks: Bools | None
-    ) -> StepReading:
-        policy, space = self.policy, self.policy.action_space
-        log_weights, parameters = policy.evaluate_pool(obs, latent, action_masks)
-        is_discrete = isinstance(space, spaces.Discrete)
-        probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
-        array = actions.cpu().numpy()
-        clipped = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
-        reading = StepReading(clipped, values, probabilities)
-        if isinstance(policy.actor, PolicyPool):
-            reading = reading._replace(pool_weights=log_weights.exp(), pool_actions=parameters)
-        if self.source is None:
-            return reading
+    def _with_messages(self, source: SAFCritic, reading: StepReading, obs: Tensors) -> StepReading:
+        policy = self.policy
         _, teams = policy.encode_teams(obs)
-        _, exchanged = self.source.communicate(teams.features, teams.members, teams.active)
+        _, exchanged = source.communicate(teams.features, teams.members, teams.active)
         # In rows that are not whole teams in order, equal teams are computed once; expand them to games.
         n_agents = policy.team_spaces.n_agents
         team = th.arange(len(exchanged.read)) if teams.rows is None else teams.rows[::n_agents] // n_agents
         values_without: dict[Replacement, th.Tensor] = {}
         for name in REPLACEMENTS if len(team) > 1 else REPLACEMENTS[:1]:
-            with _other_messages(self.source, name):
+            with _other_messages(source, name):
                 if policy.actor_memory is None:
                     values_without[name] = policy.predict_values(obs).flatten()
                 else:
@@ -399,7 +385,8 @@ def record_episodes(
     ours = require_our_policy(policy)
     check_trained_on(ours, env, same_size=True)
     check_count("n_eval_episodes", n_eval_episodes)
-    recorder = _Recorder(env, reader_of(ours, env.num_envs, deterministic), normalizer, observations)
+    reader = QReader(ours) if isinstance(ours, QPLEXPolicy) else PolicyReader(ours, deterministic)
+    recorder = _Recorder(env, reader, normalizer, observations)
     draws = pictures and env.render_mode == "rgb_array"
     was_training = ours.training
     ours.set_training_mode(False)

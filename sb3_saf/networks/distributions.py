@@ -30,7 +30,7 @@ from torch.distributions import Distribution as TorchDistribution
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from sb3_saf.teams.errors import NonFiniteError
+from sb3_saf.teams.checks import NonFiniteError
 
 #: Logit of masked actions: the probability is exactly zero, without the NaN in sums and gradients of -inf.
 _FORBIDDEN: Final = -1e8

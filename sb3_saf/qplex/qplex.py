@@ -27,7 +27,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
-from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
+from sb3_saf.callbacks import GAME_STEPS_TAG
 from sb3_saf.policies.parts import AlgorithmSpec, Declaration, memory_variants
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import MixerName

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 #: Requirements of all suites of JaxMARL.
 JAXMARL: Final = ('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"')

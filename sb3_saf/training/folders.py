@@ -37,7 +37,7 @@ import numpy.typing as npt
 
 from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.suites.registry import TeamEnvironment
-from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.checks import CheckpointError
 from sb3_saf.teams.files import digest, plain, read_json, write_json, write_text
 from sb3_saf.training.settings import Settings, saved_settings
 

@@ -27,8 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_saf.evaluation import EvaluationResult, confidence_interval, evaluate_team
 from sb3_saf.export.weights import load_weights
 from sb3_saf.suites.registry import HOME, folder_name, suites
-from sb3_saf.teams.checks import evaluation_seed, unknown_name
-from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.checks import ExportError, evaluation_seed, unknown_name
 from sb3_saf.training.folders import Run, software_versions
 
 WEIGHTS: Final = "weights.safetensors"

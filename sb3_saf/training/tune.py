@@ -23,8 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.teams.checks import MAX_SEED
-from sb3_saf.training.callbacks import SeededEvalCallback
-from sb3_saf.training.run import RunOptions, Training
+from sb3_saf.training.run import RunOptions, SeededEvalCallback, Training
 from sb3_saf.training.settings import Settings, algorithm_arguments, policy_arguments
 
 #: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.
