@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf.buffers.later import ROWS_AT_ONCE, LaterValues, compute_together
-from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
+from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.teams.checks import check_choice, check_count, check_whole_teams
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
@@ -49,9 +49,9 @@ class RolloutReturns:
 
     returns: npt.NDArray[np.floating]
     agents: npt.NDArray[np.integer]
-    known: Rescaling | None = None
+    known: tuple[th.Tensor, th.Tensor] | None = None
 
-    def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
+    def rescaling(self, normalizer: ValueNormalizer) -> tuple[th.Tensor, th.Tensor]:
         """Return the conversion of values to the new statistics, which the first call updates with the returns."""
         if self.known is None:
             self.known = normalizer.update(self.returns, self.agents)
@@ -383,21 +383,17 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         super().compute_returns_and_advantage(last_values, dones)
         agents = np.broadcast_to(self._agents, counted.shape)
         self._returns = RolloutReturns(self.returns[counted], agents[counted])
-        if self.normalize_advantage == "agent" and not self._is_reward_shared(counted):
-            for agent in range(self.n_agents):
+        if self.normalize_advantage == "agent":
+            by_team = (self.buffer_size, self.n_games, self.n_agents)
+            rewards, playing = self.rewards.reshape(by_team), counted.reshape(by_team)
+            highest = np.where(playing, rewards, -np.inf).max(axis=2)
+            lowest = np.where(playing, rewards, np.inf).min(axis=2)
+            # Not if the active agents of each team received the same rewards in all steps of the rollout.
+            for agent in range(self.n_agents) if (highest > lowest).any() else ():
                 rows = counted & (agents == agent)
                 advantages = self.advantages[rows].astype(np.float64)
                 if len(advantages):
                     self.advantages[rows] = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-
-    def _is_reward_shared(self, counted: npt.NDArray[np.bool_]) -> bool:
-        """Return whether the active agents of each team received the same rewards in all steps of the rollout."""
-        by_team = (self.buffer_size, self.n_games, self.n_agents)
-        rewards, playing = self.rewards.reshape(by_team), counted.reshape(by_team)
-        highest, lowest = (
-            reduce(np.where(playing, rewards, limit), axis=2) for reduce, limit in ((np.max, -np.inf), (np.min, np.inf))
-        )
-        return bool((highest <= lowest).all())
 
     def _with_values_of_teams(self, values: Array, active: npt.NDArray[np.bool_]) -> Array:
         """Return values (..., B) in which those of inactive agents are the mean over their team's active agents."""
@@ -461,7 +457,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             for name in ("actions", "values", "log_probs", "advantages", "returns")
         }
         own = self._gather(self.observations[OBS_KEY], batch_inds)
-        entries = {OBS_KEY: own.flatten(end_dim=1), **self._entries(batch_inds)}
+        # In the shapes of SB3's buffer.
+        entries = {OBS_KEY: own.flatten(end_dim=1), AGENT_KEY: self._agents_of_steps[: len(batch_inds)].reshape(-1, 1)}
+        if ACTION_MASK_KEY in self.observations:
+            entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], batch_inds).flatten(end_dim=1)
+        if self.starts is not None:
+            entries[EPISODE_START_KEY] = self._gather(self.starts, batch_inds).flatten(end_dim=1).long()
+        for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
+            if array is not None:
+                by_game = self.to_torch(self._of_games_at(array, batch_inds), copy=False)
+                entries[key] = by_game.repeat_interleave(self.n_agents, dim=0)
         active = None if self.active is None else self._of_games_at(self.active, batch_inds)
         rows = None
         if active is not None and not active.all():
@@ -490,16 +495,3 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """Gather team steps: (T, B, ...) -> (K, N, ...); with game-major rows, each team step is contiguous."""
         by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
         return self.to_torch(by_team.take(team_steps, axis=0), copy=False)
-
-    def _entries(self, team_steps: npt.NDArray[np.int64]) -> dict[str, th.Tensor]:
-        """Return the rows' entries other than own observations, in the shapes of SB3's buffer."""
-        entries = {AGENT_KEY: self._agents_of_steps[: len(team_steps)].reshape(-1, 1)}
-        if ACTION_MASK_KEY in self.observations:
-            entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
-        if self.starts is not None:
-            entries[EPISODE_START_KEY] = self._gather(self.starts, team_steps).flatten(end_dim=1).long()
-        for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
-            if array is not None:
-                by_game = self.to_torch(self._of_games_at(array, team_steps), copy=False)
-                entries[key] = by_game.repeat_interleave(self.n_agents, dim=0)
-        return entries

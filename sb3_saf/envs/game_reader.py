@@ -13,10 +13,10 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_saf.envs.audit import Trial, innermost, mask_error, observation_of, reset, step_results, without_mask
+from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
 from sb3_saf.envs.gymnasium_team import INFO_MASKS
 from sb3_saf.networks.encoders import Part, PartsSpace
-from sb3_saf.teams.conversion import AgentConversion, Leaf
+from sb3_saf.teams.conversion import AgentConversion, Leaf, innermost
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -276,7 +276,7 @@ def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
     """Return the space of the vector of a Dict or a Tuple; pictures in it stay known to encoders."""
     flat = spaces.flatten_space(space)
     assert isinstance(flat, spaces.Box)
-    leaves = list(innermost(space))
+    leaves = [leaf for _, leaf in innermost(space)]
     pictures = [leaf.shape if isinstance(leaf, spaces.Box) and is_image_space(leaf) else None for leaf in leaves]
     if any(pictures):
         ends = list(accumulate(map(spaces.flatdim, leaves)))

@@ -98,7 +98,10 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
     path.mkdir(parents=True, exist_ok=True)
     with atomic_file(path / "actor.onnx") as file:
         file.write(graph)
-    write_text(path / "act.py", _script())
+    # act.py with the code that it imports from this package.
+    _, _, code = inspect.getsource(conversion).partition("from __future__ import annotations\n")
+    line = r"from sb3_saf.teams.conversion import .*\n"
+    write_text(path / "act.py", re.sub(line, lambda _: f"{code.strip()}\n\n\n", inspect.getsource(act)))
     return path
 
 
@@ -148,13 +151,6 @@ def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, 
             "atlas": pixels,
         },
     }
-
-
-def _script() -> str:
-    """Return act.py with the code that it imports from this package."""
-    _, _, code = inspect.getsource(conversion).partition("from __future__ import annotations\n")
-    line = r"from sb3_saf.teams.conversion import .*\n"
-    return re.sub(line, lambda _: f"{code.strip()}\n\n\n", inspect.getsource(act))
 
 
 # --- the network ------------------------------------------------------------------------------------------------------

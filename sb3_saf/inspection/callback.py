@@ -77,7 +77,28 @@ class Inspection(NamedTuple):
         values, returns = recording.values[counted], recording.returns[counted]
         unit = self.scale.unit and f"{self.scale.unit} {'of the team' if recording.of_team else 'per agent'}"
         calibration = figures.calibration(values, returns, numbers.calibrate(values, returns), unit)
-        return {"critic/calibration": calibration, **self._of_the_pool(), **self._of_the_knowledge_source()}
+        plots = {"critic/calibration": calibration}
+        if recording.pool_weights is not None and recording.pool_actions is not None:
+            weights = recording.pool_weights[counted]
+            agents = np.broadcast_to(np.arange(counted.shape[1]) % recording.n_agents, counted.shape)[counted]
+            by_agent = numbers.selection_by_group(weights, agents, recording.n_agents)
+            plots["pool/by_agent"] = figures.chosen_by_agent(by_agent)
+            distances = numbers.policy_distances(self.action_space, recording.pool_actions[counted])
+            plots["pool/differences"] = figures.policy_differences(distances)
+            if recording.zones is not None:
+                zones = recording.zones[counted]
+                n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
+                by_zone = numbers.selection_by_group(weights, zones, n_zones)
+                plots["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
+        write, read = numbers.write_attention(recording), numbers.read_attention(recording)
+        if write is not None and read is not None and recording.write_attention is not None:
+            plots["knowledge_source/attention"] = figures.attention(write, read)
+            # The first game up to the end of its first episode.
+            game = int(np.flatnonzero(recording.counted_games.any(axis=0))[0])
+            ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
+            episode = recording.write_attention[: int(np.flatnonzero(ends)[0]) + 1, game]
+            plots["knowledge_source/one_episode"] = figures.attention_over_time(episode)
+        return plots
 
     @property
     def film(self) -> bytes | None:
@@ -88,39 +109,6 @@ class Inspection(NamedTuple):
     def strip(self) -> Picture | None:
         """Six moments of the first episode, (height, width, 3); None if the environment draws no pictures."""
         return figures.strip(self.recording.pictures) if self.recording.pictures else None
-
-    def _of_the_pool(self) -> dict[str, Figure]:
-        recording, counted = self.recording, self.recording.counted
-        if recording.pool_weights is None or recording.pool_actions is None:
-            return {}
-        weights = recording.pool_weights[counted]
-        agents = np.broadcast_to(np.arange(counted.shape[1]) % recording.n_agents, counted.shape)[counted]
-        by_agent = numbers.selection_by_group(weights, agents, recording.n_agents)
-        distances = numbers.policy_distances(self.action_space, recording.pool_actions[counted])
-        plots = {
-            "pool/by_agent": figures.chosen_by_agent(by_agent),
-            "pool/differences": figures.policy_differences(distances),
-        }
-        if recording.zones is not None:
-            zones = recording.zones[counted]
-            n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
-            by_zone = numbers.selection_by_group(weights, zones, n_zones)
-            plots["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
-        return plots
-
-    def _of_the_knowledge_source(self) -> dict[str, Figure]:
-        recording = self.recording
-        write, read = numbers.write_attention(recording), numbers.read_attention(recording)
-        if write is None or read is None or recording.write_attention is None:
-            return {}
-        # The first game up to the end of its first episode.
-        game = int(np.flatnonzero(recording.counted_games.any(axis=0))[0])
-        ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
-        episode = recording.write_attention[: int(np.flatnonzero(ends)[0]) + 1, game]
-        return {
-            "knowledge_source/attention": figures.attention(write, read),
-            "knowledge_source/one_episode": figures.attention_over_time(episode),
-        }
 
 
 def inspect_team(

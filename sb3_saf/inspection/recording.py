@@ -61,19 +61,7 @@ REPLACEMENTS: Final[tuple[Replacement, ...]] = get_args(Replacement)
 
 
 class StepReading(NamedTuple):
-    """
-    One step of all games. What a policy lacks is None.
-
-    :param actions: (B, ...) actions for the environment
-    :param values: (B,)
-    :param action_probabilities: (B, A) probability of each action; None unless actions are Discrete
-    :param pool_weights: (B, U), selection probability of each policy of a pool; sums to 1
-    :param pool_actions: (B, U, P), parameters of each policy's action distribution, illegal actions masked
-    :param write_attention: (E, L, N), attention of slots over agents
-    :param read_attention: (E, N, L), attention of agents over slots
-    :param message_strengths: (B,), Euclidean norm of the message that each agent read
-    :param values_without: (B,) each, values with a replaced message
-    """
+    """One step of all games, the entries of :class:`EpisodeRecording` without T. What a policy lacks is None."""
 
     actions: npt.NDArray[Any]
     values: th.Tensor
@@ -313,7 +301,8 @@ class EpisodeRecording(NamedTuple):
     :param returns: (T, B) discounted returns
     :param zones: (T, B), -1 for none; None if there are no zones
     :param pool_weights: (T, B, U) selection probability of each policy; None without a pool
-    :param pool_actions: (T, B, U, P) parameters of each policy's action distribution; None without a pool
+    :param pool_actions: (T, B, U, P) parameters of each policy's action distribution, illegal actions masked; None
+        without a pool
     :param write_attention: (T, E, L, N) attention of slots over agents; None without a knowledge source
     :param read_attention: (T, E, N, L) attention of agents over slots; None without a knowledge source
     :param message_strengths: (T, B) norm of the message that each agent read; None without a knowledge source

@@ -17,7 +17,7 @@ Letters: B rows.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,18 +26,6 @@ from torch import nn
 
 #: Lower limit of the standard deviation: nearly constant returns are not scaled to variance 1.
 MIN_STD: Final = 1e-2
-
-
-class Rescaling(NamedTuple):
-    """
-    Conversion of the critic's values from the old statistics to new ones: ``scale * value + shift``.
-
-    :param scale: new standard deviation / old, () or (N,) for statistics of each agent
-    :param shift: in the units of returns
-    """
-
-    scale: th.Tensor
-    shift: th.Tensor
 
 
 class ValueNormalizer(nn.Module):
@@ -89,13 +77,16 @@ class ValueNormalizer(nn.Module):
             values.register_hook(lambda gradient: gradient * factor)
         return values if active is None else values * active
 
-    def update(self, returns: npt.NDArray[np.floating], agents: npt.NDArray[np.integer] | None = None) -> Rescaling:
+    def update(
+        self, returns: npt.NDArray[np.floating], agents: npt.NDArray[np.integer] | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         Update the statistics with more returns.
 
         :param returns: returns of any shape, on the raw scale
         :param agents: their agents, in the same shape, for statistics of each agent
-        :return: conversion of values under the old statistics
+        :return: conversion of values under the old statistics, ``scale * value + shift``: new standard deviation / old,
+            and a shift in the units of returns, () or (N,) each
         :raises ValueError: for NaN or infinity
         """
         returns = np.asarray(returns, dtype=np.float64)
@@ -104,17 +95,15 @@ class ValueNormalizer(nn.Module):
         old_mean, old_std = self.mean.double(), self.std.double()
         for index in range(self.mean.numel()):
             own = returns if self.mean.ndim == 0 else returns[agents == index]
-            if own.size:
-                self._merge(index, float(own.mean()), float(own.var()), own.size)
+            if not own.size:
+                continue
+            # Mean and variance of the two sets together.
+            means, variances, counts = (values.view(-1) for values in (self.mean, self.var, self.count))
+            n_old, mean_before, var_before = int(counts[index]), float(means[index]), float(variances[index])
+            mean, share = float(own.mean()), own.size / (n_old + own.size)
+            between = share * (1.0 - share) * (mean - mean_before) ** 2 if n_old else 0.0
+            means[index] = mean_before + share * (mean - mean_before)
+            variances[index] = math.fsum([(1.0 - share) * var_before, share * float(own.var()), between])
+            counts[index] = n_old + own.size
         scale = self.std.double() / old_std
-        return Rescaling(scale, self.mean.double() - scale * old_mean)
-
-    def _merge(self, index: int, mean: float, var: float, count: int) -> None:
-        """Merge the mean and variance of two sets of values."""
-        means, variances, counts = (values.view(-1) for values in (self.mean, self.var, self.count))
-        n_old, old_mean, old_var = int(counts[index]), float(means[index]), float(variances[index])
-        share = count / (n_old + count)
-        between = share * (1.0 - share) * (mean - old_mean) ** 2 if n_old else 0.0
-        means[index] = old_mean + share * (mean - old_mean)
-        variances[index] = math.fsum([(1.0 - share) * old_var, share * var, between])
-        counts[index] = n_old + count
+        return scale, self.mean.double() - scale * old_mean

@@ -182,7 +182,19 @@ class TeamPolicy(RememberingPolicy):
     # --- construction -----------------------------------------------------------------------------------------------
 
     def _build(self, lr_schedule: Schedule) -> None:
-        spec = of_critic = self._network_spec()
+        sizes = self.net_arch if isinstance(self.net_arch, dict) else {"pi": self.net_arch, "vf": self.net_arch}
+        if set(sizes) != {"pi", "vf"}:
+            raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(sizes)}")
+        spec = of_critic = NetworkSpec(
+            self.features_dim,
+            self.team_spaces.n_agents,
+            self.action_space,
+            list(sizes["pi"]),
+            list(sizes["vf"]),
+            self.activation_fn,
+            self.log_std_init,
+            self.team_spaces.state,
+        )
         if self.memory is not None:
             self.actor_memory = Memory(self.memory, self.features_dim, self.memory_size)
             spec = spec._replace(features_dim=self.memory_size)
@@ -205,21 +217,6 @@ class TeamPolicy(RememberingPolicy):
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not kwargs.keys() & _OTHER_THAN_FUSED:
             kwargs["fused"] = True  # takes a third of the time
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
-
-    def _network_spec(self) -> NetworkSpec:
-        sizes = self.net_arch if isinstance(self.net_arch, dict) else {"pi": self.net_arch, "vf": self.net_arch}
-        if set(sizes) != {"pi", "vf"}:
-            raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(sizes)}")
-        return NetworkSpec(
-            self.features_dim,
-            self.team_spaces.n_agents,
-            self.action_space,
-            list(sizes["pi"]),
-            list(sizes["vf"]),
-            self.activation_fn,
-            self.log_std_init,
-            self.team_spaces.state,
-        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
