@@ -71,8 +71,21 @@ def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
     unknown = [name for name in mapping if name not in entries]
     if unknown:
         raise ValueError(f"state has an unknown entry {unknown[0]!r}; it needs just {', '.join(entries)}")
-    arrays: Any = {name: _check_array(name, mapping[name], *entry) for name, entry in entries.items()}
-    state: StateMapping = arrays
+    state: Any = {}
+    for name, (shape, kind, high) in entries.items():
+        try:
+            array = np.asarray(mapping[name])
+        except ValueError as error:
+            raise ValueError(f"state entry {name!r} is no array: {error}") from error
+        if array.shape != shape:
+            raise ValueError(f"state entry {name!r} must have shape {shape}, got {array.shape}")
+        if array.dtype.kind not in "bui":
+            raise ValueError(f"state entry {name!r} must be {kind}, got {array.dtype}")
+        wrong = (array < 0) | (array > high)
+        if wrong.any():
+            got = f"{array[wrong][0]} at index {_first(wrong)}"
+            raise ValueError(f"state entry {name!r} must hold values from 0 to {high}, got {got}")
+        state[name] = array.astype(kind)
     walls, treasures, keys = state["walls"], state["treasures"] != TreasureState.NONE, state["keys"]
     ring = np.ones_like(walls)
     ring[1:-1, 1:-1] = False
@@ -127,23 +140,6 @@ def state_option(options: Mapping[str, Any] | None, params: HECOGridParams) -> S
     if options is None or options.get("state") is None:
         return None
     return check_state(options["state"], params)
-
-
-def _check_array(name: str, value: object, shape: tuple[int, ...], kind: str, high: int) -> npt.NDArray[Any]:
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"state entry {name!r} is no array: {error}") from error
-    if array.shape != shape:
-        raise ValueError(f"state entry {name!r} must have shape {shape}, got {array.shape}")
-    if array.dtype.kind not in "bui":
-        raise ValueError(f"state entry {name!r} must be {kind}, got {array.dtype}")
-    wrong = (array < 0) | (array > high)
-    if wrong.any():
-        raise ValueError(
-            f"state entry {name!r} must hold values from 0 to {high}, got {array[wrong][0]} at index {_first(wrong)}"
-        )
-    return array.astype(kind)
 
 
 def _first(where: Bools) -> tuple[int, ...]:

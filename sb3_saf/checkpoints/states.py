@@ -242,7 +242,12 @@ def description(model: BaseAlgorithm, callbacks: Iterable[BaseCallback]) -> dict
         "environment": _layers(env),
         "callbacks": {
             "order": [type(one).__name__ for one in callbacks],
-            **_by_class(callbacks, _of_callback),
+            **_by_class(
+                callbacks,
+                lambda one: (
+                    _arguments(one) | ({"environment": _layers(one.eval_env)} if isinstance(one, EvalCallback) else {})
+                ),
+            ),
         },
     }
 
@@ -258,11 +263,6 @@ def check_description(found: Tree, own: dict[str, Tree]) -> None:
             f"the checkpoint is of another run: {different}; make model, games and callbacks as for the first start, "
             "or give this run a folder of its own"
         )
-
-
-def _of_callback(callback: BaseCallback) -> dict[str, Tree]:
-    environment = {"environment": _layers(callback.eval_env)} if isinstance(callback, EvalCallback) else {}
-    return {**_arguments(callback), **environment}
 
 
 def _of_layer(layer: VecEnv) -> dict[str, Tree]:

@@ -169,7 +169,8 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
         result = play_test(player, env, cell.seed, config.episodes, actions == MOST_LIKELY)
         if not np.isfinite(result.returns).all():
             raise NonFiniteError(f"team returns must be finite, got {result.returns} at {level}; repair the game")
-        plays.append(Play.of(policy, actions, result, time.perf_counter() - clock))
+        measured = result.returns, result.lengths, list(result.successes), list(result.agent_means)
+        plays.append(Play(policy, actions, *measured, time.perf_counter() - clock))
     env.close()
     return LevelResult(level.env_kwargs, settings.n_agents, settings.env_kwargs.get("n_treasures"), plays)
 

@@ -77,12 +77,6 @@ class Play:
     agent_means: list[float]
     wall_seconds: float
 
-    @classmethod
-    def of(cls, policy: str, actions: str, result: EvaluationResult, wall_seconds: float) -> Play:
-        """Return the test with this result."""
-        measured = result.returns, result.lengths, list(result.successes), list(result.agent_means)
-        return cls(policy, actions, *measured, wall_seconds)
-
     @property
     def evaluation(self) -> EvaluationResult:
         """Mean, interval and success rate."""

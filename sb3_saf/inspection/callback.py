@@ -278,7 +278,16 @@ class InspectionCallback(BaseCallback):
         )
         scalars = inspection.scalars
         if self.pictures and self._page.has_tensorboard:
-            self._draw(inspection)
+            self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))
+            if self.model.ep_info_buffer:
+                recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
+                self._page.show("rollout/team_return_of_each_episode", recent)
+            for tag, figure in inspection.figures.items():
+                self._page.show(tag, logger.Figure(figure, close=True))
+            strip, film = inspection.strip, inspection.film
+            if strip is not None and film is not None:
+                self._page.show("episode/strip", logger.Image(strip, "HWC"))
+                self._page.gif("episode/film", film, team_steps(self.model))
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began
         self._page.scalars({"time/inspection_seconds": self.seconds})
@@ -291,18 +300,6 @@ class InspectionCallback(BaseCallback):
                 f"({time.perf_counter() - began:.1f} s)"
             )
         return scalars
-
-    def _draw(self, inspection: Inspection) -> None:
-        self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))
-        if self.model.ep_info_buffer:
-            recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
-            self._page.show("rollout/team_return_of_each_episode", recent)
-        for tag, figure in inspection.figures.items():
-            self._page.show(tag, logger.Figure(figure, close=True))
-        strip, film = inspection.strip, inspection.film
-        if strip is not None and film is not None:
-            self._page.show("episode/strip", logger.Image(strip, "HWC"))
-            self._page.gif("episode/film", film, team_steps(self.model))
 
 
 def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:
