@@ -9,7 +9,6 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -261,7 +260,16 @@ class TeamEvalCallback(EvalCallback):
         self.last_mean_reward = result.mean
         self._store(result)
         self._log(result)
-        go_on = self._react(result)
+        go_on = True
+        if result.mean > self.best_mean_reward:
+            self._say("New best mean team return")
+            self.best_mean_reward = result.mean
+            if self.best_model_save_path is not None:
+                with atomic_file(Path(self.best_model_save_path, "best_model.zip")) as file:
+                    self.model.save(file)
+            if self.callback_on_new_best is not None:
+                go_on = self.callback_on_new_best.on_step()
+        go_on = go_on and (self.callback is None or self._on_event())
         self.seconds += time.monotonic() - began
         return go_on
 
@@ -300,19 +308,6 @@ class TeamEvalCallback(EvalCallback):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.record(GAME_STEPS_TAG, steps)
         self.logger.dump(self.num_timesteps)
-
-    def _react(self, result: EvaluationResult) -> bool:
-        """Save the best model and call the callbacks; return whether training continues."""
-        go_on = True
-        if result.mean > self.best_mean_reward:
-            self._say("New best mean team return")
-            self.best_mean_reward = result.mean
-            if self.best_model_save_path is not None:
-                with atomic_file(Path(self.best_model_save_path, "best_model.zip")) as file:
-                    self.model.save(file)
-            if self.callback_on_new_best is not None:
-                go_on = self.callback_on_new_best.on_step()
-        return go_on and (self.callback is None or self._on_event())
 
     def _say(self, text: str) -> None:
         if self.verbose >= 1:
@@ -411,11 +406,16 @@ class FiniteCallback(BaseCallback):
                     self._stop(f"the weight {name}", value)
 
     def _on_rollout_end(self) -> None:
-        for name, array in _floats(getattr(self.model, "rollout_buffer", None)):
-            with np.errstate(invalid="ignore"):  # infinity minus infinity
-                value = float(array.sum(dtype=np.float64))
-            if not math.isfinite(value):
-                self._stop(f"{name} of the rollout", value)
+        buffer = getattr(self.model, "rollout_buffer", None)
+        for name in _ROLLOUT:
+            arrays = getattr(buffer, name, None)
+            for key, array in arrays.items() if isinstance(arrays, dict) else [("", arrays)]:
+                if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+                    continue
+                with np.errstate(invalid="ignore"):  # infinity minus infinity
+                    value = float(array.sum(dtype=np.float64))
+                if not math.isfinite(value):
+                    self._stop(f"{name} {key}".strip() + " of the rollout", value)
 
     def _stop(self, name: str, value: float) -> None:
         steps = game_steps(self.model)
@@ -427,16 +427,6 @@ class FiniteCallback(BaseCallback):
             f"optimizer{before}; training stops here, for learning from it would ruin the model: look for a learning "
             "rate that is too high, rewards that are too large, or an encoder or loss of your own that divides by zero"
         )
-
-
-def _floats(buffer: object) -> Iterator[tuple[str, np.ndarray[Any, np.dtype[np.floating[Any]]]]]:
-    """Yield the float arrays of a rollout by name."""
-    for name in _ROLLOUT:
-        value = getattr(buffer, name, None)
-        parts = value.items() if isinstance(value, dict) else [("", value)]
-        for key, array in parts:
-            if isinstance(array, np.ndarray) and array.dtype.kind == "f":
-                yield f"{name} {key}".strip(), array
 
 
 class EntropySchedule(BaseCallback):

@@ -73,7 +73,18 @@ class GameReader:
         self.watches_masks = action_masks == "auto" and not has_masks
         self._state: tuple[Leaf, spaces.Space[Any]] | None = None
         if state:
-            space = _state_space(trial.env)
+            env, space = trial.env, None
+            layer: Any
+            for layer in (getattr(env, "unwrapped", None), env):
+                with suppress(AttributeError, NotImplementedError):
+                    found = layer.state_space
+                    space = found if isinstance(found, FIXED_SHAPE) else space
+            if space is None:
+                raise ValueError(
+                    f"state=True needs an environment with state() and a state_space of Box, Discrete, MultiDiscrete "
+                    f"or MultiBinary, got {env} with {getattr(env, 'state_space', 'no state_space')}; leave state out, "
+                    "or give the environment both"
+                )
             self._state = Leaf.of(space), own_space([space], float64)
         #: The form of the rows.
         self.rows = TeamSpaces(
@@ -329,17 +340,3 @@ def _padded(array: Any, shape: tuple[int, ...], dtype: Any, fill: float = 0) -> 
     result = np.full(shape, fill, dtype=dtype)
     result[tuple(slice(size) for size in np.shape(array))] = array
     return result
-
-
-def _state_space(env: Any) -> spaces.Space[Any]:
-    for layer in (env, getattr(env, "unwrapped", None)):
-        space = None
-        with suppress(AttributeError, NotImplementedError):
-            space = layer.state_space  # type: ignore[union-attr]
-        if isinstance(space, FIXED_SHAPE):
-            return space
-    raise ValueError(
-        f"state=True needs an environment with state() and a state_space of Box, Discrete, MultiDiscrete or "
-        f"MultiBinary, got {env} with {getattr(env, 'state_space', 'no state_space')}; leave state out, or "
-        "give the environment both"
-    )
