@@ -265,7 +265,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
             first = self.metadata["render_modes"][0]
             raise ValueError(f"no render_mode was given; create the environment with render_mode={first!r}")
         if self.render_mode == "ansi":
-            from hecogrid_envs.text import render_text
+            from hecogrid_envs.state import render_text
 
             zones = self.params.zone_of_column() if self.params.heterogeneity > 1 else None
             return render_text(self.get_state(), zones=zones, step=self.n_steps, collected=self.collected)

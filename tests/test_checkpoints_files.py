@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.checkpoints.learning import CheckpointFolder
 from sb3_saf.teams import files as trees
 from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError
 from sb3_saf.teams.files import decode, encode, write_tree

@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 
 from sb3_saf import SAFMaskablePolicy, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.networks.value_normalizer import ValueNormalizer
+from sb3_saf.networks.critic import ValueNormalizer
 from tests.toy_envs import TellingEnv
 
 N_AGENTS, N_ACTIONS = 3, 4

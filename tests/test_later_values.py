@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import TeamRolloutBuffer, make_team_env
-from sb3_saf.buffers.later import LaterValues, compute_together
+from sb3_saf.buffers.rollout import LaterValues, compute_together
 from tests.toy_envs import LateEnv
 from tests.toy_teams import VECTOR, CodeSpace, ToyTeams
 

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import CallbackList
 
 from sb3_saf import TeamRolloutBuffer, make_team_env, ppo_settings
-from sb3_saf.networks.value_normalizer import ValueNormalizer
+from sb3_saf.networks.critic import ValueNormalizer
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.probe_envs import Arms
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from hecogrid_envs import text
-from hecogrid_envs.text import LEGEND, render_text
+from hecogrid_envs import state as text
+from hecogrid_envs.state import LEGEND, render_text
 
 State = dict[str, npt.NDArray[Any]]
 

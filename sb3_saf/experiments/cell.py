@@ -18,7 +18,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_saf import RandomPolicy
-from sb3_saf.checkpoints.store import CheckpointFolder
+from sb3_saf.checkpoints.learning import CheckpointFolder
 from sb3_saf.experiments.definitions import Cell, Level, RunConfig, find_method
 from sb3_saf.experiments.results import (
     BEST,
@@ -42,13 +42,14 @@ from sb3_saf.training.folders import (
     FINISHED,
     MONITOR,
     RUN_FILE,
+    TEST_GAMES,
     Run,
     finish_run,
+    play_test,
     software_versions,
     write_run,
 )
 from sb3_saf.training.run import RunOptions, load_parameters, train
-from sb3_saf.training.trained_teams import TEST_GAMES, play_test
 
 #: Checkpoints of a training, from which another worker continues if this one is killed.
 CHECKPOINTS_PER_CELL: Final = 20

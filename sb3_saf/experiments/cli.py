@@ -36,8 +36,7 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import python_command
-from sb3_saf.training.trained_teams import TEAMS, check_team, team_names
+from sb3_saf.training.folders import TEAMS, check_team, python_command, team_names
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"

@@ -24,16 +24,14 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.buffers.later import LaterValues, Step
-from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
+from sb3_saf.buffers.rollout import LaterValues, Step, TeamMinibatch, TeamRolloutBuffer
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
-from sb3_saf.networks.critic import StateCritic, TeamCritic
+from sb3_saf.networks.critic import StateCritic, TeamCritic, ValueNormalizer
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
 from sb3_saf.networks.memory import Memory, MemoryName
 from sb3_saf.networks.row_encoder import Encoded, EncodedRows, joined
-from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.policies.memory import Masks, RememberingPolicy, RunningMemory
 from sb3_saf.policies.parts import TeamParts
 from sb3_saf.policies.rows import ChunkSize, entry_of
@@ -78,7 +76,7 @@ class TeamPolicy(RememberingPolicy):
     :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for convolved
         pictures, whose intermediate results should fit the cache
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
-        ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
+        ``sb3_saf.networks.critic``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
         and variance of each agent's own returns, for agents whose rewards differ in scale. The policy's values,
         ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in all cases
     :param memory: ``"gru"``, ``"lstm"``, or None for policies of the present observation
