@@ -218,7 +218,14 @@ class HumanWindow:
             self._pygame = imported
         pygame = self._pygame
         if self._screen is None:
-            _start_display(pygame)
+            try:
+                pygame.display.init()
+            except pygame.error as error:
+                raise RuntimeError(f"no window can be opened ({error}); {_OTHER_WAYS}") from error
+            # Without a screen, SDL silently selects a driver that shows nothing; accepted only if asked for.
+            if pygame.display.get_driver() in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
+                pygame.display.quit()
+                raise RuntimeError(f"no window can be opened (there is no display); {_OTHER_WAYS}")
             pygame.display.set_caption(self.title)
             self._clock = pygame.time.Clock()
         if self._screen is None or self._screen.get_size() != (width, height):
@@ -239,22 +246,6 @@ class HumanWindow:
             if event.type == pygame.KEYDOWN:
                 # Keys of the number pad have names such as "[4]".
                 self._keys.append(pygame.key.name(event.key).strip("[]"))
-
-
-def _start_display(pygame: ModuleType) -> None:
-    """
-    Start the display, or raise RuntimeError without one.
-
-    Without a screen, SDL silently selects a driver that shows nothing; it is accepted only if requested explicitly.
-    """
-    try:
-        pygame.display.init()
-    except pygame.error as error:
-        raise RuntimeError(f"no window can be opened ({error}); {_OTHER_WAYS}") from error
-    driver = pygame.display.get_driver()
-    if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
-        pygame.display.quit()
-        raise RuntimeError(f"no window can be opened (there is no display); {_OTHER_WAYS}")
 
 
 def play_window(session: Session, tile_size: int | None = None) -> None:

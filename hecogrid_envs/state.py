@@ -182,6 +182,9 @@ def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> 
     return np.minimum(counts, 255).astype(np.uint8)
 
 
+# --- text -------------------------------------------------------------------------------------------------------------
+
+
 WALL: Final = "#"
 FLOOR: Final = "."
 TREASURE: Final = "$"

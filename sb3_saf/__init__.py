@@ -32,8 +32,7 @@ if find_spec("stable_baselines3") is not None:
         evaluate_policy,
         evaluate_team,
     )
-    from sb3_saf.export.weights import load_weights, save_weights
-    from sb3_saf.export.writer import export_actors
+    from sb3_saf.export.writer import export_actors, load_weights, save_weights
     from sb3_saf.inspection.callback import Inspection, InspectionCallback, inspect_team
     from sb3_saf.inspection.replay import replay
     from sb3_saf.make import make_team_env, make_vec_env

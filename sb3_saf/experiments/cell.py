@@ -33,7 +33,7 @@ from sb3_saf.experiments.results import (
     Results,
     write_evaluations,
 )
-from sb3_saf.export.weights import read_weights
+from sb3_saf.export.writer import read_weights
 from sb3_saf.teams.checks import CheckpointError, NonFiniteError
 from sb3_saf.teams.files import differences, read_json, write_json, write_text
 from sb3_saf.training.folders import (

@@ -47,8 +47,7 @@ from sb3_saf.experiments.tables import (
     strata,
     write_tables,
 )
-from sb3_saf.suites.references import standing
-from sb3_saf.suites.registry import find_environment
+from sb3_saf.suites.registry import find_environment, standing
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_differences, draw_levels
 from sb3_saf.training.statistics import (
@@ -197,6 +196,9 @@ def _curves(experiment: Experiment, frames: Frames) -> dict[str, Figure]:
     return figures
 
 
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
 #: Maximum number of missing cells to list.
 _MOST_NAMED: Final = 20
 _NOTHING: Final = "–"
@@ -332,7 +334,7 @@ def means(table: pd.DataFrame, view: View) -> str:
 
 
 def known(content: Content) -> str:
-    """Return mean results beside what is known of the same games, see ``sb3_saf.suites.references``."""
+    """Return mean results beside what is known of the same games, see ``sb3_saf.suites.registry``."""
     lines = []
     keys = ["task", "method", "train_level", "level"]
     results = content.frames.tests.groupby(keys)[["success_rate", "return_mean", "game_steps"]].mean()

@@ -50,7 +50,7 @@ from scipy import stats
 
 from sb3_saf.experiments.definitions import MODULE, RANDOM, Cell, Experiment, Grid, Level, View, expand, merge
 from sb3_saf.experiments.results import BEST, BEST_MODEL, EVALUATIONS, LAST, MOST_LIKELY, Results
-from sb3_saf.export.weights import save_weights
+from sb3_saf.export.writer import save_weights
 from sb3_saf.teams.files import read_json, write_json, write_text
 from sb3_saf.training.enjoy import make_policy, write_page
 from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run, check_runs_no_code, finish_run, python_command, read_curve
@@ -321,6 +321,9 @@ def complete(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows[rows.groupby("stratum")["method"].transform("nunique") == n_methods]
     n_strata = rows["stratum"].nunique()
     return rows[rows.groupby("seed")["stratum"].transform("size") == n_methods * n_strata]
+
+
+# --- comparisons ------------------------------------------------------------------------------------------------------
 
 
 #: Minimum seeds for a verdict.

@@ -144,6 +144,9 @@ def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield f"{prefix}{key}", value
 
 
+# --- files of plain data ----------------------------------------------------------------------------------------------
+
+
 #: None, bool, int, float, str, arrays, tensors, and lists, tuples, deques and dicts of these.
 Tree = Any
 

@@ -22,11 +22,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.act import Actor
-from sb3_saf.export.weights import load_weights
+from sb3_saf.export.writer import load_weights
 from sb3_saf.inspection.figures import gif
 from sb3_saf.inspection.replay import replay
-from sb3_saf.suites.references import standing
-from sb3_saf.suites.registry import find_environment
+from sb3_saf.suites.registry import find_environment, standing
 from sb3_saf.teams.checks import ExportError, check_seed, evaluation_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
@@ -225,6 +224,9 @@ def _print_in_place(frame: Frame) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command, with the arguments of this process by default."""
     run_command(PROGRAM, lambda: enjoy(arguments))
+
+
+# --- the page of a replay ---------------------------------------------------------------------------------------------
 
 
 REPLAY: Final = "python -m sb3_saf.replay"

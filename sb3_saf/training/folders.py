@@ -52,7 +52,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.checkpoints.learning import CheckpointFolder
 from sb3_saf.evaluation import EvaluationResult, confidence_interval, evaluate_team
-from sb3_saf.export.weights import load_weights
+from sb3_saf.export.writer import load_weights
 from sb3_saf.suites.registry import HOME, TeamEnvironment, folder_name, suites
 from sb3_saf.teams.checks import CheckpointError, ExportError, evaluation_seed, unknown_name
 from sb3_saf.teams.files import digest, plain, read_json, write_json, write_text
@@ -395,6 +395,9 @@ def find_model(
             "sb3_saf.train save models on the way"
         )
     return Run(folder), path
+
+
+# --- published teams --------------------------------------------------------------------------------------------------
 
 
 WEIGHTS: Final = "weights.safetensors"

@@ -31,9 +31,9 @@ from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.checkpoints.states import settings_restored_on_error
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.evaluation import EvaluationResult
-from sb3_saf.export.weights import read_weights
+from sb3_saf.export.writer import read_weights
 from sb3_saf.inspection.callback import InspectionCallback
-from sb3_saf.suites.references import Standing, standing
+from sb3_saf.suites.registry import Standing, standing
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import atomic_file, remove_leftovers
 from sb3_saf.teams.randomness import own_randomness
@@ -50,7 +50,7 @@ class SeededEvalCallback(TeamEvalCallback):
     The last evaluation is of the final policy: at the last game step it waits for the update that follows.
 
     :param seed: of the run
-    :param settings: of the games of evaluation, to log ``eval/share_of_published``, see ``sb3_saf.suites.references``
+    :param settings: of the games of evaluation, to log ``eval/share_of_published``, see ``sb3_saf.suites.registry``
     """
 
     def __init__(self, *args: Any, seed: int, settings: Settings, **kwargs: Any) -> None:

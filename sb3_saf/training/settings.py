@@ -363,6 +363,9 @@ def _build(
     )
 
 
+# --- plain values as arguments of constructors ------------------------------------------------------------------------
+
+
 #: Classes by name for each key that takes a class. Names are looked up here only; nothing is imported or evaluated.
 CLASSES: Final[dict[str, dict[str, type]]] = {
     "rollout_buffer_class": {"TeamRolloutBuffer": TeamRolloutBuffer},
