@@ -53,7 +53,7 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.teams.checks import CheckpointError, NonFiniteError
     from sb3_saf.teams.randomness import game_seeds
     from sb3_saf.training.folders import load_team
-    from sb3_saf.training.ppo_settings import ppo_settings
+    from sb3_saf.training.settings import ppo_settings
 
     register_all()
 else:

@@ -26,7 +26,6 @@ from sb3_saf.callbacks import FiniteCallback, GameStepsCallback, show_game_steps
 from sb3_saf.checkpoints.states import (
     all_callbacks,
     callback_states,
-    check_description,
     continue_logs,
     description,
     environment_state,
@@ -41,11 +40,19 @@ from sb3_saf.checkpoints.states import (
     require_resumable,
     settings_restored_on_error,
     software,
-    warn_of_differences,
 )
 from sb3_saf.envs.game_copies import ForeignGamesError, check_signatures, pickled_games, sign_games
 from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError, NonFiniteError, check_count
-from sb3_saf.teams.files import Tree, atomic_file, encode, read_tree, remove_leftovers, try_lock, write_tree
+from sb3_saf.teams.files import (
+    Tree,
+    atomic_file,
+    differences,
+    encode,
+    read_tree,
+    remove_leftovers,
+    try_lock,
+    write_tree,
+)
 from sb3_saf.teams.vec_env import require_n_agents
 
 _NAME: Final = re.compile(r"checkpoint-(\d{12,})\.ckpt")
@@ -356,7 +363,11 @@ def resume(
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
     others = [one for one in all_callbacks(callback) if not isinstance(one, TeamCheckpointCallback)]
     tree = loaded.tree
-    check_description(tree["description"], description(model, others))
+    if different := differences(tree["description"], description(model, others)):
+        raise CheckpointError(
+            f"the checkpoint is of another run: {different}; make model, games and callbacks as for the first start, "
+            "or give this run a folder of its own"
+        )
     if exact and tree["environment"] is None:
         raise CheckpointError(f"expected the state of the games with exact=True, got {loaded.path} without it")
     games = [tree["environment"], tree["callbacks"]]
@@ -369,7 +380,13 @@ def resume(
             raise
         warnings.warn(f"{error}. New episodes begin; everything else continues", UserWarning, stacklevel=2)
         tree = {**tree, "environment": None, "callbacks": None}
-    warn_of_differences(tree["software"], software(model))
+    if different := differences(tree["software"], software(model)):
+        warnings.warn(
+            f"the checkpoint was made under other conditions ({different}): the run goes on, but its weights may "
+            "differ from those of the undisturbed run",
+            UserWarning,
+            stacklevel=2,
+        )
     try:
         load_model_state(model, tree["model"])
         if tree["environment"] is not None:

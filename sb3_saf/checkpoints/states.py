@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import platform
 import random
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -48,7 +47,7 @@ from sb3_saf.policies.memory import RememberingPolicy
 from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.teams import package_version
 from sb3_saf.teams.checks import CheckpointError
-from sb3_saf.teams.files import Tree, differences
+from sb3_saf.teams.files import Tree
 from sb3_saf.teams.rows import OBS_KEY
 from sb3_saf.teams.vec_env import TeamVecEnv, game_seeds_of, layers
 
@@ -252,19 +251,6 @@ def description(model: BaseAlgorithm, callbacks: Iterable[BaseCallback]) -> dict
     }
 
 
-def check_description(found: Tree, own: dict[str, Tree]) -> None:
-    """
-    Compare a run with the run of a checkpoint.
-
-    :raises CheckpointError: naming the first differences
-    """
-    if different := differences(found, own):
-        raise CheckpointError(
-            f"the checkpoint is of another run: {different}; make model, games and callbacks as for the first start, "
-            "or give this run a folder of its own"
-        )
-
-
 def _of_layer(layer: VecEnv) -> dict[str, Tree]:
     if isinstance(layer, Curriculum):
         stages = {f"stage {number}": _layers(stage) for number, stage in enumerate(layer.stages)}
@@ -334,17 +320,6 @@ def software(model: BaseAlgorithm) -> dict[str, str]:
         "device": model.device.type,
         "torch threads": str(th.get_num_threads()),
     }
-
-
-def warn_of_differences(found: dict[str, str], own: dict[str, str]) -> None:
-    """Warn about differences in software that may change the last bits of the weights."""
-    if different := differences(found, own):
-        warnings.warn(
-            f"the checkpoint was made under other conditions ({different}): the run goes on, but its weights may "
-            "differ from those of the undisturbed run",
-            UserWarning,
-            stacklevel=3,
-        )
 
 
 _MODEL_COUNTERS: Final = (
