@@ -65,7 +65,7 @@ class Suite:
         others of the game, ``n_agents`` among them; None if a game must be made to know them
     :param level_params: parameters that name a level in logs; empty for all that are given
     :param always_active: whether all agents take part from beginning to end, so that rows need no ``"active"``
-    :param is_drawn_from_state: whether games have ``grid_scene()`` and pictures at no cost (see ``inspection.games``)
+    :param is_drawn_from_state: whether games have ``grid_scene()`` and pictures at no cost
     :param is_seeded: whether seeds determine its games
     :param module: module of the package, if it may be a source folder on ``PYTHONPATH`` instead of an installed package
     """
