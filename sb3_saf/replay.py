@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_saf.training.enjoy import replay_main as main
+from sb3_saf.training.replay import main
 
 if __name__ == "__main__":
     main()

@@ -19,7 +19,7 @@ import sb3_saf
 from sb3_saf.inspection import replay as replay_module
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.inspection.replay import replay
-from sb3_saf.training import enjoy as command
+from sb3_saf.training import replay as command
 from tests.test_training_commands import failed
 from tests.toy_envs import CounterEnv
 
@@ -214,4 +214,4 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
     ],
 )
 def test_wrong_commands(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert message in failed(given, capsys, command.replay_main)
+    assert message in failed(given, capsys, command.main)

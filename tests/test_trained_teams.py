@@ -19,8 +19,9 @@ from sb3_saf.experiments.run import run
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training import folders as trained_teams
-from sb3_saf.training.enjoy import enjoy, write_page
+from sb3_saf.training.enjoy import enjoy
 from sb3_saf.training.folders import TEAMS, TEST_GAMES, WEIGHTS, check_team, find_team, finish_run, team_names
+from sb3_saf.training.replay import write_page
 from tests.experiments_jobs import InlineEngine, read_table
 
 SMOKE = RunConfig("smoke", episodes=TEST_GAMES + 8, eval_freq=200, eval_episodes=2)

@@ -52,8 +52,9 @@ from sb3_saf.experiments.definitions import MODULE, RANDOM, Cell, Experiment, Gr
 from sb3_saf.experiments.results import BEST, BEST_MODEL, EVALUATIONS, LAST, MOST_LIKELY, Results
 from sb3_saf.export.writer import save_weights
 from sb3_saf.teams.files import read_json, write_json, write_text
-from sb3_saf.training.enjoy import make_policy, write_page
+from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run, check_runs_no_code, finish_run, python_command, read_curve
+from sb3_saf.training.replay import write_page
 from sb3_saf.training.statistics import Estimate, Floats, mean_over_seeds, require_columns
 
 RUNS: Final = "runs.csv"

@@ -1,7 +1,4 @@
-"""
-``python -m sb3_saf.enjoy``: measure the return of a trained team, and show the first of its games;
-``python -m sb3_saf.replay``: write a browser page that plays episodes of trained teams.
-"""
+"""``python -m sb3_saf.enjoy``: measure the return of a trained team, and show the first of its games."""
 
 from __future__ import annotations
 
@@ -21,15 +18,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
-from sb3_saf.export.act import Actor
 from sb3_saf.export.writer import load_weights
 from sb3_saf.inspection.figures import gif
-from sb3_saf.inspection.replay import replay
 from sb3_saf.suites.registry import find_environment, standing
-from sb3_saf.teams.checks import ExportError, check_seed, evaluation_seed
+from sb3_saf.teams.checks import check_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
-    CommandError,
     DefaultsFormatter,
     OneLineParser,
     add_environment_options,
@@ -38,8 +32,8 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run, find_model, find_team, version_in_errors
-from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, load_settings, saved_settings
+from sb3_saf.training.folders import WEIGHTS, find_model, find_team, version_in_errors
+from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
 from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.enjoy"
@@ -224,80 +218,3 @@ def _print_in_place(frame: Frame) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command, with the arguments of this process by default."""
     run_command(PROGRAM, lambda: enjoy(arguments))
-
-
-# --- the page of a replay ---------------------------------------------------------------------------------------------
-
-
-REPLAY: Final = "python -m sb3_saf.replay"
-
-
-def make_replay_parser() -> argparse.ArgumentParser:
-    """Make the parser."""
-    parser = OneLineParser(
-        prog=REPLAY, description="Write a page that plays episodes of a team.", formatter_class=DefaultsFormatter
-    )
-    parser.add_argument(
-        "--model",
-        type=Path,
-        nargs="+",
-        required=True,
-        metavar="FILE",
-        help="a model (.zip), or the folder of exported actors; several are shown side by side",
-    )
-    parser.add_argument("-o", "--output", type=Path, default=Path("replay.html"), help="the page")
-    add_environment_options(parser, "another level than was trained on, such as coordination:3")
-    parser.set_defaults(env=None)
-    parser.add_argument("--algo", default="saf", help=f"of models without the files of their run: {', '.join(ALGOS)}")
-    parser.add_argument("--size", default="small", help="of models without the files of their run")
-    parser.add_argument("--episodes", type=at_least(1), default=1, help="games to show")
-    parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
-    parser.add_argument("--seed", type=int, default=0, help="of the games, none of which was trained on")
-    return parser
-
-
-def write_page(arguments: Sequence[str] | None = None) -> Path:
-    """Write the page and return its path."""
-    options = make_replay_parser().parse_args(arguments)
-    import_packages(options.gym_packages)
-    with user_errors(ValueError, OSError, ExportError):
-        seed = evaluation_seed(check_seed(options.seed))
-        settings = [_settings_of(path, options) for path in options.model]
-        suite = settings[0].environment.suite
-        render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
-        with closing(
-            settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
-        ) as games:
-            players: dict[str, Any] = {
-                name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
-                for name, path, own in zip(_names(options.model), options.model, settings, strict=True)
-            }
-            gamma = settings[0].hyperparams.get("gamma", 0.99)
-            return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
-
-
-def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
-    """Return the settings of a model's run, or those of the command line."""
-    if not path.exists():
-        raise CommandError(f"--model {path} is not there")
-    if not (path.is_file() and (path.parent / RUN_FILE).is_file()):
-        return load_settings(options.algo, options.env or "TeamSupport-v0", options.size, options.env_kwargs)
-    trained = Run(path.parent).settings
-    if options.env not in (None, trained.env_id):
-        raise CommandError(f"{path} was trained on {trained.env_id}, got --env {options.env}; leave --env out")
-    return saved_settings(trained.as_dict(), options.env_kwargs)
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Return distinct names of models: file names, with folders and numbers if necessary."""
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{path.parent.name}/{path.stem}" for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{number}: {name}" for number, name in enumerate(names, 1)]
-    return names
-
-
-def replay_main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command, with the arguments of this process by default."""
-    run_command(REPLAY, lambda: print(write_page(arguments)))
