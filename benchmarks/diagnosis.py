@@ -25,8 +25,7 @@ import sb3_saf
 from hecogrid_envs.constants import Command
 from hecogrid_envs.task import TaskName, check_task
 from sb3_saf.evaluation import actions_of, play
-from sb3_saf.experiments.definitions import Level
-from sb3_saf.experiments.grid import Cell
+from sb3_saf.experiments.definitions import Cell, Level
 from sb3_saf.experiments.results import Results
 from sb3_saf.inspection.recording import zones_by_attribute
 from sb3_saf.training.folders import Run

@@ -19,9 +19,20 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_saf.experiments.comparisons import FEWEST_SEEDS, MARGIN, Difference, holm, pooled, shares
 from sb3_saf.experiments.definitions import METHODS, RANDOM
-from sb3_saf.experiments.tables import CURVES, RUNS, Frames, marl_eval, read_results
+from sb3_saf.experiments.tables import (
+    CURVES,
+    FEWEST_SEEDS,
+    MARGIN,
+    RUNS,
+    Difference,
+    Frames,
+    holm,
+    marl_eval,
+    pooled,
+    read_results,
+    shares,
+)
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.figures import draw_curves, draw_differences
 from sb3_saf.training.statistics import Estimate

@@ -22,7 +22,7 @@ from benchmarks.paper import add, fill
 from sb3_saf.experiments.cli import main as experiments
 from sb3_saf.experiments.definitions import METHODS as NAMED
 from sb3_saf.experiments.tables import read_results
-from sb3_saf.suites.references import references
+from sb3_saf.suites.registry import references
 from sb3_saf.training.statistics import mean_over_seeds
 
 METHODS: Final = ("saf", "mappo", "ippo", "qplex")

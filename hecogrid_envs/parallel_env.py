@@ -167,7 +167,12 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
             raise ValueError(f"unknown agent {unknown!r}; the agents are {', '.join(self.agents)}")
         row = np.empty((1, len(self.agents)), dtype=np.uint8)
         for i, agent in enumerate(self.agents):
-            row[0, i] = _checked_action(agent, actions[agent])
+            action: Any = actions[agent]
+            if isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu":
+                action = int(action)
+            if isinstance(action, bool) or not isinstance(action, (int, np.integer)) or not 0 <= action < N_ACTIONS:
+                raise ValueError(f"action of {agent!r} must be an integer from 0 to {N_ACTIONS - 1}, got {action!r}")
+            row[0, i] = action
         return row
 
     def observations(self) -> Observations:
@@ -250,11 +255,6 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         """Treasures collected since the reset: the team's return so far."""
         return int(self._batch.collected[self._game])
 
-    @property
-    def acting_order(self) -> list[int]:
-        """Agent indices in the order in which they acted in the last step."""
-        return self._batch.order[self._game].tolist()
-
     def render(self) -> npt.NDArray[np.uint8] | str | None:
         """
         Show the game.
@@ -308,12 +308,3 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
 
     def __str__(self) -> str:
         return f"hecogrid/{self.task}-v0"
-
-
-def _checked_action(agent: str, action: object) -> int:
-    integer = isinstance(action, (int, np.integer)) and not isinstance(action, bool)
-    if isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu":
-        action, integer = int(action), True
-    if not integer or not 0 <= action < N_ACTIONS:  # type: ignore[operator]
-        raise ValueError(f"action of {agent!r} must be an integer from 0 to {N_ACTIONS - 1}, got {action!r}")
-    return int(action)  # type: ignore[call-overload]

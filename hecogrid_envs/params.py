@@ -73,7 +73,20 @@ class HECOGridParams:
     agent_colours: AgentColours = "zone"
 
     def __post_init__(self) -> None:
-        self._check_integers()
+        self._check_integer("n_agents", 1, MAX_AGENTS)
+        self._check_integer("grid_size", 3, MAX_GRID_SIZE)
+        self._check_integer("coordination", 1, self.n_agents, " (1 <= coordination <= n_agents)")
+        self._check_integer("heterogeneity", 1, self.grid_size - 2, " (1 <= heterogeneity <= grid_size - 2)")
+        self._check_integer("n_treasures", 0, self.n_interior_cells)
+        # Tasks without keys ignore the number, so check_fits checks whether they fit.
+        self._check_integer("n_keys", 0, MAX_GRID_SIZE**2)
+        self._check_integer("view_size", 1, MAX_VIEW_SIZE, " and odd")
+        if self.view_size % 2 == 0:
+            raise ValueError(f"view_size must be odd, from 1 to {MAX_VIEW_SIZE}, got {self.view_size!r}")
+        self._check_integer("view_tile_size", 1, MAX_TILE_SIZE)
+        self._check_integer("view_offset", 0, self.view_size - 1, " (0 <= view_offset < view_size)")
+        self._check_integer("support_radius", 0, self.grid_size)
+        self._check_integer("max_cycles", 1, 2**31 - 1)
         density = self.clutter_density
         if isinstance(density, (bool, np.bool_)) or not isinstance(density, Real) or not 0 <= density < 1:
             raise ValueError(f"clutter_density must be a number from 0 (included) to 1 (excluded), got {density!r}")
@@ -105,22 +118,6 @@ class HECOGridParams:
                     f"unknown parameter {name!r}{did_you_mean(name, known)}; the parameters are {', '.join(known)}"
                 )
         return cls(**params)
-
-    def _check_integers(self) -> None:
-        self._check_integer("n_agents", 1, MAX_AGENTS)
-        self._check_integer("grid_size", 3, MAX_GRID_SIZE)
-        self._check_integer("coordination", 1, self.n_agents, " (1 <= coordination <= n_agents)")
-        self._check_integer("heterogeneity", 1, self.grid_size - 2, " (1 <= heterogeneity <= grid_size - 2)")
-        self._check_integer("n_treasures", 0, self.n_interior_cells)
-        # Tasks without keys ignore the number, so check_fits checks whether they fit.
-        self._check_integer("n_keys", 0, MAX_GRID_SIZE**2)
-        self._check_integer("view_size", 1, MAX_VIEW_SIZE, " and odd")
-        if self.view_size % 2 == 0:
-            raise ValueError(f"view_size must be odd, from 1 to {MAX_VIEW_SIZE}, got {self.view_size!r}")
-        self._check_integer("view_tile_size", 1, MAX_TILE_SIZE)
-        self._check_integer("view_offset", 0, self.view_size - 1, " (0 <= view_offset < view_size)")
-        self._check_integer("support_radius", 0, self.grid_size)
-        self._check_integer("max_cycles", 1, 2**31 - 1)
 
     def _check_integer(self, name: str, low: int, high: int, note: str = "") -> None:
         value = getattr(self, name)

@@ -218,7 +218,14 @@ class HumanWindow:
             self._pygame = imported
         pygame = self._pygame
         if self._screen is None:
-            _start_display(pygame)
+            try:
+                pygame.display.init()
+            except pygame.error as error:
+                raise RuntimeError(f"no window can be opened ({error}); {_OTHER_WAYS}") from error
+            # Without a screen, SDL silently selects a driver that shows nothing; accepted only if asked for.
+            if pygame.display.get_driver() in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
+                pygame.display.quit()
+                raise RuntimeError(f"no window can be opened (there is no display); {_OTHER_WAYS}")
             pygame.display.set_caption(self.title)
             self._clock = pygame.time.Clock()
         if self._screen is None or self._screen.get_size() != (width, height):
@@ -239,22 +246,6 @@ class HumanWindow:
             if event.type == pygame.KEYDOWN:
                 # Keys of the number pad have names such as "[4]".
                 self._keys.append(pygame.key.name(event.key).strip("[]"))
-
-
-def _start_display(pygame: ModuleType) -> None:
-    """
-    Start the display, or raise RuntimeError without one.
-
-    Without a screen, SDL silently selects a driver that shows nothing; it is accepted only if requested explicitly.
-    """
-    try:
-        pygame.display.init()
-    except pygame.error as error:
-        raise RuntimeError(f"no window can be opened ({error}); {_OTHER_WAYS}") from error
-    driver = pygame.display.get_driver()
-    if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
-        pygame.display.quit()
-        raise RuntimeError(f"no window can be opened (there is no display); {_OTHER_WAYS}")
 
 
 def play_window(session: Session, tile_size: int | None = None) -> None:
@@ -279,25 +270,6 @@ def play_window(session: Session, tile_size: int | None = None) -> None:
 # --- the command line
 
 
-def _add_world_options(group: argparse._ArgumentGroup) -> None:
-    """Add options with the names, defaults and descriptions of :class:`HECOGridParams`."""
-    entries = re.findall(r":param (\w+): (.+?)(?=\n\s*:|$)", HECOGridParams.__doc__ or "", re.DOTALL)
-    notes = {name: " ".join(text.replace("`", "").split()) for name, text in entries}
-    types = get_type_hints(HECOGridParams)
-    for field in fields(HECOGridParams):
-        if field.name in _NOT_FOR_PEOPLE:
-            continue
-        choices = get_args(types[field.name]) or None
-        group.add_argument(
-            f"--{field.name.replace('_', '-')}",
-            type=str if choices else types[field.name],
-            choices=choices,
-            default=argparse.SUPPRESS,
-            metavar=None if choices else types[field.name].__name__.upper(),
-            help=f"{notes.get(field.name, '')} (default: {field.default})".replace("%", "%%"),
-        )
-
-
 def make_session(arguments: Sequence[str] | None = None) -> tuple[Session, argparse.Namespace]:
     """
     Build the game of a command line; invalid arguments end the program with a message.
@@ -315,9 +287,25 @@ def make_session(arguments: Sequence[str] | None = None) -> tuple[Session, argpa
     parser.add_argument("--raw", action="store_true", help="do not translate keys into the dynamics of the zone")
     parser.add_argument("--others", choices=get_args(Others), default="wait", help="other agents (default: wait)")
     parser.add_argument("--tile-size", type=int, help="pixels per cell (default: fit the screen)")
-    _add_world_options(parser.add_argument_group("world", "parameters of the game"))
+    group = parser.add_argument_group("world", "parameters of the game")
+    # With the names, defaults and descriptions of HECOGridParams.
+    entries = re.findall(r":param (\w+): (.+?)(?=\n\s*:|$)", HECOGridParams.__doc__ or "", re.DOTALL)
+    notes = {name: " ".join(text.replace("`", "").split()) for name, text in entries}
+    types, names = get_type_hints(HECOGridParams), []
+    for field in fields(HECOGridParams):
+        if field.name in _NOT_FOR_PEOPLE:
+            continue
+        names.append(field.name)
+        choices = get_args(types[field.name]) or None
+        group.add_argument(
+            f"--{field.name.replace('_', '-')}",
+            type=str if choices else types[field.name],
+            choices=choices,
+            default=argparse.SUPPRESS,
+            metavar=None if choices else types[field.name].__name__.upper(),
+            help=f"{notes.get(field.name, '')} (default: {field.default})".replace("%", "%%"),
+        )
     options = parser.parse_args(arguments)
-    names = {field.name for field in fields(HECOGridParams)}
     world = {name: value for name, value in vars(options).items() if name in names}
     try:
         env = parallel_env(options.task, observation="tiles", **world)

@@ -106,7 +106,7 @@ def render_scene(scene: Scene, tile_size: int | None = None) -> Picture:
 
 def header_height(task: TaskName, params: HECOGridParams, tile_size: int) -> int:
     """Return the height of the bar above the map in pixels, an even number."""
-    return _header_layout(task, params, tile_size).height
+    return _header_layout(task, params, tile_size)[1]
 
 
 def fit_tile_size(grid_size: int, max_pixels: int = 960) -> int:
@@ -163,16 +163,10 @@ def _background(task: TaskName, params: HECOGridParams, tile: int, walls_bytes: 
         tint = _mix(_FLOOR, zone_colour(int(zones[x])), _ZONE_TINT if zones[-1] > 0 else 0.0)
         box = (x * tile, top + y * tile, (x + 1) * tile - 1, top + (y + 1) * tile - 1)
         draw.rectangle(box, fill=_WALL if walls[x, y] else tint, outline=None if walls[x, y] else _mix(tint, _INK, 0.2))
-    if zones[-1] > 0:
-        _draw_zone_names(draw, zones, tile, top)
-    return image
-
-
-def _draw_zone_names(draw: Any, zones: npt.NDArray[np.int64], tile: int, top: int) -> None:
-    """Draw a band in the zones' full colours right above the map."""
     band = _band_height(zones, tile)
     font = _font(max(band - 4, 7))
-    for zone in np.unique(zones).tolist():
+    for zone in np.unique(zones).tolist() if band else ():
+        # A band in the zones' full colours right above the map.
         columns = np.flatnonzero(zones == zone) * tile
         left, right = int(columns[0]), int(columns[-1]) + tile
         draw.rectangle((left, top - band, right - 1, top - 1), fill=zone_colour(zone))
@@ -181,6 +175,7 @@ def _draw_zone_names(draw: Any, zones: npt.NDArray[np.int64], tile: int, top: in
                 place = ((left + right) / 2, top - band / 2)
                 draw.text(place, name, font=font, fill=_readable_on(zone_colour(zone)), anchor="mm")
                 break
+    return image
 
 
 def _band_height(zones: npt.NDArray[np.int64], tile: int) -> int:
@@ -188,14 +183,6 @@ def _band_height(zones: npt.NDArray[np.int64], tile: int) -> int:
 
 
 # --- the bar above the map
-
-
-class _Layout(NamedTuple):
-    """Font size of the bar's words, its height, and (x, y) of each word."""
-
-    font: int
-    height: int
-    places: tuple[tuple[int, int], ...]
 
 
 def _words(scene: Scene) -> list[tuple[str, str]]:
@@ -213,13 +200,17 @@ def _words(scene: Scene) -> list[tuple[str, str]]:
 
 
 @lru_cache(maxsize=64)
-def _header_layout(task: TaskName, params: HECOGridParams, tile: int) -> _Layout:
-    """Place as many words to a line as fit, at their largest possible width so that they do not move."""
+def _header_layout(task: TaskName, params: HECOGridParams, tile: int) -> tuple[int, int, tuple[tuple[int, int], ...]]:
+    """
+    Place as many words to a line as fit, at their largest possible width so that they do not move.
+
+    :return: font size of the bar's words, its height, and (x, y) of each word
+    """
     width, wanted = params.grid_size * tile, int(np.clip(round(tile * 0.62), 11, 22))
     most = np.ones(params.n_treasures)
     words = _words(Scene(task, params, {"treasures": 2 * most}, params.max_cycles, len(most)))
     for font in range(wanted, 5, -1):
-        widths = [_word_width(word, font) for word in words]
+        widths = [int(np.ceil(_font(font).getlength(" ".join(word).strip()))) for word in words]
         if max(widths) <= width - font:
             break
     places: list[tuple[int, int]] = []
@@ -230,11 +221,7 @@ def _header_layout(task: TaskName, params: HECOGridParams, tile: int) -> _Layout
         places.append((x, y))
         x += word_width + font
     height = y + font + font // 2 + font // 4 + _bar_height(tile) + _band_height(params.zone_of_column(), tile)
-    return _Layout(font, height + height % 2, tuple(places))
-
-
-def _word_width(word: tuple[str, str], font: int) -> int:
-    return int(np.ceil(_font(font).getlength(" ".join(word).strip())))
+    return font, height + height % 2, tuple(places)
 
 
 def _bar_height(tile: int) -> int:
@@ -242,13 +229,13 @@ def _bar_height(tile: int) -> int:
 
 
 def _draw_header(image: Any, scene: Scene, tile: int) -> None:
-    layout, draw = _header_layout(scene.task, scene.params, tile), _brush(image)
-    font = _font(layout.font)
-    for (label, value), place in zip(_words(scene), layout.places, strict=True):
+    (size, height, places), draw = _header_layout(scene.task, scene.params, tile), _brush(image)
+    font = _font(size)
+    for (label, value), place in zip(_words(scene), places, strict=True):
         indent = font.getlength(f"{label} ") if label else 0
         draw.text(place, label, font=font, fill=_DIM)
         draw.text((place[0] + indent, place[1]), value, font=font, fill=_TEXT)
-    bottom = layout.height - _band_height(scene.params.zone_of_column(), tile) - 1
+    bottom = height - _band_height(scene.params.zone_of_column(), tile) - 1
     top, share = bottom - _bar_height(tile) + 1, min(scene.step / scene.params.max_cycles, 1)
     draw.rectangle((0, top, image.width, bottom), fill=_mix(_INK, _DIM, 0.25))
     if share > 0:
@@ -394,16 +381,6 @@ def _draw_key(canvas: _Canvas, x: float, y: float, scale: float, rim: float) -> 
 # --- agents
 
 
-class _Look(NamedTuple):
-    """Properties that determine one agent's sprite."""
-
-    size: int
-    agent: int
-    direction: int
-    has_key: bool
-    selected: bool
-
-
 #: Size and centres of the sprites of a crowd in its cell; more than nine agents use the last grid.
 _CROWDS: Final[dict[int, tuple[float, list[tuple[float, float]]]]] = {
     1: (1.0, [_MIDDLE]),
@@ -429,26 +406,26 @@ def _draw_agents(image: Any, scene: Scene, tile: int, top: int) -> None:
         shown = members if len(members) <= _MOST_SHOWN else members[: _MOST_SHOWN - 1]
         for agent, centre in zip(shown, centres, strict=False):
             direction, has_key = (int(scene.state[name][agent]) for name in ("agent_dir", "agent_has_key"))
-            look = _Look(size, agent, direction, bool(has_key), agent == scene.selected)
-            _paste(image, _agent_sprite(look), x, y, tile, top, centre)
+            sprite = _agent_sprite(size, agent, direction, bool(has_key), agent == scene.selected)
+            _paste(image, sprite, x, y, tile, top, centre)
         if len(shown) < len(members):
             # The last place shows the number of agents not drawn.
             _paste(image, _more_sprite(size, len(members) - len(shown)), x, y, tile, top, centres[-1])
 
 
 @lru_cache(maxsize=4096)
-def _agent_sprite(look: _Look) -> Any:
+def _agent_sprite(size: int, agent: int, direction: int, has_key: bool, selected: bool) -> Any:
     """Draw a triangle in the agent's direction with its number, and a key if it carries one."""
-    canvas, colour, label = _Canvas(look.size), _agent_colour(look.agent), f"{look.agent}"
-    shape = _turned([(0.10, 0.06), (0.97, 0.50), (0.10, 0.94)], look.direction)
-    if look.selected:
+    canvas, colour, label = _Canvas(size), _agent_colour(agent), f"{agent}"
+    shape = _turned([(0.10, 0.06), (0.97, 0.50), (0.10, 0.94)], direction)
+    if selected:
         canvas.outline(shape, (255, 255, 255), 0.24)
     canvas.outline(shape, _INK, 0.13)
     canvas.polygon(shape, colour)
-    if look.size >= _LEGIBLE and len(label) <= 2:
-        x, y = _turned([(0.36, 0.5)], look.direction)[0]
+    if size >= _LEGIBLE and len(label) <= 2:
+        x, y = _turned([(0.36, 0.5)], direction)[0]
         canvas.text(x, y, label, 0.5 if len(label) == 1 else 0.40, _readable_on(colour))
-    if look.has_key:
+    if has_key:
         _draw_key(canvas, 0.82, 0.27, 0.60, 0.05)
     return canvas.sprite()
 

@@ -11,17 +11,13 @@ from typing import NoReturn
 
 from sb3_saf.export.act import Actor
 from sb3_saf.teams import package_version
-from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.checks import ExportError
 
 if find_spec("stable_baselines3") is not None:
     from sb3_saf.buffers.replay import TeamReplayBuffer
     from sb3_saf.buffers.rollout import TeamRolloutBuffer
-    from sb3_saf.callbacks.entropy import EntropySchedule
-    from sb3_saf.callbacks.evaluation import TeamEvalCallback
-    from sb3_saf.callbacks.finite import FiniteCallback
-    from sb3_saf.callbacks.game_steps import GameStepsCallback
-    from sb3_saf.checkpoints.callback import TeamCheckpointCallback
-    from sb3_saf.checkpoints.learning import resumable_learn, resume
+    from sb3_saf.callbacks import EntropySchedule, FiniteCallback, GameStepsCallback, TeamEvalCallback
+    from sb3_saf.checkpoints.learning import TeamCheckpointCallback, resumable_learn, resume
     from sb3_saf.envs.audit import check_team_env
     from sb3_saf.envs.curriculum import Curriculum, Stage
     from sb3_saf.envs.game_reader import EqualSpaces
@@ -36,10 +32,8 @@ if find_spec("stable_baselines3") is not None:
         evaluate_policy,
         evaluate_team,
     )
-    from sb3_saf.export.weights import load_weights, save_weights
-    from sb3_saf.export.writer import export_actors
-    from sb3_saf.inspection.callback import InspectionCallback
-    from sb3_saf.inspection.inspection import Inspection, inspect_team
+    from sb3_saf.export.writer import export_actors, load_weights, save_weights
+    from sb3_saf.inspection.callback import Inspection, InspectionCallback, inspect_team
     from sb3_saf.inspection.replay import replay
     from sb3_saf.make import make_team_env, make_vec_env
     from sb3_saf.networks.encoders import (
@@ -56,10 +50,10 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.qplex.policies import QPLEXPolicy, QPLEXPoolPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
-    from sb3_saf.teams.errors import CheckpointError, NonFiniteError
+    from sb3_saf.teams.checks import CheckpointError, NonFiniteError
     from sb3_saf.teams.randomness import game_seeds
-    from sb3_saf.training.ppo_settings import ppo_settings
-    from sb3_saf.training.trained_teams import load_team
+    from sb3_saf.training.folders import load_team
+    from sb3_saf.training.settings import ppo_settings
 
     register_all()
 else:

@@ -139,7 +139,15 @@ class RandomPolicy:
         self, action_space: spaces.Space[Any] | VecEnv | ParallelEnv[Any, Any, Any], seed: int | None = None
     ) -> None:
         if not isinstance(action_space, spaces.Space):
-            action_space = _action_space_of(action_space)
+            env: Any = action_space
+            action_space = getattr(env, "action_space", None)
+            if callable(action_space) and (agents := getattr(env, "possible_agents", None)):  # PettingZoo's
+                action_space = action_space(agents[0])
+            if not isinstance(action_space, spaces.Space):
+                raise ValueError(
+                    f"expected one agent's action space, or an environment that has it, got {type(env).__name__}; pass "
+                    "env.action_space of the environment from sb3_saf.make_team_env"
+                )
         if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
             raise ValueError(f"a uniform policy needs a bounded action space, got {action_space}; rescale the actions")
         if not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)):
@@ -201,19 +209,6 @@ class RandomPolicy:
         if space.dtype is not None and space.dtype.kind in "iu":
             return rng.integers(space.low, space.high, size=shape, endpoint=True, dtype=space.dtype)
         return rng.uniform(space.low, space.high, size=shape).astype(space.dtype)
-
-
-def _action_space_of(env: Any) -> spaces.Space[Any]:
-    """Return the action space of a vector environment, or of another environment with one space for all agents."""
-    space = getattr(env, "action_space", None)
-    if callable(space) and (agents := getattr(env, "possible_agents", None)):  # PettingZoo's
-        space = space(agents[0])
-    if isinstance(space, spaces.Space):
-        return space
-    raise ValueError(
-        f"expected one agent's action space, or an environment that has it, got {type(env).__name__}; pass "
-        "env.action_space of the environment from sb3_saf.make_team_env"
-    )
 
 
 class PlayedStep(NamedTuple):

@@ -191,7 +191,8 @@ def _make_rows(
 ) -> VecEnv:
     """Make the rows of the games in the suite's own engine or through SuperSuit."""
     env = source if isinstance(source, TeamEnvironment) else None
-    name, suite = (_name(source), None) if env is None else (env.id, env.suite)
+    name = env.id if env is not None else getattr(source, "__qualname__", None) or type(source).__name__
+    suite = None if env is None else env.suite
     if env is not None and suite is not None and suite.vec_env is not None:
         if request.backend != "supersuit":
             return _make_in_engine(env, request, seed, params)
@@ -207,7 +208,21 @@ def _make_rows(
     active = request.active
     if active is None:
         active = suite is None or not suite.always_active
-    game = _bound(source, params) if env is None else partial(env.make_game, params)
+    game: Any = source
+    if env is not None:
+        game = partial(env.make_game, params)
+    elif isinstance(source, VecEnv):
+        raise ValueError(
+            f"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv {name}; wrap it yourself: "
+            "sb3_saf.CentralizedValueWrapper(sb3_saf.TeamMonitor(venv))"
+        )
+    elif params:
+        if not callable(source) or isinstance(source, (ParallelEnv, AECEnv, gym.Env)):
+            raise ValueError(
+                f"parameters {sorted(params)} go to a factory, got them with {name}; give them to the environment "
+                "when you make it, or pass its factory (such as simple_spread_v3.parallel_env) instead"
+            )
+        game = partial(source, **params)
     n_envs, _, n_cpus, _, action_masks, state, float64, _ = request
     return SuperSuitVecEnv(game, n_envs, seed, n_cpus, active, action_masks, state, float64)
 
@@ -231,25 +246,3 @@ def _make_in_engine(env: TeamEnvironment, request: Request, seed: int | None, pa
             have = "have" if given[argument] else "have no"
             raise ValueError(f"rows of {env.id} {have} {argument}, got {argument}={value}; leave it out{others}")
     return venv
-
-
-def _bound(env: AnyParallelEnv | EnvFactory, params: dict[str, Any]) -> AnyParallelEnv | Callable[[], AnyParallelEnv]:
-    """Return a factory with its parameters bound, or the environment itself."""
-    if isinstance(env, VecEnv):
-        raise ValueError(
-            f"expected a task name, a PettingZoo ParallelEnv or a factory, got the VecEnv {_name(env)}; wrap it "
-            "yourself: sb3_saf.CentralizedValueWrapper(sb3_saf.TeamMonitor(venv))"
-        )
-    is_factory = callable(env) and not isinstance(env, (ParallelEnv, AECEnv, gym.Env))
-    if not params:
-        return env
-    if not is_factory:
-        raise ValueError(
-            f"parameters {sorted(params)} go to a factory, got them with {_name(env)}; give them to the environment "
-            "when you make it, or pass its factory (such as simple_spread_v3.parallel_env) instead"
-        )
-    return partial(env, **params)
-
-
-def _name(env: object) -> str:
-    return getattr(env, "__qualname__", None) or type(env).__name__

@@ -18,11 +18,10 @@ from typing import Any
 from hecogrid_envs import TASK_NAMES
 from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
 from sb3_saf.teams.checks import evaluation_seed
-from sb3_saf.training.callbacks import ProgressLines
 from sb3_saf.training.enjoy import Film, write_video
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import python_command, read_curve, write_run
-from sb3_saf.training.run import RunOptions, train
+from sb3_saf.training.run import ProgressLines, RunOptions, train
 from sb3_saf.training.settings import Settings, load_settings
 
 N_EPISODES = 64

@@ -36,14 +36,6 @@ DECLARATIONS: Final[tuple[Declaration, ...]] = tuple(
 COMMANDS: Final[dict[str, AlgorithmSpec]] = {name: spec for one in DECLARATIONS for name, spec in one.commands.items()}
 
 
-def _names(declaration: Declaration) -> Iterator[tuple[type[BaseAlgorithm], str, type[BasePolicy]]]:
-    for algorithm, policies in declaration.policies.items():
-        yield from ((algorithm, policy.__name__, policy) for policy in policies)
-        yield algorithm, f"{declaration.name}Policy", policies[0]
-        yield algorithm, declaration.name, policies[0]
-        yield algorithm, declaration.name.lower(), policies[0]
-
-
 def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:
     """Register a policy with an algorithm by name. A name of another policy is not replaced, with a warning."""
     known = algorithm.policy_aliases.setdefault(name, policy)
@@ -61,5 +53,8 @@ def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]
 def register_all() -> None:
     """Register every policy; called when ``sb3_saf`` is imported, the only side effect of the import."""
     for declaration in DECLARATIONS:
-        for algorithm, name, policy in _names(declaration):
-            register(algorithm, name, policy)
+        for algorithm, policies in declaration.policies.items():
+            for policy in policies:
+                register(algorithm, policy.__name__, policy)
+            for name in (f"{declaration.name}Policy", declaration.name, declaration.name.lower()):
+                register(algorithm, name, policies[0])

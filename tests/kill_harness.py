@@ -45,9 +45,8 @@ import numpy as np
 import torch as th
 
 import sb3_saf
-from sb3_saf.checkpoints.callback import TeamCheckpointCallback
-from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.export.weights import read_weights
+from sb3_saf.checkpoints.learning import CheckpointFolder, TeamCheckpointCallback
+from sb3_saf.export.writer import read_weights
 from tests.killed_runs import ALGOS, GAMES, ROLLOUT, Games, Run, make_run
 
 #: Events that are counted in a run.

@@ -27,7 +27,7 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.networks.value_normalizer import ValueNormalizer
+from sb3_saf.networks.critic import ValueNormalizer
 from sb3_saf.teams.rows import TeamSpaces
 from tests.team_venv import Array
 from tests.toy_envs import CounterEnv, DictEnv, TellingEnv

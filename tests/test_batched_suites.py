@@ -15,8 +15,8 @@ from sb3_saf.checkpoints.states import environment_state, load_environment_state
 from sb3_saf.inspection.recording import picture
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
 from sb3_saf.suites.registry import find_environment
+from sb3_saf.teams.files import decode, encode
 from sb3_saf.teams.rows import TeamSpaces
-from sb3_saf.teams.trees import decode, encode
 from sb3_saf.training.settings import load_settings
 from tests.test_suites import needs
 

@@ -16,8 +16,7 @@ from benchmarks.scripted_teams import TEAMS
 from hecogrid_envs.batch import GameBatch
 from hecogrid_envs.constants import Command, Direction
 from hecogrid_envs.params import HECOGridParams
-from sb3_saf.experiments.definitions import Level
-from sb3_saf.experiments.grid import Cell, RunConfig
+from sb3_saf.experiments.definitions import Cell, Level, RunConfig
 from sb3_saf.experiments.results import Results
 from sb3_saf.training.folders import write_run
 from sb3_saf.training.settings import load_settings

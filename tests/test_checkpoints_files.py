@@ -17,11 +17,10 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.teams import trees
-from sb3_saf.teams.errors import CheckpointError, DamagedCheckpointError
-from sb3_saf.teams.files import atomic_file, try_lock, write_text
-from sb3_saf.teams.trees import decode, encode, write_tree
+from sb3_saf.checkpoints.learning import CheckpointFolder
+from sb3_saf.teams import files as trees
+from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError
+from sb3_saf.teams.files import atomic_file, decode, encode, try_lock, write_text, write_tree
 
 
 def test_content_is_written_whole(tmp_path: Path) -> None:

@@ -15,8 +15,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_saf
 from sb3_saf.networks.actor import PolicyPool
-from sb3_saf.networks.distributions import distribution_of, masked_parameters
-from sb3_saf.networks.mixtures import mixture_of
+from sb3_saf.networks.distributions import distribution_of, masked_parameters, mixture_of
 from sb3_saf.policies.base import TeamMaskablePolicy
 from sb3_saf.registration import DECLARATIONS
 from tests import test_policies

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_saf import QPLEX, inspect_team, load_weights, make_team_env, ppo_settings, replay
-from sb3_saf.callbacks.evaluation import TeamEvalCallback
+from sb3_saf.callbacks import TeamEvalCallback
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv

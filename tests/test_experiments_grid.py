@@ -10,8 +10,20 @@ from pathlib import Path
 import pytest
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Level, find_experiment, own_experiment
-from sb3_saf.experiments.grid import Cell, Grid, RunConfig, Selection, Shard, expand, merge
+from sb3_saf.experiments.definitions import (
+    EXPERIMENTS,
+    RANDOM,
+    Cell,
+    Grid,
+    Level,
+    RunConfig,
+    Selection,
+    Shard,
+    expand,
+    find_experiment,
+    merge,
+    own_experiment,
+)
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from tests.experiments_jobs import InlineEngine

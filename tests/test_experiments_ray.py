@@ -19,9 +19,8 @@ import pytest
 
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, run_job
-from sb3_saf.experiments.definitions import find_experiment
+from sb3_saf.experiments.definitions import Cell, RunConfig, Selection, find_experiment
 from sb3_saf.experiments.engines import RayEngine, _run_on_ray, require_ray
-from sb3_saf.experiments.grid import Cell, RunConfig, Selection
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
 from sb3_saf.teams.files import read_json

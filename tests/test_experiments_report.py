@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, find_experiment, own_experiment
-from sb3_saf.experiments.grid import RunConfig, Selection, expand
-from sb3_saf.experiments.page import Content, known, losses
+from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, expand, find_experiment, own_experiment
+from sb3_saf.experiments.report import Content, known, losses
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.experiments.tables import Frames, complete, marl_eval, read_results

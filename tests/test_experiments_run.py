@@ -24,8 +24,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_saf import EvaluationResult, TeamMonitor
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, run_job
-from sb3_saf.experiments.definitions import Level, find_experiment
-from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard
+from sb3_saf.experiments.definitions import Cell, Level, RunConfig, Selection, Shard, find_experiment
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
 from sb3_saf.teams.files import differences, read_json, write_json

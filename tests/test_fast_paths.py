@@ -17,16 +17,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 from sb3_saf import QPLEX, LightEncoder, PaperCNN, TeamRolloutBuffer, make_team_env, make_vec_env
-from sb3_saf.buffers.later import LaterValues, compute_together
+from sb3_saf.buffers.rollout import LaterValues, compute_together
 from sb3_saf.networks import row_encoder
-from sb3_saf.networks.attention import Attention
 from sb3_saf.networks.distributions import LeanCategorical
 from sb3_saf.networks.encoders import PixelInput
+from sb3_saf.networks.knowledge_source import Attention
 from sb3_saf.networks.layers import mlp
 from sb3_saf.networks.row_encoder import RowEncoder, UniqueRows, unique_rows
 from sb3_saf.networks.tanh import Tanh
 from sb3_saf.networks.tile_sums import Places, places_of_convolution, places_of_linear, rectified_sums, used_codes
-from sb3_saf.teams.errors import NonFiniteError
+from sb3_saf.teams.checks import NonFiniteError
 from tests.toy_envs import late_env
 from tests.toy_teams import CodeSpace, ToyTeams
 

@@ -33,8 +33,7 @@ from sb3_saf import (
     inspect_team,
     make_team_env,
 )
-from sb3_saf.inspection.reading import QReader
-from sb3_saf.inspection.recording import EpisodeRecording, lambda_returns, record_episodes, zones_by_attribute
+from sb3_saf.inspection.recording import EpisodeRecording, QReader, lambda_returns, record_episodes, zones_by_attribute
 from sb3_saf.inspection.scalars import critic_scalars, message_scalars
 from sb3_saf.inspection.tensorboard import Line, line_of
 from sb3_saf.policies.base import TeamPolicy

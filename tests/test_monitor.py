@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from sb3_saf.callbacks.game_steps import GameStepsCallback, game_steps
+from sb3_saf.callbacks import GameStepsCallback, game_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.evaluation import RandomPolicy

@@ -113,7 +113,7 @@ def _modules_after(*statements: str) -> list[set[str]]:
 
 
 def test_the_game_needs_neither_torch_nor_stable_baselines() -> None:
-    (modules,) = _modules_after("import hecogrid_envs.rendering, hecogrid_envs.text, hecogrid_envs.play")
+    (modules,) = _modules_after("import hecogrid_envs.rendering, hecogrid_envs.state, hecogrid_envs.play")
     assert "hecogrid_envs" in modules
     learning = {"torch", "stable_baselines3", "supersuit", "sb3_contrib", "sb3_saf", "tensorboard"}
     assert modules.isdisjoint({*learning, "pygame", "PIL"})

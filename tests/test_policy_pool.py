@@ -16,13 +16,18 @@ from stable_baselines3.common.distributions import make_proba_distribution
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_saf.networks import mixtures
+from sb3_saf.networks import distributions as mixtures
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PolicyPool, Selection, SinglePolicy
-from sb3_saf.networks.attention import Attention
-from sb3_saf.networks.distributions import distribution_of, n_action_parameters
-from sb3_saf.networks.knowledge_source import KnowledgeSource
+from sb3_saf.networks.distributions import (
+    PoolDistribution,
+    SelectedDistribution,
+    distribution_of,
+    draw_policy,
+    mixture_of,
+    n_action_parameters,
+)
+from sb3_saf.networks.knowledge_source import Attention, KnowledgeSource
 from sb3_saf.networks.layers import NetworkSpec
-from sb3_saf.networks.mixtures import PoolDistribution, SelectedDistribution, draw_policy, mixture_of
 from sb3_saf.policies.parts import CriticInput
 from sb3_saf.policies.saf import SAFCritic, SAFParts
 

@@ -19,7 +19,7 @@ from sb3_saf import QPLEX, Actor, LightEncoder, evaluate_team, export_actors, ma
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import JointChoice, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
-from sb3_saf.qplex.parts import q_values
+from sb3_saf.qplex.policies import q_values
 from tests.probe_envs import ONE_STEP, MatrixGame, TwoStates
 from tests.toy_envs import TellingEnv
 from tests.toy_teams import ToyTeams

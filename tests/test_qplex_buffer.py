@@ -12,8 +12,8 @@ import pytest
 from gymnasium import spaces
 
 from sb3_saf.buffers.replay import TeamReplayBuffer, TeamReplaySamples
+from sb3_saf.teams.files import read_tree, write_tree
 from sb3_saf.teams.rows import TeamSpaces
-from sb3_saf.teams.trees import read_tree, write_tree
 
 N_AGENTS, N_GAMES, N_ACTIONS = 2, 3, 4
 OWN = spaces.Box(0, 255, (3,), np.uint8)

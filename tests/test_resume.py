@@ -346,7 +346,7 @@ def test_folders_and_algorithms_that_cannot_be_resumed(tmp_path: Path) -> None:
 
 def test_other_conditions_are_told_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     resumable_learn(make(), ROLLOUT, tmp_path)
-    monkeypatch.setattr("sb3_saf.checkpoints.runs.package_version", lambda: "9.9")
+    monkeypatch.setattr("sb3_saf.checkpoints.states.package_version", lambda: "9.9")
     with pytest.warns(UserWarning, match=r"sb3_saf was .*, now '9\.9'"):
         model = resumable_learn(make(), WHOLE, tmp_path)
     assert weights_of(model) == undisturbed()

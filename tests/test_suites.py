@@ -36,9 +36,7 @@ from sb3_saf.envs.monitor import SharedReward
 from sb3_saf.networks.encoders import PaperCNN, PartsEncoder, PartsSpace
 from sb3_saf.suites.__main__ import main
 from sb3_saf.suites.meltingpot import MeltingPotTeam
-from sb3_saf.suites.references import references, standing
-from sb3_saf.suites.registry import TeamEnvironment, find_environment, suites
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite, TeamEnvironment, find_environment, references, standing, suites
 from sb3_saf.training.settings import load_settings, saved_settings
 from tests.test_resume import Lightning
 from tests.toy_envs import CounterEnv

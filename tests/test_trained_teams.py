@@ -13,17 +13,15 @@ import pytest
 
 from sb3_saf import ExportError, evaluate_team, load_team, load_weights, save_weights
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import find_experiment
-from sb3_saf.experiments.grid import RunConfig, Selection
+from sb3_saf.experiments.definitions import RunConfig, Selection, find_experiment
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.files import read_json, write_json
-from sb3_saf.training import trained_teams
+from sb3_saf.training import folders as trained_teams
 from sb3_saf.training.enjoy import enjoy
-from sb3_saf.training.folders import finish_run
+from sb3_saf.training.folders import TEAMS, TEST_GAMES, WEIGHTS, check_team, find_team, finish_run, team_names
 from sb3_saf.training.replay import write_page
-from sb3_saf.training.trained_teams import TEAMS, TEST_GAMES, WEIGHTS, check_team, find_team, team_names
 from tests.experiments_jobs import InlineEngine, read_table
 
 SMOKE = RunConfig("smoke", episodes=TEST_GAMES + 8, eval_freq=200, eval_episodes=2)

@@ -27,9 +27,8 @@ from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import folders
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.callbacks import GameStepsProgressBar, ProgressLines
 from sb3_saf.training.folders import Run
-from sb3_saf.training.run import RunOptions
+from sb3_saf.training.run import GameStepsProgressBar, ProgressLines, RunOptions
 from sb3_saf.training.run import train as train_settings
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from tests.weights import weights_of

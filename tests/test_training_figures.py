@@ -10,7 +10,7 @@ from rliable import metrics
 from scipy import stats
 
 from sb3_saf import confidence_interval
-from sb3_saf.experiments.comparisons import compare, holm, mean_difference, pooled, shares
+from sb3_saf.experiments.tables import compare, holm, mean_difference, pooled, shares
 from sb3_saf.training.figures import draw_curves, draw_levels, method_styles
 from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import (

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_saf.export.weights import read_weights
+from sb3_saf.export.writer import read_weights
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.commands import check_device
 from sb3_saf.training.folders import Run, python_command
+from sb3_saf.training.run import SeededEvalCallback
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"

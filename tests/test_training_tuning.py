@@ -19,8 +19,8 @@ from optuna.trial import TrialState
 
 from sb3_saf import LightEncoder
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.callbacks import SeededEvalCallback
 from sb3_saf.training.folders import Run
+from sb3_saf.training.run import SeededEvalCallback
 from sb3_saf.training.settings import ALGOS, load_settings
 from sb3_saf.training.tune import open_storage, sample_overrides, to_overrides
 from tests.test_training_commands import failed

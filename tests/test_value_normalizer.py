@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import TeamRolloutBuffer, make_team_env, ppo_settings
 from sb3_saf.envs.joint_observation import TimeLimit
-from sb3_saf.networks.value_normalizer import MIN_STD, ValueNormalizer
+from sb3_saf.networks.critic import MIN_STD, ValueNormalizer
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from tests.probe_envs import Arms, DelayedReward
 from tests.test_policies import NAMES, POLICIES, equal_weights, make_policy

@@ -1,10 +1,18 @@
-"""Rollouts of teams: each observation stored once, minibatches of whole teams."""
+"""
+Rollouts of teams: each observation stored once, minibatches of whole teams, values computed many steps at a time.
+
+Values are not needed before the end of a rollout, where advantages are computed. For the few rows of a single step, the
+overhead of calling the critic dominates; evaluating many steps together takes a fraction of the time.
+
+Letters: T steps, E games, N agents, B = E N rows, U states of the critic for a team; M, Ma, Mc sizes of the memory of a
+game, of the actor, and of one of the critic's states.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator, ItemsView, Mapping
+from collections.abc import Callable, Generator, ItemsView, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, get_args
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -15,8 +23,8 @@ from stable_baselines3.common.buffers import BaseBuffer, DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.buffers.later import ROWS_AT_ONCE, LaterValues, compute_together
-from sb3_saf.networks.value_normalizer import Rescaling, ValueNormalizer
+from sb3_saf.networks.critic import ValueNormalizer
+from sb3_saf.networks.row_encoder import Encoded
 from sb3_saf.teams.checks import check_choice, check_count, check_whole_teams
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
@@ -29,6 +37,105 @@ from sb3_saf.teams.rows import (
     Array,
     TeamSpaces,
 )
+
+#: Rows whose values are computed at once: enough to amortise the calls, few enough for the cache.
+ROWS_AT_ONCE: Final = 1024
+
+
+@dataclass
+class Step:
+    """
+    Critic's input of one step of all games, and the memory before it.
+
+    :param obs: entries of the rows that critics read (agent indices, active agents)
+    :param encoded: their encoded observations, without the observations themselves
+    :param starts: (B,) bool, rows whose episode begins with the step; None for policies without memory
+    :param actor: (B, Ma) the actor's memory before the step
+    :param critic: (E U, Mc) the critic's memory before the step, if it has one; known when values are computed
+    :param values: (B, 1) values, as soon as they are computed
+    :param n_games: E, for policies with memory
+    """
+
+    obs: dict[str, th.Tensor]
+    encoded: Encoded
+    starts: th.Tensor | None = None
+    actor: th.Tensor | None = None
+    critic: th.Tensor | None = None
+    values: th.Tensor | None = None
+    n_games: int = 0
+
+    @classmethod
+    def of(cls, obs: th.Tensor | Mapping[str, th.Tensor], encoded: Encoded) -> Step:
+        """Return the critic's input of a step; critics read features, so observations are dropped."""
+        entries = {} if isinstance(obs, th.Tensor) else obs
+        own = encoded.own._replace(observations=encoded.own.features.new_empty(0))
+        return cls({key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}, encoded._replace(own=own))
+
+    @property
+    def memory(self) -> th.Tensor | None:
+        """Memory of the games before the step, (E, M): that of all agents, then the critic's."""
+        parts = [part.reshape(self.n_games, -1) for part in (self.actor, self.critic) if part is not None]
+        return th.cat(parts, dim=1) if parts else None
+
+
+#: Maps the critic's inputs of several steps to the values of each, (B, 1).
+Compute: TypeAlias = Callable[[Sequence[Step]], list[th.Tensor]]
+
+
+class LaterValues(th.Tensor):
+    """
+    Lazily computed values of one step, (B, 1).
+
+    Any use as a tensor computes them for this step only; ``TeamRolloutBuffer`` computes those of many steps together.
+    """
+
+    step: Step
+    compute: Compute
+    known: th.Tensor | None
+
+    @classmethod
+    def of(cls, step: Step, like: th.Tensor, compute: Compute) -> LaterValues:
+        """
+        Make values to be computed later.
+
+        :param step: input of the critic
+        :param like: (B, ...) tensor with their device and number of rows
+        :param compute: the critic
+        """
+        later = like.new_empty(len(like), 1).as_subclass(cls)
+        later.step, later.compute, later.known = step, compute, None
+        return later
+
+    @classmethod
+    def __torch_function__(
+        cls, func: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Compute the values and call the function with them."""
+        return func(*map(_known, args), **{name: _known(value) for name, value in (kwargs or {}).items()})
+
+
+def compute_together(steps: Sequence[LaterValues]) -> list[th.Tensor]:
+    """
+    Compute the values of several steps of one policy.
+
+    :return: values (B, 1) of each step
+    """
+    waiting = [step for step in steps if step.known is None]
+    if waiting:
+        for step, values in zip(waiting, waiting[0].compute([step.step for step in waiting]), strict=True):
+            step.known = values
+    return [_known(step) for step in steps]
+
+
+def _known(argument: Any) -> Any:
+    if isinstance(argument, (list, tuple)):
+        return type(argument)(map(_known, argument))
+    if not isinstance(argument, LaterValues):
+        return argument
+    if argument.known is None:
+        (argument.known,) = argument.compute([argument.step])
+    return argument.known
+
 
 #: Arrays with one entry per step and row, without the observations.
 _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
@@ -49,9 +156,9 @@ class RolloutReturns:
 
     returns: npt.NDArray[np.floating]
     agents: npt.NDArray[np.integer]
-    known: Rescaling | None = None
+    known: tuple[th.Tensor, th.Tensor] | None = None
 
-    def rescaling(self, normalizer: ValueNormalizer) -> Rescaling:
+    def rescaling(self, normalizer: ValueNormalizer) -> tuple[th.Tensor, th.Tensor]:
         """Return the conversion of values to the new statistics, which the first call updates with the returns."""
         if self.known is None:
             self.known = normalizer.update(self.returns, self.agents)
@@ -383,21 +490,17 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         super().compute_returns_and_advantage(last_values, dones)
         agents = np.broadcast_to(self._agents, counted.shape)
         self._returns = RolloutReturns(self.returns[counted], agents[counted])
-        if self.normalize_advantage == "agent" and not self._is_reward_shared(counted):
-            for agent in range(self.n_agents):
+        if self.normalize_advantage == "agent":
+            by_team = (self.buffer_size, self.n_games, self.n_agents)
+            rewards, playing = self.rewards.reshape(by_team), counted.reshape(by_team)
+            highest = np.where(playing, rewards, -np.inf).max(axis=2)
+            lowest = np.where(playing, rewards, np.inf).min(axis=2)
+            # Not if the active agents of each team received the same rewards in all steps of the rollout.
+            for agent in range(self.n_agents) if (highest > lowest).any() else ():
                 rows = counted & (agents == agent)
                 advantages = self.advantages[rows].astype(np.float64)
                 if len(advantages):
                     self.advantages[rows] = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-
-    def _is_reward_shared(self, counted: npt.NDArray[np.bool_]) -> bool:
-        """Return whether the active agents of each team received the same rewards in all steps of the rollout."""
-        by_team = (self.buffer_size, self.n_games, self.n_agents)
-        rewards, playing = self.rewards.reshape(by_team), counted.reshape(by_team)
-        highest, lowest = (
-            reduce(np.where(playing, rewards, limit), axis=2) for reduce, limit in ((np.max, -np.inf), (np.min, np.inf))
-        )
-        return bool((highest <= lowest).all())
 
     def _with_values_of_teams(self, values: Array, active: npt.NDArray[np.bool_]) -> Array:
         """Return values (..., B) in which those of inactive agents are the mean over their team's active agents."""
@@ -461,7 +564,16 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             for name in ("actions", "values", "log_probs", "advantages", "returns")
         }
         own = self._gather(self.observations[OBS_KEY], batch_inds)
-        entries = {OBS_KEY: own.flatten(end_dim=1), **self._entries(batch_inds)}
+        # In the shapes of SB3's buffer.
+        entries = {OBS_KEY: own.flatten(end_dim=1), AGENT_KEY: self._agents_of_steps[: len(batch_inds)].reshape(-1, 1)}
+        if ACTION_MASK_KEY in self.observations:
+            entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], batch_inds).flatten(end_dim=1)
+        if self.starts is not None:
+            entries[EPISODE_START_KEY] = self._gather(self.starts, batch_inds).flatten(end_dim=1).long()
+        for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
+            if array is not None:
+                by_game = self.to_torch(self._of_games_at(array, batch_inds), copy=False)
+                entries[key] = by_game.repeat_interleave(self.n_agents, dim=0)
         active = None if self.active is None else self._of_games_at(self.active, batch_inds)
         rows = None
         if active is not None and not active.all():
@@ -490,16 +602,3 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """Gather team steps: (T, B, ...) -> (K, N, ...); with game-major rows, each team step is contiguous."""
         by_team = array.reshape(self.buffer_size * self.n_games, self.n_agents, *array.shape[2:])
         return self.to_torch(by_team.take(team_steps, axis=0), copy=False)
-
-    def _entries(self, team_steps: npt.NDArray[np.int64]) -> dict[str, th.Tensor]:
-        """Return the rows' entries other than own observations, in the shapes of SB3's buffer."""
-        entries = {AGENT_KEY: self._agents_of_steps[: len(team_steps)].reshape(-1, 1)}
-        if ACTION_MASK_KEY in self.observations:
-            entries[ACTION_MASK_KEY] = self._gather(self.observations[ACTION_MASK_KEY], team_steps).flatten(end_dim=1)
-        if self.starts is not None:
-            entries[EPISODE_START_KEY] = self._gather(self.starts, team_steps).flatten(end_dim=1).long()
-        for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
-            if array is not None:
-                by_game = self.to_torch(self._of_games_at(array, team_steps), copy=False)
-                entries[key] = by_game.repeat_interleave(self.n_agents, dim=0)
-        return entries

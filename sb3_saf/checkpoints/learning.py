@@ -1,4 +1,4 @@
-"""Resuming from a checkpoint."""
+"""The folder of checkpoints, the callback that writes them, and resuming from them."""
 
 from __future__ import annotations
 
@@ -6,34 +6,324 @@ import os
 import re
 import signal
 import threading
+import uuid
 import warnings
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, NoReturn
+from typing import Any, BinaryIO, Final, NamedTuple, NoReturn
 
+import filelock
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_saf.callbacks.finite import FiniteCallback
-from sb3_saf.callbacks.game_steps import GameStepsCallback
-from sb3_saf.checkpoints.callback import Run, TeamCheckpointCallback, enter_run
-from sb3_saf.checkpoints.models import (
+from sb3_saf.callbacks import FiniteCallback, GameStepsCallback, show_game_steps, team_steps
+from sb3_saf.checkpoints.states import (
+    all_callbacks,
+    callback_states,
     continue_logs,
+    description,
+    environment_state,
+    generator_states,
     is_off_policy,
+    load_callback_states,
+    load_environment_state,
     load_generator_states,
     load_model_state,
+    logger_state,
+    model_state,
     require_resumable,
     settings_restored_on_error,
+    software,
 )
-from sb3_saf.checkpoints.runs import check_description, description, software, warn_of_differences
-from sb3_saf.checkpoints.states import all_callbacks, load_callback_states, load_environment_state
-from sb3_saf.checkpoints.store import CheckpointFolder
 from sb3_saf.envs.game_copies import ForeignGamesError, check_signatures, pickled_games, sign_games
-from sb3_saf.teams.errors import CheckpointError, NonFiniteError
+from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError, NonFiniteError, check_count
+from sb3_saf.teams.files import (
+    Tree,
+    atomic_file,
+    differences,
+    encode,
+    read_tree,
+    remove_leftovers,
+    try_lock,
+    write_tree,
+)
+from sb3_saf.teams.vec_env import require_n_agents
+
+_NAME: Final = re.compile(r"checkpoint-(\d{12,})\.ckpt")
+
+
+class Loaded(NamedTuple):
+    """A checkpoint that was read."""
+
+    path: Path
+    tree: Tree
+
+
+class CheckpointFolder:
+    """
+    Checkpoints of one run, named by their game steps.
+
+    :param path: the folder, created at the first write
+    :param keep: number of newest checkpoints to keep
+    """
+
+    def __init__(self, path: str | os.PathLike[str], keep: int = 3) -> None:
+        self.path = Path(path)
+        self.keep = keep
+        self._lock: filelock.BaseFileLock | None = None
+
+    def checkpoints(self) -> list[Path]:
+        """Return the files of all checkpoints, newest first."""
+        if not self.path.is_dir():
+            return []
+        files = [(int(match[1]), path) for path in self.path.iterdir() if (match := _NAME.fullmatch(path.name))]
+        return [path for _, path in sorted(files, reverse=True) if path.is_file()]
+
+    def write(self, content: Callable[[BinaryIO], object], game_steps: int) -> Path:
+        """
+        Add a checkpoint, then remove all but the newest ``keep``.
+
+        A run killed here leaves the previous checkpoints and perhaps a temporary file, which the next write removes.
+
+        :param game_steps: game steps, for the file's name
+        :raises CheckpointError: if it cannot be written, for instance because the disk is full
+        """
+        target = self.path / f"checkpoint-{game_steps:012d}.ckpt"
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            remove_leftovers(self.path)
+            with atomic_file(target) as file:
+                content(file)
+        except OSError as error:
+            older = self.checkpoints()
+            last = f"the last good one is {older[0]}" if older else "there is no earlier one"
+            raise CheckpointError(
+                f"cannot write the checkpoint {target}: {error}; {last}. Make room or choose another "
+                "folder, then resume"
+            ) from error
+        # Newer ones are damaged, otherwise this run would have resumed from them.
+        older = [path for path in self.checkpoints() if path.name <= target.name]
+        for path in older[self.keep :]:
+            path.unlink(missing_ok=True)
+        return target
+
+    def newest(self) -> Loaded | None:
+        """
+        Read the newest undamaged checkpoint, with a warning for each newer one.
+
+        :return: None if there is no checkpoint
+        :raises CheckpointError: if all are damaged, or the newest undamaged one has another format
+        """
+        paths = self.checkpoints()
+        for path, older in zip_longest(paths, paths[1:]):
+            try:
+                with path.open("rb") as file:
+                    return Loaded(path, read_tree(file))
+            except (DamagedCheckpointError, OSError) as error:
+                if older is None:
+                    raise DamagedCheckpointError(
+                        f"no checkpoint in {self.path} can be read; the last one tried, {path}: {error}"
+                    ) from error
+                warnings.warn(
+                    f"the checkpoint {path} cannot be read: {error}. Going back to {older}", UserWarning, stacklevel=2
+                )
+            except CheckpointError as error:
+                raise CheckpointError(f"cannot use the checkpoint {path}: {error}") from None
+        return None
+
+    def acquire(self) -> None:
+        """
+        Lock the folder until :meth:`release` or the end of this process.
+
+        :raises CheckpointError: if the folder cannot be created, or another run uses it
+        """
+        if self._lock is not None:
+            return
+        try:
+            self._lock = try_lock(self.path / "lock")
+        except OSError as error:
+            raise CheckpointError(
+                f"cannot keep checkpoints in {self.path}: {error}; give the run a folder that it may write to"
+            ) from error
+        if self._lock is None:
+            raise CheckpointError(
+                f"another run writes checkpoints to {self.path}; wait for its end, or give this run a folder of its own"
+            )
+
+    def release(self) -> None:
+        """Unlock the folder."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+
+class Run(NamedTuple):
+    """
+    Run of a model.
+
+    :param name: stored in every checkpoint, so that no other run continues in the folder
+    :param description: of model, games and callbacks at the first start
+    """
+
+    name: str
+    description: dict[str, Tree]
+
+
+_RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary()
+
+
+def enter_run(model: BaseAlgorithm, run: Run) -> None:
+    """Set the run that a model continues."""
+    _RUNS[model] = run
+
+
+class TeamCheckpointCallback(BaseCallback):
+    """
+    Write checkpoints from which :func:`sb3_saf.resume` continues exactly.
+
+    The state is copied at the start of a rollout, after the previous update and with an empty buffer, and kept in
+    memory, from where :meth:`write_last` writes it to disk. A checkpoint is also written at the end of training.
+
+    A rollout of QPLEX is one step of all games, and the replay buffer is too large to copy at every step. Its state is
+    therefore written directly to disk; use :meth:`stop_soon` to stop such a run.
+
+    Pass it before other callbacks, because what these do at the start of a rollout is repeated on resuming.
+
+    :param folder: folder for the checkpoints of this run only
+    :param every_game_steps: **game steps**, summed over all parallel games, between checkpoints, which are written at
+        the next start of a rollout
+    :param keep: number of newest checkpoints to keep
+    :param others: all other callbacks of the run, whose state is included
+    :param exact: None resumes exactly if the environment provides its state, and otherwise warns at the start: a
+        resumed run then begins new episodes, and its weights differ from those of an uninterrupted run. True raises
+        CheckpointError for such environments, False never stores their state
+    :param verbose: 1 to print the files' names
+    :raises ValueError: if a number is not at least 1
+    """
+
+    model: BaseAlgorithm
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        every_game_steps: int = 100_000,
+        keep: int = 3,
+        others: BaseCallback | Sequence[BaseCallback] | None = None,
+        exact: bool | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        self.every_game_steps = check_count("every_game_steps", every_game_steps)
+        self.store = CheckpointFolder(folder, check_count("keep", keep))
+        self.others = list(all_callbacks(others))
+        self.exact = exact
+        self._run = Run("", {})
+        self._between_rollouts = False
+        self._last: tuple[int, bytes] | None = None
+        self._written: int | None = None
+        self._stop: Callable[[], NoReturn] | None = None
+
+    def _init_callback(self) -> None:
+        require_resumable(self.model)
+        require_n_agents(self.training_env)
+        show_game_steps(self.model)
+        self.store.acquire()
+        if self.model not in _RUNS:
+            enter_run(self.model, Run(uuid.uuid4().hex, description(self.model, self.others)))
+        self._run = _RUNS[self.model]
+        newest = self.store.newest()
+        if newest is not None and newest.tree["run"] != self._run.name:
+            self.store.release()
+            raise CheckpointError(
+                f"{self.store.path} has checkpoints of another run ({newest.path.name}): go on with it by "
+                "sb3_saf.resume(folder, model, callbacks), or give this run a folder of its own"
+            )
+        self._written = None if newest is None else newest.tree["game_steps"]
+        if self.exact is not None:
+            return
+        self.exact = True
+        try:
+            environment_state(self.training_env)
+            callback_states(self.others)
+        except CheckpointError as error:
+            self.exact = False
+            message = (
+                f"{str(error).partition(';')[0]}. If this run is interrupted, it goes on with the weights, optimiser "
+                "and counters of its last checkpoint and begins new episodes"
+            )
+            warnings.warn(message, UserWarning, stacklevel=2)
+            self.logger.log(message)
+
+    def _on_rollout_start(self) -> None:
+        self._between_rollouts = True  # until the first step
+        is_due = self._written is None or team_steps(self.model) - self._written >= self.every_game_steps
+        if is_due or self._stop is not None or not is_off_policy(self.model):
+            self._take()
+        if is_due:
+            self.write_last()
+        if self._stop is not None:
+            self._stop()
+
+    def _on_step(self) -> bool:
+        self._between_rollouts = False
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._between_rollouts = True  # at the end of training the last update is done
+
+    def _on_training_end(self) -> None:
+        if self._between_rollouts:
+            self._take()
+        self.write_last()
+        self.store.release()
+
+    def stop_soon(self, stop: Callable[[], NoReturn]) -> None:
+        """
+        End training before the next rollout, with its state available to :meth:`write_last`.
+
+        :param stop: raises the exception that ends training
+        """
+        self._stop = stop
+
+    def _take(self) -> None:
+        """Copy the present state; with a replay buffer, to disk."""
+        steps = team_steps(self.model)
+        if not is_off_policy(self.model):
+            self._last = (steps, encode(self._state()))
+        elif steps != self._written:
+            self._write(lambda file: write_tree(file, self._state()), steps)
+
+    def _state(self) -> dict[str, Tree]:
+        return {
+            "run": self._run.name,
+            "game_steps": team_steps(self.model),
+            "software": software(self.model),
+            "description": self._run.description,
+            "model": model_state(self.model),
+            "environment": environment_state(self.training_env) if self.exact else None,
+            "callbacks": callback_states(self.others) if self.exact else None,
+            "generators": generator_states(self.model),
+            "logger": logger_state(self.model.logger),
+        }
+
+    def write_last(self) -> None:
+        """Write the last state between rollouts, unless already written; raise CheckpointError if that fails."""
+        if self._last is not None and self._last[0] != self._written:
+            steps, data = self._last
+            self._write(lambda file: file.write(data), steps)
+
+    def _write(self, content: Callable[[BinaryIO], object], steps: int) -> None:
+        path = self.store.write(content, steps)
+        self._written = steps
+        if self.verbose >= 1:
+            print(f"Checkpoint {path}")
+
 
 #: Torch's error message for action distributions with NaN parameters.
 _OF_TORCH: Final = re.compile(r"Expected parameter \w+ .*invalid values", re.DOTALL)
@@ -73,7 +363,11 @@ def resume(
         raise CheckpointError(f"expected checkpoints of sb3_saf.TeamCheckpointCallback in {folder}, found none")
     others = [one for one in all_callbacks(callback) if not isinstance(one, TeamCheckpointCallback)]
     tree = loaded.tree
-    check_description(tree["description"], description(model, others))
+    if different := differences(tree["description"], description(model, others)):
+        raise CheckpointError(
+            f"the checkpoint is of another run: {different}; make model, games and callbacks as for the first start, "
+            "or give this run a folder of its own"
+        )
     if exact and tree["environment"] is None:
         raise CheckpointError(f"expected the state of the games with exact=True, got {loaded.path} without it")
     games = [tree["environment"], tree["callbacks"]]
@@ -86,7 +380,13 @@ def resume(
             raise
         warnings.warn(f"{error}. New episodes begin; everything else continues", UserWarning, stacklevel=2)
         tree = {**tree, "environment": None, "callbacks": None}
-    warn_of_differences(tree["software"], software(model))
+    if different := differences(tree["software"], software(model)):
+        warnings.warn(
+            f"the checkpoint was made under other conditions ({different}): the run goes on, but its weights may "
+            "differ from those of the undisturbed run",
+            UserWarning,
+            stacklevel=2,
+        )
     try:
         load_model_state(model, tree["model"])
         if tree["environment"] is not None:

@@ -1,11 +1,29 @@
-"""State of the parts around a model: layers of vector environments, and callbacks."""
+"""
+State of a run between two rollouts (model, logger, random generators, layers of vector environments, callbacks), and
+the description of the run, which is compared by name before a checkpoint is used.
+
+Model, layers and callbacks are described by the arguments of their constructors that they keep under the same name;
+games by :meth:`sb3_saf.teams.vec_env.TeamVecEnv.settings`. Versions and hardware, which affect only the last bits of a
+run, may differ. SB3 has no public interface to set most of a model's state: its ``load`` sets the attributes from an
+unpickled file, and ``save`` omits some. Only this module reads and sets them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import os
+import platform
+import random
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from inspect import signature
 from typing import Any, Final, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
+import stable_baselines3
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -16,15 +34,22 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
-from sb3_saf.callbacks.evaluation import TeamEvalCallback
+from sb3_saf.buffers.replay import TeamReplayBuffer
+from sb3_saf.callbacks import TeamEvalCallback, game_steps
+from sb3_saf.envs.curriculum import Curriculum
 from sb3_saf.envs.monitor import SharedReward
-from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.policies.memory import RememberingPolicy
+from sb3_saf.qplex.qplex import QPLEX
+from sb3_saf.teams import package_version
+from sb3_saf.teams.checks import CheckpointError
+from sb3_saf.teams.files import Tree
 from sb3_saf.teams.rows import OBS_KEY
-from sb3_saf.teams.trees import Tree
-from sb3_saf.teams.vec_env import layers
+from sb3_saf.teams.vec_env import TeamVecEnv, game_seeds_of, layers
 
 #: Wrappers that remember nothing from step to step.
 _WITHOUT_STATE: Final = (VecTransposeImage, SharedReward)
@@ -172,3 +197,261 @@ def load_callback_states(callbacks: Iterable[BaseCallback], states: list[Tree]) 
 
 def _counters(callback: BaseCallback) -> list[str]:
     return [name for kind, names in _COUNTERS.items() if isinstance(callback, kind) for name in names]
+
+
+#: Arguments that do not change what is learned, or are described otherwise.
+_NOT_COMPARED: Final = frozenset(
+    {"self", "env", "venv", "eval_env", "policy", "verbose", "render", "render_mode", "warn", "device"}
+    | {"tensorboard_log", "stats_window_size", "num_envs", "observation_space", "action_space", "n_cpus"}
+)
+#: Ends of the names of arguments that are places, which may be moved.
+_PLACES: Final = ("path", "dir", "folder", "file", "filename")
+#: Arguments of models that are functions of the remaining part of training, and their attributes.
+_SCHEDULES: Final = {"learning_rate": "lr_schedule", "clip_range": "clip_range", "clip_range_vf": "clip_range_vf"}
+#: Points of training at which they are compared.
+_N_POINTS: Final = 21
+
+
+# --- description of a run ---------------------------------------------------------------------------------------------
+
+
+def description(model: BaseAlgorithm, callbacks: Iterable[BaseCallback]) -> dict[str, Tree]:
+    """
+    Describe how a model, its games and callbacks were made, as plain data with dotted names.
+
+    :param callbacks: callbacks of the run, without those that only show
+    """
+    env = model.get_env()
+    assert env is not None
+    of_model = {
+        "algorithm": type(model).__name__,
+        "policy": type(model.policy).__name__,
+        "n_envs": model.n_envs,
+        "observation_space": str(model.observation_space),
+        "action_space": str(model.action_space),
+        **_arguments(model),
+        "parameters": {name: [str(p.dtype), *p.shape] for name, p in model.policy.state_dict().items()},
+    }
+    for argument, attribute in _SCHEDULES.items():
+        if callable(schedule := getattr(model, attribute, None)):
+            of_model[argument] = [float(schedule(i / (_N_POINTS - 1))) for i in range(_N_POINTS)]
+    callbacks = list(callbacks)
+    return {
+        "model": of_model,
+        "environment": _layers(env),
+        "callbacks": {
+            "order": [type(one).__name__ for one in callbacks],
+            **_by_class(
+                callbacks,
+                lambda one: (
+                    _arguments(one) | ({"environment": _layers(one.eval_env)} if isinstance(one, EvalCallback) else {})
+                ),
+            ),
+        },
+    }
+
+
+def _of_layer(layer: VecEnv) -> dict[str, Tree]:
+    if isinstance(layer, Curriculum):
+        stages = {f"stage {number}": _layers(stage) for number, stage in enumerate(layer.stages)}
+        return {"ends": list(layer.ends), **stages}
+    games = layer.settings() if isinstance(layer, TeamVecEnv) else {}
+    return {"num_envs": layer.num_envs, **_arguments(layer), **games}
+
+
+def _layers(venv: VecEnv) -> dict[str, Tree]:
+    seeds = game_seeds_of(venv)
+    numbers = None if seeds is None else [None if seed is None else int(seed) for seed in seeds]
+    return {"seeds of the games": numbers, **_by_class(layers(venv), _of_layer)}
+
+
+def _by_class(parts: Iterable[Any], describe: Callable[[Any], dict[str, Tree]]) -> dict[str, Tree]:
+    """Describe parts under the names of their classes, numbered from the second one of a class on."""
+    result: dict[str, Tree] = {}
+    for part in parts:
+        name = type(part).__name__
+        number = sum(other.partition(" ")[0] == name for other in result) + 1
+        result[name if number == 1 else f"{name} {number}"] = describe(part)
+    return result
+
+
+def _arguments(part: object) -> dict[str, Tree]:
+    """Return the arguments of a part's constructors that are attributes of the same name, perhaps private ones."""
+    result = {}
+    for kind in reversed(type(part).__mro__):
+        for name in constructor_arguments(kind):
+            if name in _NOT_COMPARED or name.startswith("_") or name.rpartition("_")[2] in _PLACES:
+                continue
+            for attribute in (name, f"_{name}"):
+                if attribute in vars(part):
+                    result[name] = _plain(vars(part)[attribute])
+                    break
+    return result
+
+
+def constructor_arguments(kind: type) -> list[str]:
+    """Return the names of the arguments of a class's own constructor; empty if it inherits one."""
+    return [*signature(vars(kind)["__init__"]).parameters] if "__init__" in vars(kind) else []
+
+
+def _plain(value: object) -> Tree:
+    """Convert a value to plain data; classes and functions to their names."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, partial):
+        return {"function": _plain(value.func), "args": _plain(value.args), "keywords": _plain(value.keywords)}
+    return str(getattr(value, "__qualname__", type(value).__qualname__))
+
+
+def software(model: BaseAlgorithm) -> dict[str, str]:
+    """Return versions, device and the number of threads."""
+    return {
+        "sb3_saf": package_version(),
+        "stable_baselines3": stable_baselines3.__version__,
+        "torch": th.__version__,
+        "numpy": np.__version__,
+        "processor": platform.machine(),
+        "device": model.device.type,
+        "torch threads": str(th.get_num_threads()),
+    }
+
+
+_MODEL_COUNTERS: Final = (
+    *("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"),
+    *("_current_progress_remaining", "exploration_rate"),
+)
+_LAST: Final = ("_last_obs", "_last_original_obs", "_last_episode_starts")
+_INFO_BUFFERS: Final = ("ep_info_buffer", "ep_success_buffer")
+
+
+def require_resumable(model: BaseAlgorithm) -> None:
+    """Raise CheckpointError for algorithms whose complete state is not accessible, naming the supported ones."""
+    if not isinstance(model, (OnPolicyAlgorithm, QPLEX)):
+        raise CheckpointError(
+            "exact resume is for PPO, A2C, TRPO, MaskablePPO and QPLEX, got "
+            f"{type(model).__name__}; train it with model.learn and SB3's CheckpointCallback, which begins new episodes"
+        )
+
+
+def is_off_policy(model: BaseAlgorithm) -> bool:
+    """Return whether the algorithm is off-policy: its state has a replay buffer, too large to copy at every rollout."""
+    return isinstance(model, QPLEX)
+
+
+def model_state(model: BaseAlgorithm) -> dict[str, Tree]:
+    """Return weights, optimiser, counters, last observations, memories, averages and replay at a rollout's start."""
+    replay = getattr(model, "replay_buffer", None)
+    return {
+        "weights": dict(model.policy.state_dict()),
+        "optimizer": model.policy.optimizer.state_dict(),
+        "counters": {name: getattr(model, name) for name in _MODEL_COUNTERS if hasattr(model, name)},
+        "last": {name: getattr(model, name) for name in _LAST},
+        "memory": model.policy.checkpoint_state() if isinstance(model.policy, RememberingPolicy) else None,
+        "agent_state": getattr(model, "agent_state", None),
+        "replay": None if replay is None else replay.checkpoint_state(),
+        **{name: [dict(i) if isinstance(i, dict) else i for i in getattr(model, name) or ()] for name in _INFO_BUFFERS},
+        "info_buffer_size": None if model.ep_info_buffer is None else model.ep_info_buffer.maxlen,
+    }
+
+
+def load_model_state(model: BaseAlgorithm, state: Tree) -> None:
+    """Restore a state of :func:`model_state` of a model with the same description."""
+    model.policy.load_state_dict(state["weights"])
+    model.policy.optimizer.load_state_dict(state["optimizer"])
+    for name in _MODEL_COUNTERS:
+        if hasattr(model, name):
+            setattr(model, name, state["counters"][name])
+    for name in _LAST:
+        setattr(model, name, state["last"][name])
+    for name in _INFO_BUFFERS:
+        setattr(model, name, deque(state[name], maxlen=state["info_buffer_size"]))
+    if isinstance(model, QPLEX):
+        assert isinstance(model.replay_buffer, TeamReplayBuffer)
+        model.replay_buffer.load_checkpoint_state(state["replay"])
+        model.agent_state = state["agent_state"]
+    if isinstance(model.policy, RememberingPolicy):
+        model.policy.load_checkpoint_state(state["memory"])
+
+
+@contextmanager
+def settings_restored_on_error(model: BaseAlgorithm) -> Iterator[None]:
+    """
+    Restore the model's settings if training ends by an exception, such as Ctrl-C within an update.
+
+    Callbacks may change settings for a while, as :class:`~sb3_saf.EntropySchedule` does, and are not called then.
+    """
+    names = {name for kind in type(model).__mro__ for name in constructor_arguments(kind)} - {"policy", "env"}
+    before = {name: value for name, value in vars(model).items() if name in names}
+    try:
+        yield
+    except BaseException:
+        vars(model).update(before)
+        raise
+
+
+def generator_states(model: BaseAlgorithm) -> dict[str, Tree]:
+    """Return the states of Python's, NumPy's and torch's global generators and of the action space's generator."""
+    version, words, gauss = random.getstate()
+    return {
+        "python": [version, np.array(words, dtype=np.uint32), gauss],
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - SB3 draws from it
+        "torch": th.get_rng_state(),
+        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+        "action_space": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def load_generator_states(states: Tree, model: BaseAlgorithm) -> None:
+    """Restore the states of all generators; those of GPUs if there are as many as before."""
+    version, words, gauss = states["python"]
+    random.setstate((version, tuple(words.tolist()), gauss))
+    np.random.set_state(states["numpy"])  # noqa: NPY002
+    th.set_rng_state(states["torch"])
+    if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
+        th.cuda.set_rng_state_all(states["cuda"])
+    model.action_space.np_random.bit_generator.state = states["action_space"]
+
+
+def logger_state(logger: Logger) -> Tree:
+    """Return the name of the log folder, and the recorded values not yet written."""
+    numbers = {
+        name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))
+    }
+    has_tensorboard = any(isinstance(output, TensorBoardOutputFormat) for output in logger.output_formats)
+    return {
+        # Relative to the model's log folder, which may have been moved on resuming.
+        "tensorboard": os.path.basename(logger.get_dir() or "") if has_tensorboard else None,
+        "numbers": [
+            [name, value, list(logger.name_to_excluded[name] or ()), logger.name_to_count[name]]
+            for name, value in numbers.items()
+        ],
+    }
+
+
+def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
+    """Set a logger that continues in the same folder; a logger set by the caller is kept."""
+    if not hasattr(model, "logger"):
+        formats = ["stdout"] if model.verbose >= 1 else [""]
+        if state["tensorboard"] is None or model.tensorboard_log is None:
+            model.set_logger(configure(None, formats))
+        else:
+            from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+            folder = os.path.join(model.tensorboard_log, os.path.basename(state["tensorboard"]))
+            logger, board = configure(folder, formats), TensorBoardOutputFormat(folder)
+            logger.output_formats.append(board)
+            # TensorBoard hides entries written after the checkpoint, which are written again.
+            file_writer: Any = board.writer.file_writer
+            start = SessionLog(status=SessionLog.START)
+            file_writer.add_event(Event(step=(game_steps(model) or 0) + 1, session_log=start))
+            model.set_logger(logger)
+    for name, value, excluded, count in state["numbers"]:
+        model.logger.name_to_value[name] = value
+        model.logger.name_to_excluded[name] = tuple(excluded)
+        model.logger.name_to_count[name] = count

@@ -7,7 +7,7 @@ import os
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from math import isfinite, isnan
 from typing import Any, Final
@@ -18,7 +18,7 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_saf.envs.gymnasium_team import ALL, INFO_MASKS, as_parallel
-from sb3_saf.teams.conversion import checked_mask, leaves_of, read_leaves
+from sb3_saf.teams.conversion import checked_mask, innermost, leaves_of, read_leaves
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, n_mask_entries
 
@@ -80,7 +80,7 @@ class Trial:
         self.actions = {agent: deepcopy(space_of(env, "action", agent)) for agent in self.agents}
         #: By agent: key of the masks in its observations, None if they have none.
         self.mask_keys = {agent: self._mask_key(agent) for agent in self.agents}
-        self._leaves = {agent: list(leaves_of(space)) for agent, space in self.observed.items()}
+        self._leaves = {agent: leaves_of(space) for agent, space in self.observed.items()}
         for space in self.actions.values():
             space.seed(0)
 
@@ -271,9 +271,14 @@ def settings_of(env: Any, depth: int = 3) -> dict[str, Any]:
     while todo:
         name, value, level = todo.pop()
         for key, inner in sorted(vars(value).items()) if len(result) < _MOST_SETTINGS else ():
+            package = str(getattr(type(inner), "__module__", "builtins")).partition(".")[
+                0
+            ]  # some compiled types lack it
             if _is_plain(inner):
                 result[f"{name}.{key}"] = inner
-            elif level < depth - 1 and id(inner) not in visited and _may_hold_settings(inner):
+                continue
+            may_hold_settings = package not in _NO_SETTINGS and hasattr(inner, "__dict__") and not callable(inner)
+            if level < depth - 1 and id(inner) not in visited and may_hold_settings:
                 visited.add(id(inner))
                 todo.append((f"{name}.{key}", inner, level + 1))
     return result
@@ -288,11 +293,6 @@ def _is_plain(value: Any) -> bool:
     if type(value) is float:
         return not isnan(value)
     return value is None or type(value) in (bool, int) or (type(value) is str and os.sep not in value)
-
-
-def _may_hold_settings(value: Any) -> bool:
-    package = str(getattr(type(value), "__module__", "builtins")).partition(".")[0]  # some compiled types have none
-    return package not in _NO_SETTINGS and hasattr(value, "__dict__") and not callable(value)
 
 
 def has_game_attribute(env: Any, name: str) -> bool:
@@ -366,7 +366,7 @@ def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
             f"write it as: def {kind}_space(self, agent): return self.{kind}_spaces[agent]"
         )
     space = method(agent)
-    parts = list(innermost(space)) if kind == "observation" else [space]
+    parts = [part for _, part in innermost(space)] if kind == "observation" else [space]
     if not all(isinstance(part, FIXED_SHAPE) for part in parts):
         names = ", ".join(part.__name__ for part in FIXED_SHAPE)
         containers = ", or a Dict or Tuple of those" if kind == "observation" else ""
@@ -377,15 +377,6 @@ def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
             f"{'anything to see' if kind == 'observation' else 'a choice'} one constant entry"
         )
     return space
-
-
-def innermost(space: spaces.Space[Any]) -> Iterator[spaces.Space[Any]]:
-    """Yield the innermost spaces of nested Dicts and Tuples."""
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        for part in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
-            yield from innermost(part)
-    else:
-        yield space
 
 
 def present_agents(env: Any, possible_agents: Sequence[Any], place: str) -> set[Any]:

@@ -7,9 +7,8 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
@@ -69,7 +68,11 @@ class Curriculum(TeamVecEnvWrapper):
 
         :return: (B,) the seed of each row's game in the present stage
         """
-        chosen = [stage.seed(_seed_of_stage(seed, number)) for number, stage in enumerate(self.stages)]
+        seeds = [seed] * len(self.stages)
+        for number in range(1, len(seeds)):  # stages differ, so that they do not repeat each other's levels
+            if seed is not None:
+                seeds[number] = int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0])
+        chosen = [stage.seed(own) for stage, own in zip(self.stages, seeds, strict=True)]
         return chosen[self.stage]
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -78,9 +81,17 @@ class Curriculum(TeamVecEnvWrapper):
         self.game_steps += self.n_games
         if self._present_stage() == self.stage:
             return obs, rewards, dones, infos
-        infos = _truncated(obs, dones, infos)
+        shown = []
+        for row, (done, info) in enumerate(zip(dones, infos, strict=True)):
+            if not done:  # a running episode is truncated
+                last = (
+                    {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
+                )
+                is_cut = bool(info.get("active", True))
+                info = {**info, "terminal_observation": last, "TimeLimit.truncated": is_cut}
+            shown.append(info)
         self._enter(self._present_stage())
-        return self.venv.reset(), rewards, np.ones_like(dones), infos
+        return self.venv.reset(), rewards, np.ones_like(dones), shown
 
     def _present_stage(self) -> int:
         return int(np.searchsorted(self.ends, self.game_steps, side="right"))
@@ -102,23 +113,3 @@ class Curriculum(TeamVecEnvWrapper):
         """Close the games of all stages."""
         for stage in self.stages:
             stage.close()
-
-
-def _seed_of_stage(seed: int | None, number: int) -> int | None:
-    """Return the seed of a stage; stages differ, so that they do not repeat each other's levels."""
-    if seed is None or number == 0:
-        return seed
-    return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0])
-
-
-def _truncated(obs: VecEnvObs, dones: npt.NDArray[np.bool_], infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return infos in which every episode ends; running episodes are truncated."""
-    ended = []
-    for row, (done, info) in enumerate(zip(dones, infos, strict=True)):
-        if done:
-            ended.append(info)
-            continue
-        last = {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
-        takes_part = info.get("active", True)
-        ended.append({**info, "terminal_observation": last, "TimeLimit.truncated": bool(takes_part)})
-    return ended

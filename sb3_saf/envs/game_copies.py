@@ -16,23 +16,25 @@ import random
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from copy import deepcopy
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 import cloudpickle
 import numpy as np
 import numpy.typing as npt
+import torch as th
 from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from sb3_saf.envs.audit import layers_of, legal_sample, settings_of
-from sb3_saf.teams.errors import CheckpointError
+from sb3_saf.teams.checks import CheckpointError
+from sb3_saf.teams.files import decode, encode
+from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY
-from sb3_saf.teams.trees import decode, encode
 
 if TYPE_CHECKING:
     from sb3_saf.envs.supersuit_games import TeamMarkovVectorEnv
@@ -55,11 +57,8 @@ class ForeignGamesError(CheckpointError):
 # --- pickled games ----------------------------------------------------------------------------------------------------
 
 
-class _Place(NamedTuple):
-    """An attribute of a game, or of a wrapper around it."""
-
-    layer: int
-    name: str
+#: An attribute of a game, or of a wrapper around it: number of the layer, name.
+_Place: TypeAlias = tuple[int, str]
 
 
 class _Pickler(cloudpickle.Pickler):
@@ -73,9 +72,8 @@ class _Pickler(cloudpickle.Pickler):
         super().__init__(file)
         self._left_out = left_out
 
-    def persistent_id(self, obj: Any) -> tuple[int, str] | None:
-        place = self._left_out.get(id(obj))
-        return None if place is None else (place.layer, place.name)
+    def persistent_id(self, obj: Any) -> _Place | None:
+        return self._left_out.get(id(obj))
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
@@ -134,9 +132,9 @@ def _unpicklable(game: Any) -> dict[int, _Place]:
     for number, layer in enumerate(layers):
         for name, value in getattr(layer, "__dict__", {}).items():
             try:
-                _dump(value, dict.fromkeys(own, _Place(number, name)))
+                _dump(value, dict.fromkeys(own, (number, name)))
             except Exception:
-                found[id(value)] = _Place(number, name)
+                found[id(value)] = (number, name)
     return found
 
 
@@ -147,15 +145,6 @@ def _global_generators() -> tuple[Any, Any]:
 def _set_global_generators(states: tuple[Any, Any]) -> None:
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
-
-
-@contextmanager
-def _kept_generators() -> Iterator[None]:
-    before = _global_generators()
-    try:
-        yield
-    finally:
-        _set_global_generators(before)
 
 
 # --- signatures -------------------------------------------------------------------------------------------------------
@@ -224,7 +213,7 @@ def sign_games(tree: Any) -> None:
 
 def common_settings(make_game: Callable[[], Any]) -> dict[str, Any]:
     """Return the settings of new games, see :func:`settings_of`, without those that differ from game to game."""
-    with _kept_generators():
+    with own_randomness(0, th.device("cpu")):
         games = [make_game(), make_game()]
     one, other = map(settings_of, games)
     for game in games:
@@ -245,7 +234,7 @@ def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
     :raises CheckpointError: if there is no such way, with the difference found
     """
     reasons = []
-    with _kept_generators():
+    with own_randomness(0, th.device("cpu")):
         for way in get_args(Way):
             reason = _trial(make_game, way)
             if reason is None:
@@ -266,7 +255,7 @@ def _trial(make_game: Callable[[], TeamMarkovVectorEnv], way: Way) -> str | None
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
     if reason is not None and way == "pickle":
-        left_out = [place.name for place in _unpicklable(original.par_env).values()]
+        left_out = [name for _, name in _unpicklable(original.par_env).values()]
         reason += f" (it has to do without {', '.join(left_out)}, which cannot be pickled)" if left_out else ""
     for game in (original, copy):
         with suppress(Exception):

@@ -13,10 +13,10 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_saf.envs.audit import Trial, innermost, mask_error, observation_of, reset, step_results, without_mask
+from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
 from sb3_saf.envs.gymnasium_team import INFO_MASKS
 from sb3_saf.networks.encoders import Part, PartsSpace
-from sb3_saf.teams.conversion import AgentConversion, Leaf
+from sb3_saf.teams.conversion import AgentConversion, Leaf, innermost
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -73,7 +73,18 @@ class GameReader:
         self.watches_masks = action_masks == "auto" and not has_masks
         self._state: tuple[Leaf, spaces.Space[Any]] | None = None
         if state:
-            space = _state_space(trial.env)
+            env, space = trial.env, None
+            layer: Any
+            for layer in (getattr(env, "unwrapped", None), env):
+                with suppress(AttributeError, NotImplementedError):
+                    found = layer.state_space
+                    space = found if isinstance(found, FIXED_SHAPE) else space
+            if space is None:
+                raise ValueError(
+                    f"state=True needs an environment with state() and a state_space of Box, Discrete, MultiDiscrete "
+                    f"or MultiBinary, got {env} with {getattr(env, 'state_space', 'no state_space')}; leave state out, "
+                    "or give the environment both"
+                )
             self._state = Leaf.of(space), own_space([space], float64)
         #: The form of the rows.
         self.rows = TeamSpaces(
@@ -276,7 +287,7 @@ def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
     """Return the space of the vector of a Dict or a Tuple; pictures in it stay known to encoders."""
     flat = spaces.flatten_space(space)
     assert isinstance(flat, spaces.Box)
-    leaves = list(innermost(space))
+    leaves = [leaf for _, leaf in innermost(space)]
     pictures = [leaf.shape if isinstance(leaf, spaces.Box) and is_image_space(leaf) else None for leaf in leaves]
     if any(pictures):
         ends = list(accumulate(map(spaces.flatdim, leaves)))
@@ -329,17 +340,3 @@ def _padded(array: Any, shape: tuple[int, ...], dtype: Any, fill: float = 0) -> 
     result = np.full(shape, fill, dtype=dtype)
     result[tuple(slice(size) for size in np.shape(array))] = array
     return result
-
-
-def _state_space(env: Any) -> spaces.Space[Any]:
-    for layer in (env, getattr(env, "unwrapped", None)):
-        space = None
-        with suppress(AttributeError, NotImplementedError):
-            space = layer.state_space  # type: ignore[union-attr]
-        if isinstance(space, FIXED_SHAPE):
-            return space
-    raise ValueError(
-        f"state=True needs an environment with state() and a state_space of Box, Discrete, MultiDiscrete or "
-        f"MultiBinary, got {env} with {getattr(env, 'state_space', 'no state_space')}; leave state out, or "
-        "give the environment both"
-    )

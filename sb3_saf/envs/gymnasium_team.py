@@ -40,14 +40,23 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         is_ended: Callable[[gym.Env[Any, Any]], bool] | None = None,
         is_success: Callable[[gym.Env[Any, Any]], bool] | None = None,
     ) -> None:
-        check_is_team(env)
+        observations, actions = env.observation_space, env.action_space
+        if (
+            not isinstance(observations, spaces.Tuple)
+            or not isinstance(actions, spaces.Tuple)
+            or len(observations.spaces) != len(actions.spaces)
+            or not actions.spaces
+        ):
+            raise ValueError(
+                "expected a Gymnasium environment of several agents, whose observation_space and action_space are "
+                f"Tuples with one entry per agent, got {observations} and {actions}; for one agent use "
+                "Stable-Baselines3 itself"
+            )
         self.env = env
         self._is_ended = is_ended
         self._is_success = is_success
         self.metadata = dict(env.metadata)
         self.render_mode = env.render_mode
-        observations, actions = env.observation_space, env.action_space
-        assert isinstance(observations, spaces.Tuple) and isinstance(actions, spaces.Tuple)
         self.possible_agents = [f"agent_{i}" for i in range(len(actions.spaces))]
         self.agents: list[str] = []
         self.observation_spaces = dict(zip(self.possible_agents, observations.spaces, strict=True))
@@ -152,21 +161,6 @@ def as_parallel(env: Any) -> Any:
     """Return a Gymnasium environment with one action per agent as a ParallelEnv; any other object as it is."""
     is_team = isinstance(env, gym.Env) and isinstance(getattr(env, "action_space", None), spaces.Tuple)
     return GymnasiumTeam(env) if is_team else env
-
-
-def check_is_team(env: gym.Env[Any, Any]) -> None:
-    """Raise ValueError unless observations and actions are Tuples of one entry per agent."""
-    observations, actions = env.observation_space, env.action_space
-    if (
-        not isinstance(observations, spaces.Tuple)
-        or not isinstance(actions, spaces.Tuple)
-        or len(observations.spaces) != len(actions.spaces)
-        or not actions.spaces
-    ):
-        raise ValueError(
-            "expected a Gymnasium environment of several agents, whose observation_space and action_space are Tuples "
-            f"with one entry per agent, got {observations} and {actions}; for one agent use Stable-Baselines3 itself"
-        )
 
 
 def make_gymnasium(env_id: str, render_mode: str | None, params: Mapping[str, Any]) -> gym.Env[Any, Any]:

@@ -6,6 +6,7 @@ import shlex
 import shutil
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -17,9 +18,8 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_saf import RandomPolicy
-from sb3_saf.checkpoints.store import CheckpointFolder
-from sb3_saf.experiments.definitions import Level, find_method
-from sb3_saf.experiments.grid import Cell, RunConfig
+from sb3_saf.checkpoints.learning import CheckpointFolder
+from sb3_saf.experiments.definitions import Cell, Level, RunConfig, find_method
 from sb3_saf.experiments.results import (
     BEST,
     BEST_MODEL,
@@ -33,8 +33,8 @@ from sb3_saf.experiments.results import (
     Results,
     write_evaluations,
 )
-from sb3_saf.export.weights import read_weights
-from sb3_saf.teams.errors import CheckpointError, NonFiniteError
+from sb3_saf.export.writer import read_weights
+from sb3_saf.teams.checks import CheckpointError, NonFiniteError
 from sb3_saf.teams.files import differences, read_json, write_json, write_text
 from sb3_saf.training.folders import (
     CHECKPOINTS,
@@ -42,13 +42,14 @@ from sb3_saf.training.folders import (
     FINISHED,
     MONITOR,
     RUN_FILE,
+    TEST_GAMES,
     Run,
     finish_run,
+    play_test,
     software_versions,
     write_run,
 )
 from sb3_saf.training.run import RunOptions, load_parameters, train
-from sb3_saf.training.trained_teams import TEST_GAMES, play_test
 
 #: Checkpoints of a training, from which another worker continues if this one is killed.
 CHECKPOINTS_PER_CELL: Final = 20
@@ -169,7 +170,8 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
         result = play_test(player, env, cell.seed, config.episodes, actions == MOST_LIKELY)
         if not np.isfinite(result.returns).all():
             raise NonFiniteError(f"team returns must be finite, got {result.returns} at {level}; repair the game")
-        plays.append(Play.of(policy, actions, result, time.perf_counter() - clock))
+        measured = result.returns, result.lengths, list(result.successes), list(result.agent_means)
+        plays.append(Play(policy, actions, *measured, time.perf_counter() - clock))
     env.close()
     return LevelResult(level.env_kwargs, settings.n_agents, settings.env_kwargs.get("n_treasures"), plays)
 
@@ -212,48 +214,40 @@ def check_cell(folder: Path, device: str = "auto") -> Check:
         Job(cell, config, device, int(cost.get("threads", 1))).write(Path(name))
         run_job(Path(name))
         for what, difference in _compare(cell, folder, Path(name, "result")):
-            if difference:
-                different.append(f"{what}: {difference}")
-            else:
-                equal.append(what)
+            (different if difference else equal).append(f"{what}: {difference}" if difference else what)
     then, now = run.description["versions"], software_versions()
     common = {name: value for name, value in then.items() if name in now and name != "host"}
     return Check(equal, different, differences(common, {name: now[name] for name in common}, most=10))
 
 
-def _compare(cell: Cell, before: Path, after: Path) -> list[tuple[str, str]]:
-    """Return what was compared, and the difference, empty if there is none."""
-    compared = []
+def _compare(cell: Cell, before: Path, after: Path) -> Iterator[tuple[str, str]]:
+    """Yield what was compared, and the difference, empty if there is none."""
     for level in cell.tests:
         old, new = (read_json(folder / "tests" / f"{level.slug}.json") for folder in (before, after))
         for play_of in (*old["plays"], *new["plays"]):
             play_of.pop("wall_seconds")
-        compared.append((f"returns at {level}", "" if repr(old) == repr(new) else differences(old, new)))
+        yield f"returns at {level}", "" if repr(old) == repr(new) else differences(old, new)
     if not cell.is_trained:
-        return compared
+        return
     for what, name, times in (("learning curve", CURVE, [1]), ("evaluations", EVALUATIONS, [])):
         curves = []
         for path in (before / name, after / name):
             lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
             curves.append([[text for i, text in enumerate(line.split(",")) if i not in times] for line in lines])
-        compared.append((what, "" if curves[0] == curves[1] else "differs"))
+        yield what, "" if curves[0] == curves[1] else "differs"
     for what, name in (("best weights", BEST_MODEL), ("weights", MODEL)):
-        compared.append((what, _difference_of_weights(before / name, after / name)))
-    return compared
-
-
-def _difference_of_weights(before: Path, after: Path) -> str:
-    """Compare names, dtypes, shapes and bytes."""
-    try:
-        ours, theirs = read_weights(before), read_weights(after)
-    except ValueError as error:
-        return str(error)
-    if list(ours) != list(theirs):
-        return "other names"
-    for name, one in ours.items():
-        other = theirs[name]
-        if (one.dtype, one.shape) != (other.dtype, other.shape):
-            old, new = (f"{tensor.dtype} of shape {tuple(tensor.shape)}" for tensor in (one, other))
-            return f"{name} is {old}, now {new}"
-    changed = [name for name in ours if ours[name].numpy().tobytes() != theirs[name].numpy().tobytes()]
-    return f"{len(changed)} of {len(ours)} tensors differ, such as {changed[0]}" if changed else ""
+        try:
+            old, new = (
+                {
+                    key: (tensor.dtype, tuple(tensor.shape), tensor.numpy().tobytes())
+                    for key, tensor in read_weights(path).items()
+                }
+                for path in (before / name, after / name)
+            )
+        except ValueError as error:
+            yield what, str(error)
+            continue
+        changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+        forms = [[" of shape ".join(map(str, one.get(key, "?")[:2])) for one in (old, new)] for key in changed[:1]]
+        such = " ".join(f"is {before}, now {after}" for before, after in forms if before != after)
+        yield what, f"{len(changed)} of {len(old)} tensors differ, such as {changed[0]} {such}" if changed else ""

@@ -12,9 +12,18 @@ from pathlib import Path
 from typing import Final
 
 from sb3_saf.checkpoints.learning import handled
-from sb3_saf.experiments.definitions import DEFAULT_SEEDS, EXPERIMENTS, MODULE, PROGRAM, Experiment, own_experiment
+from sb3_saf.experiments.definitions import (
+    DEFAULT_SEEDS,
+    EXPERIMENTS,
+    MODULE,
+    PROGRAM,
+    Experiment,
+    RunConfig,
+    Selection,
+    Shard,
+    own_experiment,
+)
 from sb3_saf.experiments.engines import Engine, LocalEngine, RayEngine
-from sb3_saf.experiments.grid import RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.suites.registry import find_environment, folder_name
 from sb3_saf.teams.checks import check_seed, unknown_name
@@ -27,8 +36,7 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import python_command
-from sb3_saf.training.trained_teams import TEAMS, check_team, team_names
+from sb3_saf.training.folders import TEAMS, check_team, python_command, team_names
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
@@ -170,10 +178,17 @@ def _subject(options: argparse.Namespace) -> tuple[Experiment, Results, Selectio
         raise ValueError("--vary is for a grid of your own: give its environments with --env")
     else:
         experiment = results.experiment(name)
+    envs = []
+    for task in options.tasks:
+        env_id = task if task in experiment.envs else find_environment(task).id
+        # The paper's experiments accept any of HECOGrid's tasks.
+        if env_id not in experiment.envs and experiment.name not in EXPERIMENTS:
+            raise unknown_name("environment of this experiment", task, experiment.envs)
+        envs.append(env_id)
     selection = Selection(
         tuple(dict.fromkeys(check_seed(seed) for seed in options.seeds)),
         tuple(dict.fromkeys(options.methods)),
-        tuple(dict.fromkeys(_env(task, experiment) for task in options.tasks)),
+        tuple(dict.fromkeys(envs)),
         tuple(dict.fromkeys(options.levels)),
     )
     return experiment, results, selection
@@ -183,16 +198,6 @@ def _size(options: argparse.Namespace) -> Size:
     """Return the given size, that of the folder, or the default."""
     stored = None if options.folder is None else Results(options.folder).config()
     return options.size or (DEFAULT_SIZE if stored is None else stored.size)
-
-
-def _env(task: str, experiment: Experiment) -> str:
-    """Return the environment of a task; the paper's experiments accept any of HECOGrid's."""
-    if task in experiment.envs:
-        return task
-    env_id = find_environment(task).id
-    if env_id not in experiment.envs and experiment.name not in EXPERIMENTS:
-        raise unknown_name("environment of this experiment", task, experiment.envs)
-    return env_id
 
 
 def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:

@@ -158,24 +158,17 @@ class RayEngine(Engine):
                     f"no Ray cluster at --address {address} ({_first_line(error)}); start one with `ray start "
                     "--head`, or leave --address out to start Ray on this machine"
                 ) from None
-        try:
-            self._check_resources()
-        except ValueError:
-            self.close()
-            raise
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        if not any(node.get("CPU", 0) >= cpus and node.get("GPU", 0) >= gpus for node in nodes):
+            largest = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
+            message = f"a cell wants {cpus:g} CPUs and {gpus:g} GPUs of one node, the nodes have {largest}"
+            if address is None:
+                self.close()
+                raise ValueError(f"{message}; lower --cpus-per-cell or --gpus-per-cell")
+            # A cluster may grow.
+            print(f"{message}: waiting for a node that is large enough", file=sys.stderr)
         # The run counts attempts, so that failures and lost nodes count alike.
         self._task = self._ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_run_on_ray)
-
-    def _check_resources(self) -> None:
-        """Raise ValueError for jobs that fit on no node; only warn on a cluster, which may grow."""
-        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
-        if any(node.get("CPU", 0) >= self.cpus and node.get("GPU", 0) >= self.gpus for node in nodes):
-            return
-        largest = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
-        message = f"a cell wants {self.cpus:g} CPUs and {self.gpus:g} GPUs of one node, the nodes have {largest}"
-        if self.address is None:
-            raise ValueError(f"{message}; lower --cpus-per-cell or --gpus-per-cell")
-        print(f"{message}: waiting for a node that is large enough", file=sys.stderr)
 
     @property
     def slots(self) -> int:

@@ -35,8 +35,16 @@ import msgspec
 import numpy as np
 
 from sb3_saf.evaluation import EvaluationResult
-from sb3_saf.experiments.definitions import EXPERIMENTS, Experiment, Level, find_experiment, own_experiment
-from sb3_saf.experiments.grid import Cell, RunConfig, Selection
+from sb3_saf.experiments.definitions import (
+    EXPERIMENTS,
+    Cell,
+    Experiment,
+    Level,
+    RunConfig,
+    Selection,
+    find_experiment,
+    own_experiment,
+)
 from sb3_saf.teams.files import differences, plain, read_json, try_lock, write_json, write_text
 from sb3_saf.training.folders import CURVE, RUN_FILE, Run, finish_run
 
@@ -68,12 +76,6 @@ class Play:
     successes: list[bool]
     agent_means: list[float]
     wall_seconds: float
-
-    @classmethod
-    def of(cls, policy: str, actions: str, result: EvaluationResult, wall_seconds: float) -> Play:
-        """Return the test with this result."""
-        measured = result.returns, result.lengths, list(result.successes), list(result.agent_means)
-        return cls(policy, actions, *measured, wall_seconds)
 
     @property
     def evaluation(self) -> EvaluationResult:

@@ -18,9 +18,8 @@ from filelock import BaseFileLock
 from tqdm import tqdm
 
 from sb3_saf.experiments.cell import Job
-from sb3_saf.experiments.definitions import Experiment
+from sb3_saf.experiments.definitions import Cell, Experiment, RunConfig, Selection, Shard, expand
 from sb3_saf.experiments.engines import Engine
-from sb3_saf.experiments.grid import Cell, RunConfig, Selection, Shard, expand
 from sb3_saf.experiments.results import BEST_MODEL, MODEL, Results
 from sb3_saf.experiments.tables import write_tables
 from sb3_saf.teams.files import write_text
@@ -232,7 +231,15 @@ class _Progress:
             self.finished.append(cell)
             found = [(level, self._results.test(cell, level)) for level in cell.tests]
             returns = ", ".join(f"{test.evaluation.mean:.2f} ({level})" for level, test in found if test is not None)
-            return f"{count} {cell}: return {returns}{self._rate()}"
+            # The rate of this run, and the remaining time at that rate.
+            ended = {one.id for one in (*self.finished, *self.failed, *self.elsewhere)}
+            played = sum(self._game_steps.get(one.id, 0) for one in self.finished)
+            left = sum(steps for cell_id, steps in self._game_steps.items() if cell_id not in ended)
+            if not played or not left:
+                return f"{count} {cell}: return {returns}"
+            rate = played / (time.monotonic() - self._clock)
+            remaining = timedelta(seconds=round(left / rate))
+            return f"{count} {cell}: return {returns}; {rate:,.0f} game steps/s, about {remaining} (h:mm:ss) left"
         reason = shorten(str(error).strip().splitlines()[-1], width=160, placeholder=" ...")
         if attempt.number <= self._options.retries:
             self._waiting.append((cell, attempt.number + 1))
@@ -241,13 +248,3 @@ class _Progress:
         path = self._results.unfinished(cell) / "error.txt"
         write_text(path, str(error))
         return f"{count} {cell}: FAILED: {reason}; see {path}"
-
-    def _rate(self) -> str:
-        """Return the rate of this run, and the remaining time at that rate."""
-        ended = {cell.id for cell in (*self.finished, *self.failed, *self.elsewhere)}
-        played = sum(self._game_steps.get(cell.id, 0) for cell in self.finished)
-        left = sum(steps for cell_id, steps in self._game_steps.items() if cell_id not in ended)
-        if not played or not left:
-            return ""
-        rate = played / (time.monotonic() - self._clock)
-        return f"; {rate:,.0f} game steps/s, about {timedelta(seconds=round(left / rate))} (h:mm:ss) left"

@@ -27,13 +27,18 @@ has one row per cell and test level:
 
 ``curves.csv`` has one row per evaluation during training: ``method``, ``task``, ``level`` and its parameters, ``seed``,
 ``game_steps``, ``processor_seconds`` of the training until then, and ``score``, the mean team return.
+
+Comparisons of methods are on the same seeds and test games. The spread of paired differences over seeds is not taken to
+be below the noise of the tests: with few seeds it may be small by chance. A difference is *equivalent* to none if a
+test with both bounds (TOST, 5 %) excludes 2 % of the largest return. Other differences are *higher* or *lower* if the
+95 % interval excludes 0, *open* if it does not.
 """
 
 from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -41,17 +46,16 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
-from sb3_saf.experiments.definitions import MODULE, RANDOM, Experiment, View
-from sb3_saf.experiments.grid import Cell, Grid, expand, merge
+from sb3_saf.experiments.definitions import MODULE, RANDOM, Cell, Experiment, Grid, Level, View, expand, merge
 from sb3_saf.experiments.results import BEST, BEST_MODEL, EVALUATIONS, LAST, MOST_LIKELY, Results
-from sb3_saf.export.weights import save_weights
+from sb3_saf.export.writer import save_weights
 from sb3_saf.teams.files import read_json, write_json, write_text
 from sb3_saf.training.enjoy import make_policy
-from sb3_saf.training.folders import RUN_FILE, Run, finish_run, python_command, read_curve
+from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run, check_runs_no_code, finish_run, python_command, read_curve
 from sb3_saf.training.replay import write_page
-from sb3_saf.training.statistics import require_columns
-from sb3_saf.training.trained_teams import WEIGHTS, check_runs_no_code
+from sb3_saf.training.statistics import Estimate, Floats, mean_over_seeds, require_columns
 
 RUNS: Final = "runs.csv"
 CURVES: Final = "curves.csv"
@@ -77,8 +81,15 @@ def read_results(folder: str | Path, name: str) -> Frames:
     results = Results(Path(folder))
     if results.config() is None:
         for published in (results.folder / name, results.folder):
-            if (found := _published(published)) is not None:
-                return found
+            paths = [published / file for file in (RUNS, CURVES)]
+            if not all(path.is_file() for path in paths):
+                continue
+            try:
+                tests, curves = (pd.read_csv(path, float_precision="round_trip") for path in paths)
+                require_columns(tests, ("method", "task", "train_level", "level", "seed", "return_mean", "score"))
+            except ValueError as error:
+                raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
+            return Frames(tests, curves)
     experiment = results.experiment(name)
     cells = [] if results.config() is None else requested(experiment, results).cells
     tests = frame_of_tests(results, cells)
@@ -87,19 +98,6 @@ def read_results(folder: str | Path, name: str) -> Frames:
             f"{folder} has no finished cell of {name!r}; run it first: {python_command(MODULE)} run {name} -f {folder}"
         )
     return Frames(tests, frame_of_curves(results, cells))
-
-
-def _published(folder: Path) -> Frames | None:
-    """Read the two files of an experiment; None if they are not there."""
-    paths = [folder / name for name in (RUNS, CURVES)]
-    if not all(path.is_file() for path in paths):
-        return None
-    try:
-        tests, curves = (pd.read_csv(path, float_precision="round_trip") for path in paths)
-        require_columns(tests, ("method", "task", "train_level", "level", "seed", "return_mean", "score"))
-        return Frames(tests, curves)
-    except ValueError as error:
-        raise ValueError(f"{folder} has no {RUNS} and {CURVES} of experiments: {error}") from None
 
 
 def beside(ours: Frames, theirs: Frames) -> Frames:
@@ -111,18 +109,19 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
         trainings of the same length are taken
     """
     rows, here = theirs.tests, ours.tests
-    same_games = _keys(rows, "task", "level", "n_agents").isin(_keys(here, "task", "level", "n_agents"))
+    same_games = keys_of(rows, "task", "level", "n_agents").isin(keys_of(here, "task", "level", "n_agents"))
     names = "method", "task", "train_level", "level", "seed"
-    is_new = ~_keys(rows, *names).isin(_keys(here, *names))
+    is_new = ~keys_of(rows, *names).isin(keys_of(here, *names))
     tests = rows[same_games & is_new & rows["game_steps"].isin({0, *here["game_steps"]})]
     if tests.empty:
         return ours
-    of_curves = _keys(theirs.curves, "method", "task", "level", "seed")
-    curves = theirs.curves[of_curves.isin(_keys(tests, "method", "task", "train_level", "seed"))]
+    of_curves = keys_of(theirs.curves, "method", "task", "level", "seed")
+    curves = theirs.curves[of_curves.isin(keys_of(tests, "method", "task", "train_level", "seed"))]
     return Frames(*(pd.concat(pair, ignore_index=True) for pair in ((here, tests), (ours.curves, curves))))
 
 
-def _keys(table: pd.DataFrame, *columns: str) -> pd.Series:
+def keys_of(table: pd.DataFrame, *columns: str) -> pd.Series:
+    """Return the entries of some columns as one tuple for each row."""
     return pd.Series(list(table[list(columns)].itertuples(index=False, name=None)), index=table.index, dtype=object)
 
 
@@ -140,7 +139,11 @@ def frame_of_tests(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
     """Return the finished tests of some cells, in the order of cells, then of tests."""
     table = pd.DataFrame([row for cell in cells for row in _rows(results, cell)])
     if not table.empty:
-        table["score"] = _scores(table)
+        here = table.groupby(["task", "level"])["return_mean"]
+        low, high = here.transform("min"), here.transform("max")
+        of_range = ((table["return_mean"] - low) / (high - low).where(high > low, 1.0)).astype(float)
+        known = pd.to_numeric(table["max_return"])
+        table["score"] = (table["return_mean"] / known).where(known.notna(), of_range)
     return table
 
 
@@ -191,15 +194,6 @@ def best_game_steps(folder: Path) -> int:
     return int(curve["game_steps"][curve["return_mean"].idxmax()])
 
 
-def _scores(table: pd.DataFrame) -> pd.Series:
-    """Return the fraction of the largest return, or of the range of returns on the same task and level."""
-    here = table.groupby(["task", "level"])["return_mean"]
-    low, high = here.transform("min"), here.transform("max")
-    of_range = ((table["return_mean"] - low) / (high - low).where(high > low, 1.0)).astype(float)
-    known = pd.to_numeric(table["max_return"])
-    return (table["return_mean"] / known).where(known.notna(), of_range)
-
-
 def write_tables(experiment: Experiment, results: Results) -> Frames:
     """Write ``runs.csv`` and ``curves.csv`` of all requested and finished cells, with exact floats; return them."""
     cells = requested(experiment, results).cells
@@ -211,7 +205,7 @@ def write_tables(experiment: Experiment, results: Results) -> Frames:
 
 def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     """
-    Write teams for others to play, see ``training/trained_teams.py``: of each task, level and method of a folder of
+    Write teams for others to play, see ``training/folders.py``: of each task, level and method of a folder of
     experiments the seed with the best test at the level of its training.
 
     :param target: folder of all teams; a team of the same name is replaced
@@ -328,3 +322,166 @@ def complete(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows[rows.groupby("stratum")["method"].transform("nunique") == n_methods]
     n_strata = rows["stratum"].nunique()
     return rows[rows.groupby("seed")["stratum"].transform("size") == n_methods * n_strata]
+
+
+# --- comparisons ------------------------------------------------------------------------------------------------------
+
+
+#: Minimum seeds for a verdict.
+FEWEST_SEEDS: Final = 3
+#: Differences below this share of the largest return do not matter.
+MARGIN: Final = 0.02
+_LEVEL: Final = 0.05
+_ON: Final = ["task", "level", "seed"]
+
+
+class Difference(NamedTuple):
+    """
+    Mean of differences of independent pairs.
+
+    :param estimate: mean with its 95 % interval (Student's t), NaN for a single pair
+    :param p: of the two-sided test of no difference
+    :param p_equivalent: of the test that the difference is at least the margin; NaN without margin
+    """
+
+    estimate: Estimate
+    p: float
+    p_equivalent: float
+    n: int
+
+    @property
+    def verdict(self) -> str:
+        """``"higher"``, ``"lower"``, ``"equivalent"`` or ``"open"``; or that there are too few pairs."""
+        if self.n < FEWEST_SEEDS:
+            return f"fewer than {FEWEST_SEEDS} pairs"
+        if self.p_equivalent < _LEVEL:
+            return "equivalent"
+        return "open" if self.p >= _LEVEL else "higher" if self.estimate.value > 0 else "lower"
+
+
+def mean_difference(differences: Sequence[float] | Floats, noise: float = 0.0, margin: float = np.nan) -> Difference:
+    """
+    Test the mean of paired differences.
+
+    :param differences: (n,) one for each pair
+    :param noise: standard deviation that the tests alone give a difference: the floor of their spread
+    :param margin: smallest difference that matters
+    """
+    sample = np.asarray(differences, dtype=np.float64)
+    n, mean = len(sample), float(sample.mean())
+    if n < 2:
+        return Difference(Estimate(mean, np.nan, np.nan), np.nan, np.nan, n)
+    error = max(float(sample.std(ddof=1)), noise) / np.sqrt(n)
+    if error == 0:
+        return Difference(Estimate(mean, mean, mean), float(mean == 0), float(abs(mean) >= margin), n)
+    half = float(stats.t.ppf(0.975, n - 1)) * error
+    p = 2 * float(stats.t.sf(abs(mean) / error, n - 1))
+    p_equivalent = float(stats.t.sf((margin - abs(mean)) / error, n - 1))
+    return Difference(Estimate(mean, mean - half, mean + half), p, p_equivalent, n)
+
+
+class Comparison(NamedTuple):
+    """
+    Comparison of two methods on the same seeds and the same test games.
+
+    :param first: mean return of the first, with its 95 % interval over these seeds
+    :param test: mean of first - second, paired by seed
+    """
+
+    seeds: list[int]
+    first: Estimate
+    second: Estimate
+    test: Difference
+
+
+class Compared(NamedTuple):
+    """Comparison of a view's first method with another one, at a level of a task."""
+
+    task: str
+    level: Level
+    ours: str
+    other: str
+    found: Comparison
+
+
+def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
+    """
+    Compare two methods at one level of one task.
+
+    :param first: columns ``seed`` and ``return_mean``; with ``return_sd`` and ``episodes`` the noise of tests is known,
+        with ``max_return`` the margin of equivalence
+    :return: None if they have no seed in common
+    """
+    pairs = first.merge(second, on="seed", suffixes=("", "_second")).sort_values("seed")
+    if pairs.empty:
+        return None
+    ours, theirs = (pairs[name].to_numpy(dtype=np.float64) for name in ("return_mean", "return_mean_second"))
+    known = pairs["max_return"].iloc[0] if "max_return" in pairs else np.nan
+    margin = MARGIN * float(known) if pd.notna(known) else np.nan
+    test = mean_difference(ours - theirs, float(np.sqrt(_variance(pairs).mean())), margin)
+    return Comparison(pairs["seed"].tolist(), mean_over_seeds(ours), mean_over_seeds(theirs), test)
+
+
+def _variance(pairs: pd.DataFrame) -> Floats:
+    """Return the variance of each pair's difference from the tests' episodes; 0 where it is not known."""
+    if "return_sd" not in pairs:
+        return np.zeros(len(pairs))
+    parts = [pairs[f"return_sd{end}"] ** 2 / pairs[f"episodes{end}"] for end in ("", "_second")]
+    return (parts[0] + parts[1]).fillna(0).to_numpy(dtype=np.float64)
+
+
+def comparisons(table: pd.DataFrame, view: View) -> list[Compared]:
+    """Compare SAF, or the first method if SAF is missing, with each other one, if they have common seeds."""
+    rows = of_view(table, view)
+    methods = list(dict.fromkeys(rows["method"]))
+    ours = "saf" if "saf" in methods else next(iter(methods), RANDOM)
+    found = []
+    for task in dict.fromkeys(rows["task"]):
+        for level in view.levels:
+            here = rows[(rows["task"] == task) & (rows["level"] == level.slug)]
+            for other in [method for method in methods if method != ours]:
+                comparison = compare(*(here[here["method"] == one] for one in (ours, other)))
+                if comparison is not None:
+                    found.append(Compared(str(task), level, ours, other, comparison))
+    return found
+
+
+def shares(table: pd.DataFrame, first: str, second: str) -> pd.DataFrame:
+    """
+    Return the paired differences of two methods in percent of the largest return.
+
+    :param table: table of tests
+    :return: columns ``setting``, ``seed``, ``difference`` and ``variance`` (of the tests), one row per pair
+    """
+    ours, theirs = (table[table["method"] == method] for method in (first, second))
+    pairs = ours.merge(theirs, on=["train_level", *_ON], suffixes=("", "_second"))
+    scale = 100 / pd.to_numeric(pairs["max_return"]).to_numpy(dtype=np.float64)
+    difference = (pairs["return_mean"] - pairs["return_mean_second"]).to_numpy(dtype=np.float64)
+    setting = pairs["task"] + " " + pairs["train_level"] + " " + pairs["level"]
+    variance = _variance(pairs) * scale**2
+    return pd.DataFrame(
+        {"setting": setting, "seed": pairs["seed"], "difference": difference * scale, "variance": variance}
+    )
+
+
+def pooled(pairs: pd.DataFrame) -> Difference | None:
+    """
+    Test the mean difference over settings: over those of their means if there are three or more, else over seeds.
+
+    :param pairs: from :func:`shares`
+    :return: in percent of the largest return; None without pairs
+    """
+    if pairs.empty:
+        return None
+    by = "setting" if pairs["setting"].nunique() >= FEWEST_SEEDS else "seed"
+    groups = pairs.groupby(by)
+    noise = float(np.sqrt((groups["variance"].mean() / groups.size()).mean()))
+    return mean_difference(groups["difference"].mean().to_numpy(), noise, 100 * MARGIN)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p values corrected for the number of declared tests (Holm)."""
+    p, order = np.asarray(p_values, dtype=np.float64), np.argsort(p_values)
+    corrected = np.empty_like(p)
+    corrected[order] = np.minimum(1, np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order]))
+    return [float(value) for value in corrected]

@@ -97,7 +97,13 @@ class Actor:
             description = json.loads(session.get_modelmeta().custom_metadata_map["sb3_saf"])
         except Exception as error:  # those of onnxruntime have no common class
             raise ValueError(f"expected {path} to be written by sb3_saf.export_actors, got {error!r:.300}") from error
-        return cls(session, description, _index_of(agent, description))
+        n_agents, names = description["n_agents"], description["agents"]
+        index: Any = names.index(agent) if names is not None and agent in names else agent
+        is_number = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
+        if index is not None and not (is_number and 0 <= index < n_agents):
+            or_name = "" if names is None else f" or one of {', '.join(map(repr, names))}"
+            raise ValueError(f"agent must be a whole number in 0..{n_agents - 1}{or_name}, got {agent!r}")
+        return cls(session, description, None if index is None else int(index))
 
     @property
     def n_agents(self) -> int:
@@ -150,7 +156,12 @@ class Actor:
         by_agent = given is not None and given.agents is not None
         states = self._states(memory, by_agent)
         is_drawn = not deterministic and not self.description["greedy"]
-        predict = partial(self._predict, generator=self._generator(rng) if is_drawn else None)
+        generator = self._rng if rng is None else None
+        if is_drawn and rng is not None:
+            if isinstance(rng, bool) or not isinstance(rng, (int, np.integer, np.random.Generator)):
+                raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
+            generator = np.random.default_rng(rng)
+        predict = partial(self._predict, generator=generator if is_drawn else None)
         if given is None:
             actions, after = predict(rows, states)
         else:
@@ -225,13 +236,6 @@ class Actor:
     def _check_is_drawn(self) -> None:
         if self.description["greedy"]:
             raise ValueError(f"{self.description['policy']} takes the action of the highest value: nothing is drawn")
-
-    def _generator(self, rng: object) -> np.random.Generator:
-        if rng is None:
-            return self._rng
-        if isinstance(rng, bool) or not isinstance(rng, (int, np.integer, np.random.Generator)):
-            raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
-        return np.random.default_rng(rng)
 
     def _run(self, names: list[str], inputs: dict[str, Array], rng: np.random.Generator | None = None) -> list[Array]:
         """
@@ -342,19 +346,6 @@ class Actor:
         if not self.has_memory:
             self.new_memory()  # raises an error: the actor has no memory
         return (memory.states if by_agent else tuple(memory.states.values())) or None
-
-
-def _index_of(agent: object, description: Mapping[str, Any]) -> int | None:
-    """Return the index of an agent, given by index or name; None for None."""
-    n_agents, names = description["n_agents"], description["agents"]
-    if agent is None:
-        return None
-    if names is not None and agent in names:
-        return int(names.index(agent))
-    if isinstance(agent, bool) or not isinstance(agent, (int, np.integer)) or not 0 <= agent < n_agents:
-        or_name = "" if names is None else f" or one of {', '.join(map(repr, names))}"
-        raise ValueError(f"agent must be a whole number in 0..{n_agents - 1}{or_name}, got {agent!r}")
-    return int(agent)
 
 
 def _fits(array: Array, dtype: np.dtype[Any]) -> bool:

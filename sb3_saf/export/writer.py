@@ -1,14 +1,16 @@
-"""Export of a trained model's actors as an ONNX graph that chooses actions."""
+"""Export of a trained model: its actors as an ONNX graph that chooses actions, its weights as safetensors."""
 
 from __future__ import annotations
 
 import base64
 import copy
 import inspect
+import io
 import json
 import logging
 import re
 import warnings
+import zipfile
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
@@ -17,7 +19,9 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from safetensors.torch import load, save
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
@@ -28,16 +32,17 @@ from sb3_saf.networks.distributions import (
     is_one_hot,
     likeliest_action,
     masked_parameters,
+    mixture_log_prob,
     mixture_log_probs,
+    mixture_mode,
     n_action_parameters,
+    policy_parameters,
 )
 from sb3_saf.networks.encoders import encoded
-from sb3_saf.networks.mixtures import mixture_log_prob, mixture_mode, policy_parameters
 from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
-from sb3_saf.qplex.parts import AgentMemory
-from sb3_saf.qplex.policies import QPLEXPolicy
+from sb3_saf.qplex.policies import AgentMemory, QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
-from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.checks import ExportError
 from sb3_saf.teams.files import atomic_file, write_text
 
 #: Policies whose actors read only one agent's own observation, index, mask and memory.
@@ -97,7 +102,10 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
     path.mkdir(parents=True, exist_ok=True)
     with atomic_file(path / "actor.onnx") as file:
         file.write(graph)
-    write_text(path / "act.py", _script())
+    # act.py with the code that it imports from this package.
+    _, _, code = inspect.getsource(conversion).partition("from __future__ import annotations\n")
+    line = r"from sb3_saf.teams.conversion import .*\n"
+    write_text(path / "act.py", re.sub(line, lambda _: f"{code.strip()}\n\n\n", inspect.getsource(act)))
     return path
 
 
@@ -147,13 +155,6 @@ def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, 
             "atlas": pixels,
         },
     }
-
-
-def _script() -> str:
-    """Return act.py with the code that it imports from this package."""
-    _, _, code = inspect.getsource(conversion).partition("from __future__ import annotations\n")
-    line = r"from sb3_saf.teams.conversion import .*\n"
-    return re.sub(line, lambda _: f"{code.strip()}\n\n\n", inspect.getsource(act))
 
 
 # --- the network ------------------------------------------------------------------------------------------------------
@@ -335,3 +336,94 @@ def _check(graph: bytes, network: ActingNetwork, policy: ExportablePolicy, input
             raise ExportError(
                 f"the graph's {name} is not the model's: {type(policy).__name__} does more than its encoder and actor"
             )
+
+
+# --- weights ----------------------------------------------------------------------------------------------------------
+
+
+def save_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -> Path:
+    """
+    Write the policy's weights as safetensors, atomically; :func:`load_weights` reads them.
+
+    :param model: an algorithm or a policy
+    :param path: the file; ``.safetensors`` is appended if missing
+    :return: the file
+    """
+    path = Path(path)
+    path = path if path.suffix == ".safetensors" else path.with_name(f"{path.name}.safetensors")
+    policy: Any = getattr(model, "policy", model)
+    tensors = policy.state_dict()
+    names = set(_first_names(tensors).values())
+    content = save({name: tensor.contiguous() for name, tensor in tensors.items() if name in names})
+    with atomic_file(path) as file:
+        file.write(content)
+    return path
+
+
+def load_weights(model: BaseAlgorithm | BasePolicy, path: str | PathLike[str]) -> None:
+    """
+    Load the weights of a policy, without running code from the file.
+
+    SB3's ``load`` unpickles the whole model, so an untrusted file can run arbitrary code. Here the caller makes the
+    model (with the same ``policy_kwargs``), and only tensors are read. The optimiser's state and the hyperparameters
+    are not read.
+
+    :param model: an algorithm or a policy, changed only if the whole file matches
+    :param path: the file of :func:`save_weights`, or the zip file of SB3's ``save``, with or without ``.zip``
+    :raises ExportError: if the file is damaged, malformed, or of a differently built policy
+    """
+    policy: Any = getattr(model, "policy", model)
+    own: dict[str, th.Tensor] = policy.state_dict()
+    path = Path(path)
+    path = path if path.is_file() or path.suffix in (".zip", ".safetensors") else path.with_name(f"{path.name}.zip")
+    tensors = read_weights(path)
+    if path.suffix == ".safetensors":  # each tensor is stored under the first of its names
+        tensors |= {name: tensors[first] for name, first in _first_names(own).items() if first in tensors}
+    fix = "; make the model with the policy and policy_kwargs it was trained with"
+    if missing := sorted(own.keys() - tensors.keys()):
+        raise ExportError(f"{path} lacks the tensor {missing[0]!r}{fix}")
+    if unknown := sorted(map(str, tensors.keys() - own.keys())):
+        raise ExportError(f"{path} has a tensor that the network does not have: {unknown[0][:80]!r}{fix}")
+    for name, expected in own.items():
+        tensor = tensors[name]
+        if not isinstance(tensor, th.Tensor) or (tensor.shape, tensor.dtype) != (expected.shape, expected.dtype):
+            is_tensor = isinstance(tensor, th.Tensor)
+            got = f"{tuple(tensor.shape)} and {tensor.dtype}" if is_tensor else type(tensor).__name__
+            raise ExportError(
+                f"{path}: expected {name!r} of shape {tuple(expected.shape)} and {expected.dtype}, got {got}{fix}"
+            )
+        if not bool(tensor.isfinite().all()):
+            raise ExportError(f"{path}: {name!r} has NaN or infinity")
+    policy.load_state_dict(tensors)
+
+
+def _first_names(tensors: dict[str, th.Tensor]) -> dict[str, str]:
+    """Return for every tensor the first name of the same memory: modules may be shared."""
+    first: dict[tuple[Any, ...], str] = {}
+    return {
+        name: first.setdefault((tensor.data_ptr(), tensor.shape) if tensor.numel() else (name,), name)
+        for name, tensor in tensors.items()
+    }
+
+
+def read_weights(path: Path) -> dict[str, th.Tensor]:
+    """
+    Return the weights in a file of safetensors or of a saved model; only tensors are read.
+
+    :raises ExportError: if the file is missing, damaged, or has other content
+    """
+    if not path.is_file():
+        raise ExportError(f"expected a model saved by Stable-Baselines3 or its weights, found no file {path}")
+    try:
+        if path.suffix == ".safetensors":
+            return load(path.read_bytes())
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} in it is damaged")
+            data = archive.read("policy.pth")
+        tensors = th.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # zips, the unpickler and safetensors have no common class of errors
+        raise ExportError(f"{path} does not hold the tensors of a saved model: {str(error)[:200]}") from error
+    if not isinstance(tensors, dict):
+        raise ExportError(f"{path} must map names to tensors, got {type(tensors).__name__}")
+    return tensors

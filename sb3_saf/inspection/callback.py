@@ -1,26 +1,158 @@
-"""Callback that inspects a team policy during training and writes the results to TensorBoard."""
+"""
+Inspection of a team: recorded episodes as scalars, figures and a film, and the callback that writes them to
+TensorBoard during training.
+"""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common import logger
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Figure, Image
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
-from sb3_saf.callbacks.game_steps import show_game_steps, team_steps
+from sb3_saf.callbacks import show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.inspection.inspection import Inspection, inspect_team
-from sb3_saf.inspection.reading import require_our_policy
-from sb3_saf.inspection.recording import Zones, zone_function
+from sb3_saf.inspection import figures
+from sb3_saf.inspection import scalars as numbers
+from sb3_saf.inspection.recording import (
+    EpisodeRecording,
+    Picture,
+    ReturnScale,
+    Zones,
+    record_episodes,
+    require_our_policy,
+    return_scale,
+    zone_colours,
+    zone_function,
+)
 from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.vec_env import layers, require_n_agents
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Inspection(NamedTuple):
+    """
+    Recorded episodes of a team, with scalars and figures.
+
+    :param recording: every step, as arrays
+    :param action_space: one agent's action space
+    :param scale: unit of team returns
+    :param colours: colours of the zones; None if the environment has none
+    :param gae_lambda: lambda of the critic's training targets
+    """
+
+    recording: EpisodeRecording
+    action_space: spaces.Space[Any]
+    scale: ReturnScale
+    colours: Sequence[figures.Colour] | None
+    gae_lambda: float
+
+    @property
+    def scalars(self) -> dict[str, float]:
+        """Scalars by their names in TensorBoard (``docs/tensorboard.md``)."""
+        return {
+            **numbers.team_scalars(self.recording, self.scale),
+            **numbers.pool_scalars(self.recording, self.action_space),
+            **numbers.knowledge_scalars(self.recording),
+            **numbers.critic_scalars(self.recording, self.gae_lambda),
+            **numbers.message_scalars(self.recording),
+        }
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """Figures by their names in TensorBoard. Needs matplotlib."""
+        recording, counted = self.recording, self.recording.counted
+        values, returns = recording.values[counted], recording.returns[counted]
+        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if recording.of_team else 'per agent'}"
+        calibration = figures.calibration(values, returns, numbers.calibrate(values, returns), unit)
+        plots = {"critic/calibration": calibration}
+        if recording.pool_weights is not None and recording.pool_actions is not None:
+            weights = recording.pool_weights[counted]
+            agents = np.broadcast_to(np.arange(counted.shape[1]) % recording.n_agents, counted.shape)[counted]
+            by_agent = numbers.selection_by_group(weights, agents, recording.n_agents)
+            plots["pool/by_agent"] = figures.chosen_by_agent(by_agent)
+            distances = numbers.policy_distances(self.action_space, recording.pool_actions[counted])
+            plots["pool/differences"] = figures.policy_differences(distances)
+            if recording.zones is not None:
+                zones = recording.zones[counted]
+                n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
+                by_zone = numbers.selection_by_group(weights, zones, n_zones)
+                plots["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
+        write, read = numbers.write_attention(recording), numbers.read_attention(recording)
+        if write is not None and read is not None and recording.write_attention is not None:
+            plots["knowledge_source/attention"] = figures.attention(write, read)
+            # The first game up to the end of its first episode.
+            game = int(np.flatnonzero(recording.counted_games.any(axis=0))[0])
+            ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)
+            episode = recording.write_attention[: int(np.flatnonzero(ends)[0]) + 1, game]
+            plots["knowledge_source/one_episode"] = figures.attention_over_time(episode)
+        return plots
+
+    @property
+    def film(self) -> bytes | None:
+        """The first episode as a GIF; None if the environment draws no pictures. Needs Pillow."""
+        return figures.gif(self.recording.pictures) if self.recording.pictures else None
+
+    @property
+    def strip(self) -> Picture | None:
+        """Six moments of the first episode, (height, width, 3); None if the environment draws no pictures."""
+        return figures.strip(self.recording.pictures) if self.recording.pictures else None
+
+
+def inspect_team(
+    model: BaseAlgorithm,
+    eval_env: VecEnv,
+    n_eval_episodes: int = 16,
+    seed: int = 20_000,
+    deterministic: bool = False,
+    zones: Zones = None,
+    *,
+    pictures: bool = True,
+    observations: bool = True,
+) -> Inspection:
+    """
+    Inspect a team: play episodes, and record its observations, actions and network outputs.
+
+    :class:`~sb3_saf.InspectionCallback` writes the same to TensorBoard. The result has ``scalars`` by name, ``figures``
+        drawn on access, ``film``, the first episode as a GIF, and ``recording`` with every step.
+
+    :param model: model with a policy of this package
+    :param eval_env: environment of teams, for instance from ``make_team_env`` with ``n_envs=16`` and, for a film,
+        ``render_mode="rgb_array"``
+    :param n_eval_episodes: team episodes to play
+    :param seed: seed of the episodes
+    :param deterministic: whether the policy takes its most likely actions
+    :param zones: as in :class:`~sb3_saf.InspectionCallback`
+    :param pictures: whether to draw the first game
+    :param observations: whether to record the agents' own observations
+    :raises ValueError: if the policy is not of this package or ``eval_env`` has no teams
+    """
+    recording = record_episodes(
+        model.policy,
+        eval_env,
+        n_eval_episodes,
+        seed,
+        deterministic,
+        gamma=float(getattr(model, "gamma", 1.0)),
+        zones=zones,
+        normalizer=model.get_vec_normalize_env(),
+        observations=observations,
+        pictures=pictures,
+    )
+    gae_lambda = float(getattr(model, "gae_lambda", 1.0))
+    return Inspection(recording, model.policy.action_space, return_scale(eval_env), zone_colours(eval_env), gae_lambda)
 
 
 class InspectionCallback(BaseCallback):
@@ -146,7 +278,16 @@ class InspectionCallback(BaseCallback):
         )
         scalars = inspection.scalars
         if self.pictures and self._page.has_tensorboard:
-            self._draw(inspection)
+            self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))
+            if self.model.ep_info_buffer:
+                recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
+                self._page.show("rollout/team_return_of_each_episode", recent)
+            for tag, figure in inspection.figures.items():
+                self._page.show(tag, logger.Figure(figure, close=True))
+            strip, film = inspection.strip, inspection.film
+            if strip is not None and film is not None:
+                self._page.show("episode/strip", logger.Image(strip, "HWC"))
+                self._page.gif("episode/film", film, team_steps(self.model))
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began
         self._page.scalars({"time/inspection_seconds": self.seconds})
@@ -159,18 +300,6 @@ class InspectionCallback(BaseCallback):
                 f"({time.perf_counter() - began:.1f} s)"
             )
         return scalars
-
-    def _draw(self, inspection: Inspection) -> None:
-        self._page.show("team/return_of_each_episode", th.tensor(inspection.recording.episode_returns))
-        if self.model.ep_info_buffer:
-            recent = th.tensor([float(episode["r"]) for episode in self.model.ep_info_buffer])
-            self._page.show("rollout/team_return_of_each_episode", recent)
-        for tag, figure in inspection.figures.items():
-            self._page.show(tag, Figure(figure, close=True))
-        strip, film = inspection.strip, inspection.film
-        if strip is not None and film is not None:
-            self._page.show("episode/strip", Image(strip, "HWC"))
-            self._page.gif("episode/film", film, team_steps(self.model))
 
 
 def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:

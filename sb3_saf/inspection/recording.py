@@ -18,36 +18,197 @@ attribute        form                    meaning
 A game on a grid may have two methods for :func:`~sb3_saf.replay`: ``grid_scene()`` returns the data for a drawing (see
 ``HECOGridEnv``), ``replica()`` another game that plays the same episode from the same seed.
 
-Letters: T game steps, E games, N agents, B = E N rows, A actions, U policies, L slots, P parameters of an action
-distribution.
+Letters: T game steps, E games, N agents, B = E N rows, A actions, U policies or heads, L slots, P parameters of an
+action distribution.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.evaluation import PlayedStep, check_trained_on, play
-from sb3_saf.inspection.reading import (
-    PolicyReader,
-    QReader,
-    Replacement,
-    reader_of,
-    require_our_policy,
-)
-from sb3_saf.policies.base import TeamMaskablePolicy
+from sb3_saf.networks.actor import PolicyPool
+from sb3_saf.networks.distributions import mixture_log_probs
+from sb3_saf.policies.base import TeamMaskablePolicy, TeamPolicy
+from sb3_saf.policies.memory import RunningMemory
+from sb3_saf.policies.saf import SAFCritic
+from sb3_saf.qplex.learning import greedy_q_tot
+from sb3_saf.qplex.policies import QPLEXPolicy, State
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTIVE_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.teams.rows import ACTIVE_KEY, EPISODE_START_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED, TerminalRow
 from sb3_saf.teams.vec_env import require_n_agents
+
+Tensors = dict[str, th.Tensor]
+#: Policies of this package.
+OurPolicy = TeamPolicy | QPLEXPolicy
+
+#: Replacement of a message: zeros, or the message of the same agent in another game at the same step.
+Replacement = Literal["zero", "shuffled"]
+REPLACEMENTS: Final[tuple[Replacement, ...]] = get_args(Replacement)
+
+
+class StepReading(NamedTuple):
+    """One step of all games, the entries of :class:`EpisodeRecording` without T. What a policy lacks is None."""
+
+    actions: npt.NDArray[Any]
+    values: th.Tensor
+    action_probabilities: th.Tensor | None
+    pool_weights: th.Tensor | None = None
+    pool_actions: th.Tensor | None = None
+    write_attention: th.Tensor | None = None
+    read_attention: th.Tensor | None = None
+    message_strengths: th.Tensor | None = None
+    values_without: Mapping[Replacement, th.Tensor] = MappingProxyType({})
+
+
+def require_our_policy(policy: BasePolicy) -> OurPolicy:
+    """Return the policy; ValueError if it is not of this package and cannot be inspected."""
+    if isinstance(policy, (TeamPolicy, QPLEXPolicy)):
+        return policy
+    raise ValueError(
+        "expected a policy of sb3_saf such as 'SAFPolicy', 'MAPPOPolicy', 'IPPOPolicy' or 'QPLEXPolicy', got "
+        f"{type(policy).__name__}"
+    )
+
+
+class PolicyReader:
+    """
+    Act with an actor-critic policy and read its outputs. Its memory of the games of a training is left alone.
+
+    :param deterministic: whether it takes its most likely actions
+    """
+
+    #: Whether values are of the team's reward, not of the agent's.
+    of_team: ClassVar[bool] = False
+
+    def __init__(self, policy: TeamPolicy, deterministic: bool = False):
+        self.policy = policy
+        self.deterministic = deterministic
+        critic = policy.value_net
+        self.source = critic if isinstance(critic, SAFCritic) else None
+        self._memory = RunningMemory()
+        # Messages are replaced at every step, so that the critic's memory depends on them, too.
+        self._without = {name: RunningMemory() for name in REPLACEMENTS}
+
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
+        """
+        Act in one step.
+
+        :param obs: rows of whole teams, game-major
+        :param starts: (B,) whether an episode starts with this step, for policies with memory
+        :param action_masks: (B, M) for policies of MaskablePPO
+        """
+        arguments = {} if action_masks is None else {"action_masks": action_masks}
+        latents, before = self.policy.extract_features(obs), self._memory.actor
+        with self.policy.remembering(self._memory):
+            actions, values, _ = self.policy(obs, deterministic=self.deterministic, **arguments)
+            values = values.flatten()
+        if self.policy.actor_memory is not None:
+            latents, _ = self.policy.remember(latents, before, obs[EPISODE_START_KEY] != 0)
+        policy, space = self.policy, self.policy.action_space
+        log_weights, parameters = policy.evaluate_pool(obs, latents, action_masks)
+        is_discrete = isinstance(space, spaces.Discrete)
+        probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
+        array = actions.cpu().numpy()
+        clipped = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
+        reading = StepReading(clipped, values, probabilities)
+        if isinstance(policy.actor, PolicyPool):
+            reading = reading._replace(pool_weights=log_weights.exp(), pool_actions=parameters)
+        return reading if self.source is None else self._with_messages(self.source, reading, obs)
+
+    def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
+        """
+        Compute the values of last observations, for bootstrapping time limits that are no true ends.
+
+        :param obs: rows of the games that ended
+        :param rows: (K,) their indices among the rows of the last step
+        :return: (K,)
+        """
+        with self.policy.remembering(self._memory):
+            values: th.Tensor = self.policy.predict_values(TerminalRow(obs, rows))
+        return values.flatten()
+
+    def _with_messages(self, source: SAFCritic, reading: StepReading, obs: Tensors) -> StepReading:
+        policy = self.policy
+        _, teams = policy.encode_teams(obs)
+        _, exchanged = source.communicate(teams.features, teams.members, teams.active)
+        # In rows that are not whole teams in order, equal teams are computed once; expand them to games.
+        n_agents = policy.team_spaces.n_agents
+        team = th.arange(len(exchanged.read)) if teams.rows is None else teams.rows[::n_agents] // n_agents
+        values_without: dict[Replacement, th.Tensor] = {}
+        for name in REPLACEMENTS if len(team) > 1 else REPLACEMENTS[:1]:
+            with _other_messages(source, name):
+                if policy.actor_memory is None:
+                    values_without[name] = policy.predict_values(obs).flatten()
+                else:
+                    with policy.remembering(self._without[name]):
+                        values_without[name] = policy(obs, deterministic=True)[1].flatten()
+        return reading._replace(
+            write_attention=exchanged.write_attention[team],
+            read_attention=exchanged.read_attention[team],
+            message_strengths=exchanged.read[team].norm(dim=2).flatten(),
+            values_without=values_without,
+        )
+
+
+@contextmanager
+def _other_messages(source: SAFCritic, replacement: Replacement) -> Iterator[None]:
+    """Replace the messages that a critic reads."""
+
+    def replaced(_: th.nn.Module, inputs: tuple[th.Tensor, ...]) -> th.Tensor:
+        states, read = inputs[0].chunk(2, dim=2)
+        return th.cat([states, th.zeros_like(read) if replacement == "zero" else read.roll(1, dims=0)], dim=2)
+
+    hook = source.combine_net.register_forward_pre_hook(replaced)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
+class QReader:
+    """Act with a value-based policy and read its outputs. It always takes its best actions."""
+
+    #: Values are Q_tot, of the sum of all agents' rewards.
+    of_team: ClassVar[bool] = True
+
+    def __init__(self, policy: QPLEXPolicy):
+        self.policy = policy
+        self._state: State | None = None
+
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
+        """See :class:`PolicyReader`; ``action_masks`` is unused: legal actions are part of the rows."""
+        values, latents, self._state = self.policy.evaluate(obs, self._state, starts)
+        best = values.argmax(dim=1)
+        probabilities = th.nn.functional.one_hot(best, values.shape[1]).to(values.dtype)
+        reading = StepReading(best.cpu().numpy(), greedy_q_tot(self.policy, obs, values), probabilities)
+        if not isinstance(self.policy.actor, PolicyPool):
+            return reading
+        # The weights with which training samples heads, and each head's best action with probability 1.
+        log_weights, of_heads = self.policy.actor.evaluate(latents)
+        of_heads = of_heads.masked_fill(values.isneginf().unsqueeze(1), -th.inf)  # illegal actions
+        is_best = of_heads == of_heads.max(dim=2, keepdim=True).values
+        pool_actions = th.zeros_like(of_heads).masked_fill(~is_best, -th.inf)
+        return reading._replace(pool_weights=log_weights.exp(), pool_actions=pool_actions)
+
+    def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
+        """See :class:`PolicyReader`."""
+        state = None if self._state is None else tuple(part[rows] for part in self._state)
+        return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state).values)
+
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -140,7 +301,8 @@ class EpisodeRecording(NamedTuple):
     :param returns: (T, B) discounted returns
     :param zones: (T, B), -1 for none; None if there are no zones
     :param pool_weights: (T, B, U) selection probability of each policy; None without a pool
-    :param pool_actions: (T, B, U, P) parameters of each policy's action distribution; None without a pool
+    :param pool_actions: (T, B, U, P) parameters of each policy's action distribution, illegal actions masked; None
+        without a pool
     :param write_attention: (T, E, L, N) attention of slots over agents; None without a knowledge source
     :param read_attention: (T, E, N, L) attention of agents over slots; None without a knowledge source
     :param message_strengths: (T, B) norm of the message that each agent read; None without a knowledge source
@@ -212,7 +374,8 @@ def record_episodes(
     ours = require_our_policy(policy)
     check_trained_on(ours, env, same_size=True)
     check_count("n_eval_episodes", n_eval_episodes)
-    recorder = _Recorder(env, reader_of(ours, env.num_envs, deterministic), normalizer, observations)
+    reader = QReader(ours) if isinstance(ours, QPLEXPolicy) else PolicyReader(ours, deterministic)
+    recorder = _Recorder(env, reader, normalizer, observations)
     draws = pictures and env.render_mode == "rgb_array"
     was_training = ours.training
     ours.set_training_mode(False)

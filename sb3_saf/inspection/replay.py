@@ -103,12 +103,20 @@ def replay(
     for name, player in players.items():
         if not isinstance(player, Actor):  # which checks every observation
             check_trained_on(player, env, name, same_size=True)
-        for game, episode in enumerate(_play(player, env, episodes, seed, deterministic, gamma)):
+        if isinstance(player, Actor):
+            played = _play_actor(player, env, episodes, seed, deterministic)
+        else:
+            policy = player.policy if isinstance(player, BaseAlgorithm) else player
+            discount = float(getattr(player, "gamma", 1.0)) if gamma is None else gamma
+            recording = record_episodes(policy, env, env.num_envs // n_agents, seed, deterministic, gamma=discount)
+            played = [_episode_of(recording, game) for game in range(episodes)]
+        for game, episode in enumerate(played):
+            pictures = [base64.b64encode(png(frame)).decode() for frame in episode.frames]
             run: Packed = {
                 "name": name if episodes == 1 else f"{name}, game {game + 1}",
                 "steps": len(episode.actions),
                 "rewards": _packed(episode.rewards, "f4"),
-                "frames": None if has_grid else [_data_url(frame) for frame in episode.frames],
+                "frames": None if has_grid else [f"data:image/png;base64,{picture}" for picture in pictures],
             }
             if has_grid:
                 scenes, grid = _played_again(episode.actions, env, game, seed)
@@ -149,19 +157,6 @@ def replay(
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(page, encoding="utf-8")
     return target
-
-
-def _play(
-    player: Player, env: VecEnv, episodes: int, seed: int, deterministic: bool, gamma: float | None
-) -> list[_Episode]:
-    """Return one episode of each of the first games."""
-    if isinstance(player, Actor):
-        return _play_actor(player, env, episodes, seed, deterministic)
-    policy = player.policy if isinstance(player, BaseAlgorithm) else player
-    discount = float(getattr(player, "gamma", 1.0)) if gamma is None else gamma
-    n_games = env.num_envs // require_n_agents(env)
-    recording = record_episodes(policy, env, n_games, seed, deterministic, gamma=discount)
-    return [_episode_of(recording, game) for game in range(episodes)]
 
 
 def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
@@ -268,7 +263,3 @@ def _packed(array: npt.ArrayLike, kind: str, scale: float = 1) -> Packed:
         numbers = np.rint(numbers)
     data = np.ascontiguousarray(numbers.astype(np.dtype(_KINDS[kind]).newbyteorder("<"))).tobytes()
     return {"type": kind, "shape": list(numbers.shape), "scale": scale, "data": base64.b64encode(data).decode()}
-
-
-def _data_url(frame: Picture) -> str:
-    return f"data:image/png;base64,{base64.b64encode(png(frame)).decode()}"

@@ -16,8 +16,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_saf.evaluation import confidence_interval
-from sb3_saf.inspection.reading import Replacement
-from sb3_saf.inspection.recording import EpisodeRecording, ReturnScale
+from sb3_saf.inspection.recording import EpisodeRecording, Replacement, ReturnScale
 
 Scalars = dict[str, float]
 Floats = npt.NDArray[np.floating[Any]]

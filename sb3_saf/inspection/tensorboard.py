@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
-from sb3_saf.inspection.reading import OurPolicy
+from sb3_saf.inspection.recording import OurPolicy
 from sb3_saf.teams.vec_env import require_n_agents
 
 #: Formats for numbers only.

@@ -20,14 +20,15 @@ from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_saf.networks.distributions import (
+    SelectedDistribution,
     distribution_of,
     masked_parameters,
     mixture_log_probs,
+    mixture_of,
     n_action_outputs,
     n_action_parameters,
 )
 from sb3_saf.networks.layers import AgentHeads, NetworkSpec, mlp, side_by_side
-from sb3_saf.networks.mixtures import SelectedDistribution, mixture_of
 
 #: Orthogonal gain of the last layer: initial policies are close to uniform.
 ACTION_GAIN = 0.01
@@ -183,7 +184,7 @@ class PolicyPool(ActorNetwork):
 
     ``selection="mixture"``: u is drawn from the weights, then the action from policy u. Likelihood, entropy and most
     likely action are those of the mixture, exact where the action space allows it (see
-    ``sb3_saf.networks.mixtures``).
+    ``sb3_saf.networks.distributions``).
 
     ``selection="gumbel"``: one policy is drawn for each distribution (Gumbel noise on the logits, hard choice,
     straight-through gradient), and likelihood and entropy are that policy's. This is the behaviour of the released

@@ -1,15 +1,19 @@
 """
-Action distributions of single policies: likelihoods, masks, samples, modes, as SB3's distributions.
+Action distributions of single policies and of pools of policies: likelihoods, masks, samples, modes, as SB3's
+distributions.
 
 A policy's parameters are one vector per row: logits (Discrete, MultiDiscrete, MultiBinary), or means and then log
-standard deviations (Box). Letters: B rows, U policies of a pool, P parameters, D action dimensions, M choices of all
-dimensions, A actions.
+standard deviations (Box). A pool is given by log weights (B, U), normalised, and the parameters of all its policies
+(B, U, P). Letters: B rows, U policies of a pool, P parameters, D action dimensions, M choices of all dimensions, A
+actions, J joint actions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import product
 from math import isnan, prod
-from typing import Any, Final, cast
+from typing import Any, ClassVar, Final, cast
 
 import torch as th
 from gymnasium import spaces
@@ -17,11 +21,16 @@ from stable_baselines3.common.distributions import (
     CategoricalDistribution,
     DiagGaussianDistribution,
     Distribution,
+    kl_divergence,
     make_proba_distribution,
 )
-from torch.distributions import Categorical
+from torch import nn
+from torch.distributions import Bernoulli, Categorical, Normal, register_kl
+from torch.distributions import Distribution as TorchDistribution
+from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
 
-from sb3_saf.teams.errors import NonFiniteError
+from sb3_saf.teams.checks import NonFiniteError
 
 #: Logit of masked actions: the probability is exactly zero, without the NaN in sums and gradients of -inf.
 _FORBIDDEN: Final = -1e8
@@ -199,3 +208,264 @@ def mixture_log_probs(log_weights: th.Tensor, logits: th.Tensor) -> th.Tensor:
     # With rows last in memory, inner loops run over many rows instead of few actions.
     of_policies = logits.permute(1, 2, 0).contiguous().log_softmax(dim=1)
     return (log_weights.t().unsqueeze(1) + of_policies).logsumexp(dim=0).t()
+
+
+#: Maximum number of joint actions for which a pool's entropy and most likely action are enumerated.
+MAX_ENUMERATED_ACTIONS: Final = 4096
+#: Maximum number of values in memory while enumerating; more rows are split into checkpointed chunks.
+_ENUMERATED_AT_ONCE: Final = 1 << 22
+
+
+def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
+    """
+    Return the parameters of one policy per row.
+
+    :param parameters: (B, U, P)
+    :param policy: (B,) index of a policy
+    :return: (B, P)
+    """
+    # shape[0], not len(), here and elsewhere: it stays dynamic in exported graphs.
+    return parameters[th.arange(policy.shape[0], device=policy.device), policy]
+
+
+def mixture_log_prob(
+    action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor, actions: th.Tensor
+) -> th.Tensor:
+    """
+    Return the exact log-likelihood of a mixture: log sum_u w_u pi_u(a).
+
+    :param log_weights: (B, U)
+    :param parameters: (B, U, P)
+    :param actions: (B, D)
+    :return: (B,)
+    """
+    actions = actions.reshape(parameters.shape[0], 1, -1)
+    if isinstance(action_space, spaces.Box):
+        mean, log_std = parameters.chunk(2, dim=-1)
+        of_dimensions = Normal(mean, log_std.exp(), validate_args=False).log_prob(actions)
+    elif isinstance(action_space, spaces.MultiBinary):
+        of_dimensions = Bernoulli(logits=parameters, validate_args=False).log_prob(actions)
+    else:
+        logits = split_by_dimension(action_space, parameters)
+        of_actions = [
+            (one - one.logsumexp(dim=2, keepdim=True)).gather(2, action.expand(-1, parameters.shape[1], 1))
+            for one, action in zip(logits, actions.long().split(1, dim=2), strict=True)
+        ]
+        of_dimensions = th.cat(of_actions, dim=2)
+    return (log_weights + of_dimensions.sum(dim=2)).logsumexp(dim=1)
+
+
+def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Draw one policy per row by its weight, with straight-through gradients to the weights.
+
+    :param log_weights: (B, U)
+    :param actions: (B, U, P)
+    :return: (B, P), bit for bit the parameters of the drawn policy
+    """
+    uniform = th.rand_like(log_weights).clamp_min(th.finfo(log_weights.dtype).tiny)
+    noisy = log_weights - (-uniform.log()).log()
+    soft = noisy.softmax(dim=1)
+    # Zero in value; its gradient is that of the soft choice.
+    straight_through = ((soft - soft.detach()).unsqueeze(2) * actions.detach()).sum(dim=1)
+    return policy_parameters(actions, noisy.argmax(dim=1)) + straight_through
+
+
+def is_enumerable(action_space: spaces.Space[Any]) -> bool:
+    """Return whether a mixture's entropy and most likely action are computed by enumerating joint actions."""
+    choices = choices_of(action_space)
+    return bool(choices) and prod(choices) <= MAX_ENUMERATED_ACTIONS
+
+
+def mixture_mode(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+    """
+    Return a mixture's most likely action, or that of its likeliest policy if actions cannot be enumerated.
+
+    :param log_weights: (B, U)
+    :param parameters: (B, U, P)
+    :return: (B, D)
+    """
+    if not is_enumerable(action_space):
+        return likeliest_action(action_space, policy_parameters(parameters, log_weights.argmax(dim=1)))
+    best = _over_joint_actions(action_space, log_weights, parameters, lambda joint: joint.argmax(dim=1))
+    joint_actions = th.tensor(list(product(*map(range, choices_of(action_space)))), device=best.device)
+    # SB3's MultiBinary actions are floats.
+    return joint_actions[best].to(parameters.dtype if isinstance(action_space, spaces.MultiBinary) else th.int64)
+
+
+def _over_joint_actions(
+    action_space: spaces.Space[Any],
+    log_weights: th.Tensor,
+    parameters: th.Tensor,
+    reduce: Callable[[th.Tensor], th.Tensor],
+) -> th.Tensor:
+    """Apply a function (rows, J) -> (rows,) to the mixture's joint log-probabilities, in chunks of bounded memory."""
+
+    def part(log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        joint = _joint_log_probs(action_space, parameters)
+        return reduce((log_weights.unsqueeze(2) + joint).logsumexp(dim=1))
+
+    if th.compiler.is_compiling():
+        return part(log_weights, parameters)
+    rows_at_once = max(1, _ENUMERATED_AT_ONCE // (log_weights.shape[1] * prod(choices_of(action_space))))
+    parts = list(zip(th.split(log_weights, rows_at_once), th.split(parameters, rows_at_once), strict=True))
+    if len(parts) == 1:
+        return part(*parts[0])
+    return th.cat([checkpoint(part, *arguments, use_reentrant=False) for arguments in parts])
+
+
+def _joint_log_probs(action_space: spaces.Space[Any], parameters: th.Tensor) -> th.Tensor:
+    """Return log-probabilities (B, U, J) of every joint action under every policy, last action dimension fastest."""
+    if isinstance(action_space, spaces.MultiBinary):
+        factors = list(th.stack([F.logsigmoid(-parameters), F.logsigmoid(parameters)], dim=3).unbind(dim=2))
+    else:
+        factors = [logits.log_softmax(dim=2) for logits in split_by_dimension(action_space, parameters)]
+    joint = factors[0]
+    for factor in factors[1:]:
+        joint = (joint.unsqueeze(3) + factor.unsqueeze(2)).flatten(2)
+    return joint
+
+
+def mixture_of(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> Distribution:
+    """
+    Make the exact mixture of a pool of policies: pi(a|o) = sum_u w_u(o) pi_u(a|o).
+
+    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
+    :param log_weights: (B, U), normalised
+    :param parameters: (B, U, P)
+    """
+    if isinstance(action_space, spaces.Discrete):
+        return LeanCategorical(int(action_space.n)).of_log_probs(mixture_log_probs(log_weights, parameters))
+    return PoolDistribution(action_space).proba_distribution(log_weights, parameters)
+
+
+class PoolDistribution(Distribution):
+    """
+    Mixture of a pool of policies over actions of several dimensions.
+
+    ``log_prob`` is exact. ``entropy`` and ``mode`` are exact for at most ``MAX_ENUMERATED_ACTIONS`` joint actions. For
+    more, and for Box actions, the entropy is None (no closed form; SB3 then estimates it by -log_prob), and the mode is
+    that of the likeliest policy.
+
+    :param action_space: MultiDiscrete, MultiBinary or Box
+    """
+
+    log_weights: th.Tensor
+    parameters: th.Tensor
+
+    def __init__(self, action_space: spaces.Space[Any]):
+        super().__init__()
+        self.action_space = action_space
+
+    def proba_distribution(self, log_weights: th.Tensor, parameters: th.Tensor) -> PoolDistribution:
+        """Set normalised log weights (B, U) and parameters (B, U, P)."""
+        self.log_weights, self.parameters = log_weights, parameters
+        return self
+
+    @property
+    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # SB3's attribute
+        """Joint distribution of policy and action, for TRPO's KL divergence."""
+        return PolicyAndAction(self.log_weights, distribution_of(self.action_space, self.parameters.flatten(0, 1)))
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """Return log-likelihoods (B,) of actions (B, D)."""
+        return mixture_log_prob(self.action_space, self.log_weights, self.parameters, actions)
+
+    def entropy(self) -> th.Tensor | None:
+        """Return exact entropies (B,) by enumeration, or None."""
+        if not is_enumerable(self.action_space):
+            return None
+        return _over_joint_actions(
+            self.action_space, self.log_weights, self.parameters, lambda joint: -(joint.exp() * joint).sum(dim=1)
+        )
+
+    def sample(self) -> th.Tensor:
+        """Draw a policy, then its action: (B, D)."""
+        policy = th.multinomial(self.log_weights.exp(), 1).squeeze(1)
+        return distribution_of(self.action_space, policy_parameters(self.parameters, policy)).sample()
+
+    def mode(self) -> th.Tensor:
+        """Return the most likely joint action (B, D), or the likeliest policy's mode if they cannot be enumerated."""
+        return mixture_mode(self.action_space, self.log_weights, self.parameters)
+
+    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
+        """Raise an error: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
+        raise NotImplementedError("the parameters of a pool's distribution come from sb3_saf.networks.actor.PolicyPool")
+
+    def actions_from_params(self, *args: Any, deterministic: bool = False, **kwargs: Any) -> th.Tensor:
+        """Set the parameters (see ``proba_distribution``) and act."""
+        self.proba_distribution(*args, **kwargs)
+        return self.get_actions(deterministic=deterministic)
+
+    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
+        """Set the parameters (see ``proba_distribution``), sample, and return the sample and its log-likelihood."""
+        actions = self.actions_from_params(*args, **kwargs)
+        return actions, self.log_prob(actions)
+
+
+class SelectedDistribution(PoolDistribution):
+    """
+    Distribution of one policy, drawn when the parameters are set; deterministic actions are those of the policy with
+    the highest selection logit.
+    """
+
+    drawn: Distribution
+
+    def proba_distribution(self, log_weights: th.Tensor, parameters: th.Tensor) -> SelectedDistribution:
+        """Set normalised log weights (B, U) and parameters (B, U, P), and draw."""
+        super().proba_distribution(log_weights, parameters)
+        self.drawn = distribution_of(self.action_space, draw_policy(log_weights, parameters))
+        return self
+
+    @property
+    def distribution(self) -> PolicyAndAction:  # type: ignore[override]  # SB3's attribute
+        """Raise an error: TRPO would compare policies drawn at different times."""
+        raise ValueError(
+            "selection='gumbel' draws a policy whenever actions are evaluated, so how far two evaluations are apart "
+            "(TRPO's KL divergence) says nothing; use selection='mixture'"
+        )
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """Return log-likelihoods (B,) under the drawn policy."""
+        return self.drawn.log_prob(actions)
+
+    def entropy(self) -> th.Tensor | None:
+        """Return entropies (B,) of the drawn policy."""
+        return self.drawn.entropy()
+
+    def sample(self) -> th.Tensor:
+        """Sample from the drawn policy."""
+        return self.drawn.sample()
+
+    def mode(self) -> th.Tensor:
+        """Return the most likely action of the likeliest policy."""
+        likeliest = policy_parameters(self.parameters, self.log_weights.argmax(dim=1))
+        return distribution_of(self.action_space, likeliest).mode()
+
+
+class PolicyAndAction(TorchDistribution):
+    """
+    Joint distribution of the drawn policy and its action, with KL(w || w') + sum_u w_u KL(pi_u || pi'_u).
+
+    This is an upper bound of the KL divergence of the mixtures, which has no closed form, and zero for equal pools:
+    TRPO's trust region on it also bounds the mixtures.
+
+    :param log_weights: (B, U), normalised
+    :param policies: distribution of B * U rows, those of a mixture's policies consecutive
+    """
+
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, log_weights: th.Tensor, policies: Distribution):
+        super().__init__(log_weights.shape[:1], validate_args=False)
+        self.log_weights = log_weights
+        self.policies = policies
+
+
+@register_kl(PolicyAndAction, PolicyAndAction)
+def _divergence(one: PolicyAndAction, other: PolicyAndAction) -> th.Tensor:
+    """Return the divergence (B,), see :class:`PolicyAndAction`."""
+    weights = one.log_weights.exp()
+    # kl_divergence returns one number per row, or one per action dimension.
+    of_actions = kl_divergence(one.policies, other.policies).reshape(*weights.shape, -1).sum(dim=2)
+    return (weights * (one.log_weights - other.log_weights + of_actions)).sum(dim=1)

@@ -360,7 +360,14 @@ class LightEncoder(Encoder):
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, ...) as (K, features_dim)."""
         if self.pixels.looks_up(observations):
-            return self.net[2:](self._first_layer(observations))
+            first = self.net[0]
+            assert isinstance(first, nn.Linear)
+            used = used_codes(observations.flatten(1))
+            embedded = self.embed(self.tile_inputs[used.codes])
+            # Weights are (hidden, T * e); contributions of a code at each of the T places are (U, T, hidden).
+            by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
+            table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
+            return self.net[2:](rectified_sums(used.views, table, first.bias, self._places))
         if self.pixels.layout == "codes":
             tiles = nn.functional.embedding(observations.long().flatten(1), self.embed(self.tile_inputs))
         else:
@@ -370,17 +377,6 @@ class LightEncoder(Encoder):
             # Pixels in the order of an atlas: (K, tiles, t * t * C).
             tiles = self.embed(cut.permute(0, 2, 4, 3, 5, 1).reshape(-1, self.n_tiles, t * t * channels))
         return self.net(tiles.flatten(1))
-
-    def _first_layer(self, codes: th.Tensor) -> th.Tensor:
-        """Apply the first linear layer and its ReLU: codes (K, rows, columns) to (K, hidden)."""
-        first = self.net[0]
-        assert isinstance(first, nn.Linear)
-        used = used_codes(codes.flatten(1))
-        embedded = self.embed(self.tile_inputs[used.codes])
-        # Weights are (hidden, T * e); contributions of a code at each of the T places are (U, T, hidden).
-        by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
-        table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
-        return rectified_sums(used.views, table, first.bias, self._places)
 
 
 class MLPEncoder(Encoder):

@@ -24,16 +24,14 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_saf.buffers.later import LaterValues, Step
-from sb3_saf.buffers.rollout import TeamMinibatch, TeamRolloutBuffer
+from sb3_saf.buffers.rollout import LaterValues, Step, TeamMinibatch, TeamRolloutBuffer
 from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
-from sb3_saf.networks.critic import StateCritic, TeamCritic
+from sb3_saf.networks.critic import StateCritic, TeamCritic, ValueNormalizer
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.encoders import ObservationEncoder
 from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
 from sb3_saf.networks.memory import Memory, MemoryName
 from sb3_saf.networks.row_encoder import Encoded, EncodedRows, joined
-from sb3_saf.networks.value_normalizer import ValueNormalizer
 from sb3_saf.policies.memory import Masks, RememberingPolicy, RunningMemory
 from sb3_saf.policies.parts import TeamParts
 from sb3_saf.policies.rows import ChunkSize, entry_of
@@ -78,7 +76,7 @@ class TeamPolicy(RememberingPolicy):
     :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for convolved
         pictures, whose intermediate results should fit the cache
     :param normalize_values: whether the critic learns returns normalised by their running mean and variance (see
-        ``sb3_saf.networks.value_normalizer``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
+        ``sb3_saf.networks.critic``); needs ``rollout_buffer_class=TeamRolloutBuffer``. ``"agent"`` keeps mean
         and variance of each agent's own returns, for agents whose rewards differ in scale. The policy's values,
         ``train/value_loss`` and ``clip_range_vf`` are on the raw scale in all cases
     :param memory: ``"gru"``, ``"lstm"``, or None for policies of the present observation
@@ -182,7 +180,19 @@ class TeamPolicy(RememberingPolicy):
     # --- construction -----------------------------------------------------------------------------------------------
 
     def _build(self, lr_schedule: Schedule) -> None:
-        spec = of_critic = self._network_spec()
+        sizes = self.net_arch if isinstance(self.net_arch, dict) else {"pi": self.net_arch, "vf": self.net_arch}
+        if set(sizes) != {"pi", "vf"}:
+            raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(sizes)}")
+        spec = of_critic = NetworkSpec(
+            self.features_dim,
+            self.team_spaces.n_agents,
+            self.action_space,
+            list(sizes["pi"]),
+            list(sizes["vf"]),
+            self.activation_fn,
+            self.log_std_init,
+            self.team_spaces.state,
+        )
         if self.memory is not None:
             self.actor_memory = Memory(self.memory, self.features_dim, self.memory_size)
             spec = spec._replace(features_dim=self.memory_size)
@@ -205,21 +215,6 @@ class TeamPolicy(RememberingPolicy):
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not kwargs.keys() & _OTHER_THAN_FUSED:
             kwargs["fused"] = True  # takes a third of the time
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
-
-    def _network_spec(self) -> NetworkSpec:
-        sizes = self.net_arch if isinstance(self.net_arch, dict) else {"pi": self.net_arch, "vf": self.net_arch}
-        if set(sizes) != {"pi", "vf"}:
-            raise ValueError(f"net_arch must be a list or have the keys 'pi' and 'vf', got the keys {sorted(sizes)}")
-        return NetworkSpec(
-            self.features_dim,
-            self.team_spaces.n_agents,
-            self.action_space,
-            list(sizes["pi"]),
-            list(sizes["vf"]),
-            self.activation_fn,
-            self.log_std_init,
-            self.team_spaces.state,
-        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()

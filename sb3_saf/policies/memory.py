@@ -20,8 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_saf.buffers.later import ROWS_AT_ONCE, Step
-from sb3_saf.buffers.rollout import TeamMinibatch
+from sb3_saf.buffers.rollout import ROWS_AT_ONCE, Step, TeamMinibatch
 from sb3_saf.networks.critic import OwnValueHead, StateCritic, TeamCritic
 from sb3_saf.networks.layers import gather
 from sb3_saf.networks.memory import MEMORY_NAMES, Memory, MemoryName

@@ -57,16 +57,7 @@ class TeamRowsPolicy(BasePolicy):
         encode_once: bool | None,
         chunk_size: ChunkSize,
     ) -> None:
-        """
-        Read the spaces.
-
-        :param observation_space: Dict of ``obs``, ``team``, ``agent``, and optionally ``active``, ``action_mask``,
-            ``state``
-        :param encode_once: whether equal observations are encoded once; None for True with integer observations
-        :param chunk_size: observations encoded at once on the CPU; None for all, ``"auto"`` for all, except for
-            convolved pictures, whose intermediate results should fit the cache
-        :raises ValueError: if the space is not that of a team
-        """
+        """Read the spaces; arguments and errors as in :class:`~sb3_saf.policies.base.TeamPolicy`."""
         if chunk_size is not None and chunk_size != "auto":
             check_count("chunk_size", chunk_size)
         self.team_spaces = TeamSpaces.from_observation_space(observation_space)

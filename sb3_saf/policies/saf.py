@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Final, NamedTuple, get_args
+from typing import ClassVar, Final, get_args
 
 import torch as th
 from stable_baselines3 import PPO
@@ -26,18 +26,6 @@ from sb3_saf.policies.parts import (
     team_policies,
 )
 from sb3_saf.teams.checks import check_choice, check_count
-
-
-class Communicated(NamedTuple):
-    """
-    States of the agents and the exchange through the knowledge source.
-
-    :param states: (G, N, d), s of every agent
-    :param exchanged: messages read, and the attention of writing and reading
-    """
-
-    states: th.Tensor
-    exchanged: Exchanged
 
 
 class SAFCritic(TeamCritic):
@@ -68,26 +56,29 @@ class SAFCritic(TeamCritic):
 
     def states(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
         """See :class:`TeamCritic`; (G, N, d), or (G, 1, N d) with those of inactive agents read as zeros."""
-        communicated = self.communicate(features, teams, active)
-        states = self.combine_net(th.cat([communicated.states, communicated.exchanged.read], dim=2))
+        states, exchanged = self.communicate(features, teams, active)
+        states = self.combine_net(th.cat([states, exchanged.read], dim=2))
         if isinstance(self.value_head, OwnValueHead):
             return states
         if active is not None:
             states = states * active.unsqueeze(2)
         return states.flatten(1).unsqueeze(1)
 
-    def communicate(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> Communicated:
+    def communicate(
+        self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None
+    ) -> tuple[th.Tensor, Exchanged]:
         """
         Exchange the agents' messages through the knowledge source.
 
         :param features: (K, d) features of own observations
         :param teams: (G, N), index into ``features`` of each agent of a team
         :param active: (G, N) bool, agents that take part; all if None
+        :return: s of every agent (G, N, d); messages read, and the attention of writing and reading
         """
         # g_theta and g_omega depend on one observation only: computed once per unique observation, then gathered.
         ((own_messages, own_states),) = side_by_side([[self.message_net, self.state_net]], features)
         messages, states = gather(own_messages, teams), gather(own_states, teams)
-        return Communicated(states, self.knowledge_source(messages, states, active))
+        return states, self.knowledge_source(messages, states, active)
 
 
 @dataclass(frozen=True)

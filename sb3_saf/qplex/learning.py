@@ -15,8 +15,7 @@ import torch as th
 from sb3_saf.buffers.replay import TeamReplaySamples, TeamSteps
 from sb3_saf.networks.layers import gather
 from sb3_saf.qplex.mixers import JointChoice, Mixed
-from sb3_saf.qplex.parts import q_values
-from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy
+from sb3_saf.qplex.policies import QNetworks, QPLEXPolicy, q_values
 
 
 class TeamError(NamedTuple):
@@ -70,7 +69,13 @@ def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -
     td, weights = _mix(policy, online, values, samples.now, features.now, samples.actions)
     with th.no_grad():
         best = _q_values(online, latents.after, samples.after).argmax(dim=2)
-        features = _target_features(policy, views, now, after)
+        if policy.target.memory is not None:
+            every = policy.encode_with(policy.target.encoder, views)
+            features = Features(gather(every, now), gather(every, after))
+        else:  # the target's features before the step are unused
+            occurring, rows = after.unique(return_inverse=True)
+            of_after = gather(policy.encode_with(policy.target.encoder, views[occurring]), rows)
+            features = Features(of_after, of_after)
         following = _q_values(policy.target, _recall(policy.target, features, samples).after, samples.after)
         value = _mix(policy, policy.target, following, samples.after, features.after, best).q_tot
         target = samples.rewards + gamma * (1.0 - samples.dones) * value
@@ -79,17 +84,6 @@ def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -
         return error
     counted = samples.sequences.counted
     return TeamError(*(None if part is None else part[counted] for part in error))  # type: ignore[arg-type]
-
-
-def _target_features(policy: QPLEXPolicy, views: th.Tensor, now: th.Tensor, after: th.Tensor) -> Features:
-    """Encode views with the target networks; without memory, only those after a step."""
-    networks = policy.target
-    if networks.memory is not None:
-        every = policy.encode_with(networks.encoder, views)
-        return Features(gather(every, now), gather(every, after))
-    occurring, rows = after.unique(return_inverse=True)
-    features = gather(policy.encode_with(networks.encoder, views[occurring]), rows)
-    return Features(features, features)  # the target's features before the step are unused
 
 
 def _agents(x: th.Tensor) -> th.Tensor:

@@ -152,21 +152,15 @@ class AttentionKernels(nn.Module):
         self.key = ParallelMLPs(n_kernels, [state_dim, *hidden, 1])
         self.agents = ParallelMLPs(n_kernels, [state_dim, *hidden, n_agents])
         self.action = ParallelMLPs(n_kernels, [state_dim + n_agents * n_actions, *hidden, n_agents])
-        self._tell_joint_actions_apart(n_agents, n_agents * n_actions)
-
-    @th.no_grad()
-    def _tell_joint_actions_apart(self, n_agents: int, n_inputs: int) -> None:
-        """
-        Apply He initialisation to the networks that read the joint action.
-
-        One-hot actions count as N inputs, the number of non-zero ones. Together with a wide state they would hardly
-        affect the hidden layers, and the initial lambda would be nearly additive over agents. Where an advantage is
-        close to zero, lambda gets no gradient, so it would keep the value extrapolated from that sum (docs/qplex.md).
-        """
+        # The networks that read the joint action have He initialisation. One-hot actions count as N inputs, the number
+        # of non-zero ones. Together with a wide state they would hardly affect the hidden layers, and the initial
+        # lambda would be nearly additive over agents. Where an advantage is close to zero, lambda gets no gradient, so
+        # it would keep the value extrapolated from that sum (docs/qplex.md).
         first, *others = self.action.weights
-        _he_uniform(first[:, -n_inputs:], n_agents)
-        for weight in others:
-            _he_uniform(weight, weight.shape[1])
+        with th.no_grad():
+            _he_uniform(first[:, -n_agents * n_actions :], n_agents)
+            for weight in others:
+                _he_uniform(weight, weight.shape[1])
 
     def forward(self, state: th.Tensor, state_and_actions: th.Tensor) -> th.Tensor:
         """Compute lambda (G, N) from states (G, S) and states with joint actions (G, S + N A)."""

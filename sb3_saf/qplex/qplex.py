@@ -27,7 +27,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
-from sb3_saf.callbacks.game_steps import GAME_STEPS_TAG
+from sb3_saf.callbacks import GAME_STEPS_TAG
 from sb3_saf.policies.parts import AlgorithmSpec, Declaration, memory_variants
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import MixerName
@@ -291,20 +291,6 @@ class QPLEX(OffPolicyAlgorithm):
             others = np.where(legal, np.random.random(legal.shape), -1.0).argmax(axis=1)  # noqa: NPY002
         return np.where(explores, others, actions)
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Choose the actions (B,) of the next step; all random before ``learning_starts`` game steps."""
-        assert isinstance(self._last_obs, dict)
-        starts = self._last_episode_starts
-        if self.agent_state is not None and len(self.agent_state[0]) != n_envs:
-            self.agent_state = None  # another environment
-        actions, state = self.policy.predict(self._last_obs, self.agent_state, starts)
-        rate = 1.0 if self._game_steps() < learning_starts else self.exploration_rate
-        actions = self._explore(actions, rate, self._last_obs.get(ACTION_MASK_KEY))
-        self.agent_state = None if state is None else (*state[:-1], actions.copy())
-        return actions, actions
-
     def collect_rollouts(
         self,
         env: VecEnv,
@@ -324,16 +310,32 @@ class QPLEX(OffPolicyAlgorithm):
         """
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
-        actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
+        if self.agent_state is not None and len(self.agent_state[0]) != env.num_envs:
+            self.agent_state = None  # another environment
+        assert isinstance(self._last_obs, dict)
+        actions, state = self.policy.predict(self._last_obs, self.agent_state, self._last_episode_starts)
+        rate = 1.0 if self._game_steps() < learning_starts else self.exploration_rate
+        actions = self._explore(actions, rate, self._last_obs.get(ACTION_MASK_KEY))
+        self.agent_state = None if state is None else (*state[:-1], actions.copy())
         new_obs, rewards, dones, infos = env.step(actions)
-        assert isinstance(new_obs, dict)
+        assert isinstance(new_obs, dict) and isinstance(replay_buffer, TeamReplayBuffer)
         dones = team_dones(dones, self.n_agents, alone=True).repeat(self.n_agents)
         self.num_timesteps += env.num_envs
         callback.update_locals(locals())
         if not callback.on_step():
             return RolloutReturn(self.n_games, 0, continue_training=False)
         self._update_info_buffer(infos, dones)
-        self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)
+        keys = [key for key in _STORED_KEYS if key in new_obs]
+        after = {key: new_obs[key] for key in keys}
+        ended = np.flatnonzero(dones).tolist()
+        if ended:
+            after = {key: part.copy() for key, part in after.items()}
+        for row in ended:
+            for key in keys:
+                after[key][row] = infos[row][TERMINAL_OBSERVATION][key]
+        starts = self._last_episode_starts
+        replay_buffer.add(self._last_obs, after, actions, rewards, dones, infos, episode_starts=starts)
+        self._last_obs, self._last_episode_starts = new_obs, dones
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._on_step()
         n_episodes = int(np.count_nonzero(dones)) // self.n_agents
@@ -345,31 +347,6 @@ class QPLEX(OffPolicyAlgorithm):
             self.dump_logs()
         callback.on_rollout_end()
         return RolloutReturn(self.n_games, n_episodes, continue_training=True)
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Store one step of all games, with the last observations of games that ended."""
-        assert isinstance(self._last_obs, dict) and isinstance(new_obs, dict)
-        assert isinstance(replay_buffer, TeamReplayBuffer)
-        keys = [key for key in _STORED_KEYS if key in new_obs]
-        after = {key: new_obs[key] for key in keys}
-        ended = np.flatnonzero(dones)
-        if len(ended):
-            after = {key: part.copy() for key, part in after.items()}
-            for row in ended.tolist():
-                for key in keys:
-                    after[key][row] = infos[row][TERMINAL_OBSERVATION][key]
-        replay_buffer.add(
-            self._last_obs, after, buffer_action, reward, dones, infos, episode_starts=self._last_episode_starts
-        )
-        self._last_obs, self._last_episode_starts = new_obs, dones
 
     def _on_step(self) -> None:
         """Update the target networks and the exploration rate."""

@@ -1,7 +1,7 @@
 """
 Suites of cooperative games by name: ``make_team_env("lbf/Foraging-8x8-2p-3f-v3", n_envs=8)``.
 
-A suite is one file of this folder with a constant ``SUITE``, an object of :class:`sb3_saf.suites.suite.Suite`, which
+A suite is one file of this folder with a constant ``SUITE``, an object of :class:`sb3_saf.suites.registry.Suite`, which
 adapts an installed package. ``make_team_env``, the commands and the experiments find it by the part of an id before the
 slash; ``python -m sb3_saf.suites`` lists all. Packages are imported only when a game is made or listed.
 

@@ -9,9 +9,7 @@ from functools import partial
 from typing import Any, Final
 
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-from sb3_saf.suites.references import references
-from sb3_saf.suites.registry import HOME, find_environment, suites
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import HOME, Suite, find_environment, references, suites
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.teams.rows import TeamSpaces
 

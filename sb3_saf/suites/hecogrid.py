@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 _VERSION: Final = "-v0"
 

@@ -9,20 +9,20 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 #: Requirements of all suites of JaxMARL.
 JAXMARL: Final = ('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"')
 
 
 def _tasks() -> list[str]:
-    from sb3_saf.suites.engines.jaxmarl_envs import registered
+    from sb3_saf.suites.engines.jaxmarl import registered
 
     return registered()
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+    from sb3_saf.suites.engines.jaxmarl import vec_env
 
     return vec_env(task, n_envs, seed, **params)
 

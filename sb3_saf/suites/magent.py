@@ -11,7 +11,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from sb3_saf.suites.suite import Suite, modules_with_versions, parallel_env
+from sb3_saf.suites.registry import Suite, modules_with_versions, parallel_env
 
 SUITE: Final = Suite(
     name="magent",

@@ -23,7 +23,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 #: Side of the engine's sprites in pixels.
 _SPRITE: Final = 8

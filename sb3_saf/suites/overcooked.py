@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from sb3_saf.suites.jaxmarl import JAXMARL
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 
 def _tasks() -> list[str]:
@@ -21,7 +21,7 @@ def _tasks() -> list[str]:
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+    from sb3_saf.suites.engines.jaxmarl import vec_env
     from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts
 
     return vec_env("overcooked", n_envs, seed, fixed={"layout": overcooked_layouts[task]}, **params)

@@ -1,25 +1,189 @@
-"""Environments by name, the one look-up of Python, commands and experiments; suites by their files."""
+"""
+Environments by name, the one look-up of Python, commands and experiments; the declaration of a suite, and all suites by
+their files; and known results of tasks (``references.csv``), to tell whether a return is normal.
+
+The same game is quoted in several units and with several lengths of an episode. A reference therefore names the
+parameters of the game that differ from the suite's defaults, and its unit: ``return``, the team's in the suite's unit
+(sum or mean over agents, ``Suite.team_return``), or ``won``, the fraction of games won. Others are never compared.
+"""
 
 from __future__ import annotations
 
+import csv
 import importlib
+import math
 import pkgutil
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cache, partial
+from fnmatch import fnmatchcase
+from functools import cache, cached_property, partial
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
 from importlib.util import find_spec
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
 import pettingzoo
+import yaml
+from packaging.requirements import Requirement
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf.suites
 from sb3_saf.envs.gymnasium_team import as_parallel
-from sb3_saf.suites.suite import N_NEAREST, Suite
 from sb3_saf.teams.checks import import_by_name
+
+#: Reduction of the rewards of a team's agents to one number.
+Reduction = Literal["sum", "mean"]
+
+#: Maximum number of nearest names in a message.
+N_NEAREST: Final = 3
+
+
+@dataclass(frozen=True)
+class Suite:
+    """
+    A package of games for teams, with ``game``, ``vec_env`` or both; see :mod:`sb3_saf.suites`.
+
+    :param name: part of an id before the slash
+    :param title: one line
+    :param requires: requirements in pip's format, the suite's own package first; as in the extra of ``setup.cfg``
+    :param extra: extra of ``setup.cfg`` that installs them; empty for packages of this repository
+    :param page: address of the package's documentation
+    :param list_tasks: returns the names after the slash; only called if the package is installed, so it may import it
+    :param examples: tasks shown by ``python -m sb3_saf.suites`` with agents and spaces
+    :param game: makes one game: ``game(task, *, render_mode=None, **params)``
+    :param vec_env: makes all games: ``vec_env(task, n_envs, seed, *, state=False, render_mode=None, **params)``
+    :param competitive: patterns of tasks whose agents play against each other
+    :param team_return: the suite's unit of returns: the sum over agents of their rewards, or the mean (if every agent
+        receives the team's whole reward)
+    :param team_reward: default reward for learning, see ``make_team_env``
+    :param training_params: parameters of the games for training only, such as shaped rewards
+    :param defaults: parameters of the games in ``make_team_env`` and the commands where they differ from the package's
+    :param complete: ``complete(task, params)`` checks parameters without making a game, and returns them with all
+        others of the game, ``n_agents`` among them; None if a game must be made to know them
+    :param level_params: parameters that name a level in logs; empty for all that are given
+    :param always_active: whether all agents take part from beginning to end, so that rows need no ``"active"``
+    :param is_drawn_from_state: whether games have ``grid_scene()`` and pictures at no cost
+    :param is_seeded: whether seeds determine its games
+    :param module: module of the package, if it may be a source folder on ``PYTHONPATH`` instead of an installed package
+    """
+
+    name: str
+    title: str
+    requires: tuple[str, ...]
+    extra: str
+    page: str
+    list_tasks: Callable[[], Sequence[str]]
+    examples: tuple[str, ...]
+    game: Callable[..., Any] | None = None
+    vec_env: Callable[..., Any] | None = None
+    competitive: tuple[str, ...] = ()
+    team_return: Reduction = "sum"
+    team_reward: Literal["given"] | Reduction = "given"
+    training_params: tuple[str, ...] = ()
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    complete: Callable[[str, Mapping[str, Any]], dict[str, Any]] | None = None
+    level_params: tuple[str, ...] = ()
+    always_active: bool = False
+    is_drawn_from_state: bool = False
+    is_seeded: bool = True
+    module: str | None = None
+
+    def __post_init__(self) -> None:
+        assert self.game is not None or self.vec_env is not None, f"{self.name}: neither game nor vec_env"
+
+    @property
+    def requirements(self) -> tuple[Requirement, ...]:
+        """Parsed requirements of this interpreter."""
+        parsed = (Requirement(line) for line in self.requires)
+        return tuple(one for one in parsed if one.marker is None or one.marker.evaluate())
+
+    @property
+    def pip_line(self) -> str:
+        """Command that installs the suite, in a clone of this repository."""
+        return f"pip install 'sb3-saf[{self.extra}]'"
+
+    def installed_version(self) -> str | None:
+        """Return the version of the suite's own package, None if it is not installed."""
+        installed = _version(self._package)
+        return "of a source folder" if installed is None and self._is_source_folder(self._package) else installed
+
+    @property
+    def _package(self) -> str:
+        return Requirement(self.requires[0]).name
+
+    def _is_source_folder(self, package: str) -> bool:
+        return package == self._package and self.module is not None and find_spec(self.module) is not None
+
+    def problem(self) -> str | None:
+        """Return why no game can be made, None if all requirements are installed."""
+        if not self.requirements:
+            return f"needs another version of Python: {'; '.join(self.requires)}"
+        for requirement in self.requirements:
+            installed = _version(requirement.name)
+            if installed is None and self._is_source_folder(requirement.name):
+                continue
+            if installed is None:
+                return f"needs {requirement.name}, which is not installed: {self.pip_line}"
+            if not requirement.specifier.contains(installed, prereleases=True):
+                return (
+                    f"works with {requirement.name}{requirement.specifier}, got version {installed}: "
+                    f"pip install '{requirement.name}{requirement.specifier}'"
+                )
+        return None
+
+    @cached_property
+    def tasks(self) -> tuple[str, ...]:
+        """
+        Names after the slash.
+
+        :raises ValueError: if the package is missing or has an unsupported version, with the install command
+        """
+        if (problem := self.problem()) is not None:
+            raise ValueError(f"{self.name}/...: {problem}")
+        return tuple(self.list_tasks())
+
+    def is_competitive(self, task: str) -> bool:
+        """Return whether the agents of a task play against each other."""
+        return any(fnmatchcase(task, pattern) for pattern in self.competitive)
+
+    def find_task(self, task: str) -> str | None:
+        """Return a task by its name, with or without the version ``-v0``; None if there is none."""
+        return next((name for name in (task, f"{task}-v0") if name in self.tasks), None)
+
+    def unknown_task(self, task: str) -> ValueError:
+        """Return an error that names the nearest tasks and the command that lists all."""
+        near = get_close_matches(task, self.tasks, n=N_NEAREST)
+        names = ", ".join(f"{self.name}/{name}" for name in near or self.examples)
+        hint = f"did you mean {names}?" if near else f"there are {names}, ..."
+        return ValueError(
+            f"unknown task '{self.name}/{task}'; {hint} (python -m sb3_saf.suites {self.name} lists all "
+            f"{len(self.tasks)})"
+        )
+
+
+def modules_with_versions(package: str) -> list[str]:
+    """Return the names of a package's modules that end with a version, such as ``simple_spread_v3``."""
+    modules = pkgutil.iter_modules(importlib.import_module(package).__path__)
+    return [module.name for module in modules if module.name[-1].isdigit()]
+
+
+def parallel_env(package: str, task: str, *, render_mode: str | None = None, **params: Any) -> Any:
+    """Make a game of one of these modules, named as in PettingZoo's packages."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The old environment creation API", DeprecationWarning)  # names no other
+        module = importlib.import_module(f"{package}.{task}")
+    return module.parallel_env(render_mode=render_mode, **params)
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
+
 
 #: Suite whose tasks are named without it: "TeamSupport" is "hecogrid/TeamSupport-v0".
 HOME: Final = "hecogrid"
@@ -170,3 +334,113 @@ def suites() -> dict[str, Suite]:
             if isinstance(suite, Suite):
                 declared[suite.name] = suite
     return declared
+
+
+# --- known results ----------------------------------------------------------------------------------------------------
+
+
+RANDOM: Final = "random"
+
+
+class Reference(NamedTuple):
+    """
+    A known result of a task.
+
+    :param params: parameters of the game that differ from the suite's defaults
+    :param unit: ``"return"`` or ``"won"``
+    :param game_steps: of its training; 0 for players that do not learn
+    """
+
+    task: str
+    params: Mapping[str, Any]
+    unit: str
+    value: float
+    method: str
+    game_steps: int
+    source: str
+
+    def __str__(self) -> str:
+        value = f"{100 * self.value:.0f} % won" if self.unit == "won" else f"{self.value:g}"
+        steps = f" after {self.game_steps:,} game steps" if self.game_steps else ""
+        return f"{self.method} {value}{steps}"
+
+
+@cache
+def _all_references() -> tuple[Reference, ...]:
+    lines = files("sb3_saf.suites").joinpath("references.csv").read_text(encoding="utf-8").splitlines()
+    return tuple(
+        Reference(
+            row["task"],
+            {key: yaml.safe_load(value) for key, _, value in (word.partition(":") for word in row["params"].split())},
+            row["unit"],
+            float(row["value"]),
+            row["method"],
+            int(row["game_steps"]),
+            row["source"],
+        )
+        for row in csv.DictReader(lines)
+    )
+
+
+def references(env: str | TeamEnvironment, params: Mapping[str, Any] | None = None) -> list[Reference]:
+    """
+    Return what is known of a task.
+
+    :param env: the environment, or its id, whose package need not be installed
+    :param params: only references of games with these parameters, in training or in evaluation; None for all
+    """
+    name = (env if isinstance(env, str) else env.id).removeprefix(f"{HOME}/")
+    known = [one for one in _all_references() if one.task in (name, f"{name}-v0")]
+    if params is None:
+        return known
+    environment = find_environment(env) if isinstance(env, str) else env
+    shaping = () if environment.suite is None else environment.suite.training_params
+    played = _without(environment.complete(params), shaping)
+    return [one for one in known if _without(environment.complete(one.params), shaping) == played]
+
+
+def _without(params: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: value for name, value in params.items() if name not in names}
+
+
+class Standing(NamedTuple):
+    """
+    A result beside what is known of its task.
+
+    :param share: of the way from a random team to the closest published result; None if one of them is unknown
+    """
+
+    text: str
+    share: float | None
+
+
+def standing(
+    env: TeamEnvironment, params: Mapping[str, Any], scores: Mapping[str, float], game_steps: int
+) -> Standing | None:
+    """
+    Compare a result with what is known of its task: players that do not learn, and the published result whose training
+    is closest in game steps, as a ratio.
+
+    :param scores: the result by unit, from the most telling one: ``won``, ``return``
+    :return: None if nothing is known in these units
+    """
+    over = "sum" if env.suite is None else env.suite.team_return
+    texts, share = [], None
+    for unit, score in scores.items():
+        known = [one for one in references(env, params) if one.unit == unit]
+        trained = [one for one in known if one.game_steps]
+        if not known:
+            continue
+        here = f"{100 * score:.0f} % won" if unit == "won" else f"return, {over} over agents: {score:.4g}"
+        texts += [here, *(str(one) for one in known if not one.game_steps)]
+        floor = next((one.value for one in known if one.method == RANDOM), None)
+        if trained:
+            closest = min(trained, key=lambda one: (abs(math.log(one.game_steps / max(1, game_steps))), -one.value))
+            texts.append(f"{closest} ({closest.source})")
+            if share is None and floor is not None and closest.value > floor:
+                share = (score - floor) / (closest.value - floor)
+    if not texts:
+        return None
+    if share is not None:
+        texts.append("below random" if share < 0 else f"{share:.0%} of the way from random to published")
+    return Standing("; ".join(texts), share)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 _PREFIX: Final = "rware"
 

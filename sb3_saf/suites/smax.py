@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from sb3_saf.suites.jaxmarl import JAXMARL
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 
 def _tasks() -> list[str]:
@@ -22,7 +22,7 @@ def _tasks() -> list[str]:
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl_envs import vec_env
+    from sb3_saf.suites.engines.jaxmarl import vec_env
     from sb3_saf.suites.engines.jaxmarl_package import MAP_NAME_TO_SCENARIO
 
     return vec_env("HeuristicEnemySMAX", n_envs, seed, fixed={"scenario": MAP_NAME_TO_SCENARIO[task]}, **params)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from sb3_saf.suites.suite import Suite
+from sb3_saf.suites.registry import Suite
 
 
 def _tasks() -> list[str]:

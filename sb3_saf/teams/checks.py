@@ -1,4 +1,4 @@
-"""Checks of arguments, and errors for unknown names typed by users."""
+"""Checks of arguments, errors of this package, and errors for unknown names typed by users."""
 
 from __future__ import annotations
 
@@ -116,3 +116,23 @@ def check_form(name: str, value: Any, like: Any) -> None:
             raise ValueError(f"expected {name} of shape {like.shape} and {like.dtype}, got {shape} and {dtype}")
     elif not isinstance(value, type(like)):
         raise ValueError(f"expected {name} to be a {type(like).__name__}, got {value!r:.80}")
+
+
+class ExportError(ValueError):
+    """Raised for an invalid or untrusted file, or a model that cannot be exported."""
+
+
+class SettingsError(ValueError):
+    """Raised for settings that do not fit the model."""
+
+
+class NonFiniteError(ValueError):
+    """Raised for NaN or infinity in training data, losses or gradients."""
+
+
+class CheckpointError(ValueError):
+    """Raised for a checkpoint that cannot be written, read, or used with the given model."""
+
+
+class DamagedCheckpointError(CheckpointError):
+    """Raised for a truncated or changed file, whose checksum does not match."""

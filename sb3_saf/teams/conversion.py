@@ -148,16 +148,21 @@ def _as_array(value: Any) -> Array:
         return np.asarray(None)
 
 
-def leaves_of(space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Iterator[Leaf]:
-    """Yield the innermost spaces of nested Dicts and Tuples, in the order of ``gymnasium.spaces.flatten``."""
+def innermost(space: spaces.Space[Any], path: tuple[Key, ...] = ()) -> Iterator[tuple[tuple[Key, ...], Any]]:
+    """Yield the innermost spaces of nested Dicts and Tuples with their paths, as ``gymnasium.spaces.flatten`` does."""
     from gymnasium import spaces
 
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
         for key, part in parts:
-            yield from leaves_of(part, (*path, key))
+            yield from innermost(part, (*path, key))
     else:
-        yield Leaf.of(space, path)
+        yield path, space
+
+
+def leaves_of(space: spaces.Space[Any]) -> list[Leaf]:
+    """Describe the innermost spaces of nested Dicts and Tuples."""
+    return [Leaf.of(part, path) for path, part in innermost(space)]
 
 
 def read_leaves(leaves: Sequence[Leaf], observation: Any) -> list[Array]:

@@ -15,8 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, tile_images
 
-from sb3_saf.teams.checks import check_count, check_whole_teams
-from sb3_saf.teams.errors import NonFiniteError
+from sb3_saf.teams.checks import NonFiniteError, check_count, check_whole_teams
 from sb3_saf.teams.randomness import game_seeds
 from sb3_saf.teams.rows import IS_SUCCESS, Array, bounds_of
 

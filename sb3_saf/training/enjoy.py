@@ -18,10 +18,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
-from sb3_saf.export.weights import load_weights
+from sb3_saf.export.writer import load_weights
 from sb3_saf.inspection.figures import gif
-from sb3_saf.suites.references import standing
-from sb3_saf.suites.registry import find_environment
+from sb3_saf.suites.registry import find_environment, standing
 from sb3_saf.teams.checks import check_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
@@ -33,9 +32,8 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import find_model
+from sb3_saf.training.folders import WEIGHTS, find_model, find_team, version_in_errors
 from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
-from sb3_saf.training.trained_teams import WEIGHTS, find_team, version_in_errors
 from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.enjoy"

@@ -197,34 +197,29 @@ def draw_levels(
     styles = method_styles(_methods_of(results))
     figure, all_axes = _figure(len(panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
-        _draw_bars(ax, rows, level, styles, names or {})
+        # Side by side at each level, in the order of the methods.
+        methods, levels = _methods_of(rows), sorted(rows[level].unique())
+        width = min(0.3, 0.8 / len(methods))
+        for index, method in enumerate(methods):
+            of_method, style = rows[rows["method"] == method], styles[method]
+            found = [value for value in levels if (of_method[level] == value).any()]
+            estimates = [
+                mean_over_seeds(of_method[of_method[level] == value].groupby("seed")["score"].mean().to_numpy())
+                for value in found
+            ]
+            values = np.array([estimate.value for estimate in estimates])
+            margins = np.array([[e.value - e.low, e.high - e.value] for e in estimates]).reshape(-1, 2).T
+            places = [levels.index(value) + (index - (len(methods) - 1) / 2) * width for value in found]
+            label = (names or {}).get(method, method)
+            ax.bar(places, values, width * 0.92, color=style.colour, hatch=style.hatch, edgecolor="white", label=label)
+            ax.errorbar(places, values, yerr=margins, fmt="none", ecolor="black", capsize=3, linewidth=1)
+        ax.set_xticks(range(len(levels)), [str(value) for value in levels])
+        ax.set_xlim(-0.6, len(levels) - 0.4)
         if maximum is not None:
             ax.axhline(maximum, color=_REFERENCE, linestyle=":", label="largest possible")
         ax.set(xlabel=level, ylabel=y_label, title=fill(name, _TITLE_WIDTH))
         _start_at_zero(ax, rows["score"].to_numpy())
     return _finish(figure, all_axes, title)
-
-
-def _draw_bars(ax: Axes, rows: pd.DataFrame, level: str, styles: Mapping[str, Style], names: Mapping[str, str]) -> None:
-    """Draw the bars of one panel: side by side at each level, in the order of the methods."""
-    methods, levels = _methods_of(rows), sorted(rows[level].unique())
-    width = min(0.3, 0.8 / len(methods))
-    for index, method in enumerate(methods):
-        of_method = rows[rows["method"] == method]
-        found = [value for value in levels if (of_method[level] == value).any()]
-        estimates = [
-            mean_over_seeds(of_method[of_method[level] == value].groupby("seed")["score"].mean().to_numpy())
-            for value in found
-        ]
-        values = np.array([estimate.value for estimate in estimates])
-        margins = np.array([[e.value - e.low, e.high - e.value] for e in estimates]).reshape(-1, 2).T
-        places = [levels.index(value) + (index - (len(methods) - 1) / 2) * width for value in found]
-        style = styles[method]
-        label = names.get(method, method)
-        ax.bar(places, values, width * 0.92, color=style.colour, hatch=style.hatch, edgecolor="white", label=label)
-        ax.errorbar(places, values, yerr=margins, fmt="none", ecolor="black", capsize=3, linewidth=1)
-    ax.set_xticks(range(len(levels)), [str(value) for value in levels])
-    ax.set_xlim(-0.6, len(levels) - 0.4)
 
 
 def draw_differences(

@@ -10,8 +10,7 @@ from typing import Any, Final
 
 from sb3_saf.export.act import Actor
 from sb3_saf.inspection.replay import replay
-from sb3_saf.teams.checks import check_seed, evaluation_seed
-from sb3_saf.teams.errors import ExportError
+from sb3_saf.teams.checks import ExportError, check_seed, evaluation_seed
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,

@@ -1,5 +1,6 @@
 """
-Training from settings: make the games, make the model, learn, save.
+Training from settings: make the games, make the model, learn, save; and the callbacks of a run, which count game steps
+and leave the random generators of training unchanged.
 
 Commands, tuning, experiments and scripts call :func:`train`. :class:`Training` has the same function in two steps, for
 callers that distinguish errors of preparation from errors of training.
@@ -8,29 +9,229 @@ callers that distinguish errors of preparation from errors of training.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+import time
+import warnings
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from tqdm import TqdmExperimentalWarning
+from tqdm.rich import tqdm
 
-from sb3_saf.callbacks.finite import FiniteCallback
-from sb3_saf.callbacks.game_steps import GameStepsCallback
+from sb3_saf.callbacks import FiniteCallback, GameStepsCallback, TeamEvalCallback, team_steps
 from sb3_saf.checkpoints.learning import resumable_learn
-from sb3_saf.checkpoints.models import settings_restored_on_error
+from sb3_saf.checkpoints.states import settings_restored_on_error
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
-from sb3_saf.export.weights import read_weights
+from sb3_saf.evaluation import EvaluationResult
+from sb3_saf.export.writer import read_weights
 from sb3_saf.inspection.callback import InspectionCallback
+from sb3_saf.suites.registry import Standing, standing
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import atomic_file, remove_leftovers
-from sb3_saf.training.callbacks import CheckpointInGameSteps, GameStepsProgressBar, SeededEvalCallback, TrainingClock
+from sb3_saf.teams.randomness import own_randomness
+from sb3_saf.teams.vec_env import require_n_agents
 from sb3_saf.training.folders import CHECKPOINTS, CURVE_POINTS, MONITOR, finish_run, write_curve
 from sb3_saf.training.settings import Settings
 from sb3_saf.training.wrappers import load_normalization, make_callbacks, save_normalization
+
+
+class SeededEvalCallback(TeamEvalCallback):
+    """
+    Evaluate with a separate seed, so that training is unchanged.
+
+    The last evaluation is of the final policy: at the last game step it waits for the update that follows.
+
+    :param seed: of the run
+    :param settings: of the games of evaluation, to log ``eval/share_of_published``, see ``sb3_saf.suites.registry``
+    """
+
+    def __init__(self, *args: Any, seed: int, settings: Settings, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._seed = evaluation_seed(seed)
+        self._settings = settings
+        self.standing: Standing | None = None
+        #: Evaluations of the run so far.
+        self.n_evaluations = 0
+        self._evaluated_at = -1
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps >= self.locals["total_timesteps"] or super()._on_step()
+
+    def _evaluate(self) -> bool:
+        self.n_evaluations += 1
+        self._evaluated_at = team_steps(self.model)
+        with own_randomness(self._seed + self.n_evaluations, self.model.device):
+            return super()._evaluate()
+
+    def _log(self, result: EvaluationResult) -> None:
+        settings = self._settings
+        self.standing = standing(settings.environment, settings.env_kwargs, result.scores, team_steps(self.model))
+        if self.standing is not None and self.standing.share is not None:
+            self.logger.record("eval/share_of_published", self.standing.share)
+        super()._log(result)
+
+    def checkpoint_state(self) -> dict[str, int]:
+        """Return the counters, for exact resume."""
+        return {"n_evaluations": self.n_evaluations, "evaluated_at": self._evaluated_at}
+
+    def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
+        """Restore the counters."""
+        self.n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
+
+    def _on_training_end(self) -> None:
+        if self.eval_freq > 0 and self._evaluated_at != team_steps(self.model):
+            self._evaluate()
+
+
+class TrainingClock(BaseCallback):
+    """
+    Record processor time and wall time against game steps, also over resumed trainings.
+
+    :param every_game_steps: minimum game steps between two points
+    """
+
+    def __init__(self, every_game_steps: float) -> None:
+        super().__init__()
+        self.every_game_steps = every_game_steps
+        self._points: list[tuple[float, float]] = []
+        self._started_at = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+        #: Processor and wall seconds of earlier parts of the training, and both clocks at the begin of this part.
+        self._spent = np.zeros(2)
+        self._begin: npt.NDArray[np.float64] | None = None
+
+    @property
+    def points(self) -> npt.NDArray[np.float64]:
+        """Game steps, and processor seconds of this process until then, (K, 2)."""
+        return np.array(self._points, dtype=np.float64).reshape(-1, 2)
+
+    def cost(self) -> dict[str, Any]:
+        """Return the cost of the training."""
+        processor, wall = self._seconds()
+        return {
+            "started": self._started_at,
+            "wall_seconds": float(wall),
+            "processor_seconds": float(processor),
+            "threads": th.get_num_threads(),
+            "device": str(self.model.device),
+        }
+
+    def _seconds(self) -> npt.NDArray[np.float64]:
+        return self._spent if self._begin is None else self._spent + _clocks() - self._begin
+
+    def _add_point(self) -> None:
+        self._points.append((team_steps(self.model), float(self._seconds()[0])))
+
+    def _on_training_start(self) -> None:
+        self._begin = _clocks()
+
+    def _on_rollout_start(self) -> None:
+        # Rollouts of off-policy algorithms are a few steps each.
+        if not self._points or team_steps(self.model) >= self._points[-1][0] + self.every_game_steps:
+            self._add_point()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self._spent, self._begin = self._seconds(), None
+        self._add_point()
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the points, the time until now, and when training began, as plain data."""
+        return {"points": self.points, "seconds": self._seconds(), "started_at": self._started_at}
+
+    def load_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """Restore a state of :meth:`checkpoint_state`."""
+        self._points = [(float(steps), float(seconds)) for steps, seconds in state["points"]]
+        self._spent, self._started_at = state["seconds"], state["started_at"]
+
+
+def _clocks() -> npt.NDArray[np.float64]:
+    return np.array([time.process_time(), time.perf_counter()])
+
+
+class GameStepsProgressBar(ProgressBarCallback):
+    """SB3's progress bar in game steps instead of agent steps."""
+
+    def _on_training_start(self) -> None:
+        n_agents = require_n_agents(self.training_env)
+        total = self.locals["total_timesteps"] - self.model.num_timesteps
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TqdmExperimentalWarning)
+            self.pbar = tqdm(total=total // n_agents, unit="game steps")
+
+    def _on_step(self) -> bool:
+        self.pbar.update(self.training_env.num_envs // require_n_agents(self.training_env))
+        return True
+
+    def _on_training_end(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the bar, also if training never began, or ended by an error."""
+        if hasattr(self, "pbar"):
+            self.pbar.close()
+
+
+class ProgressLines(BaseCallback):
+    """Print a line for every tenth of the training, for log files and terminals without a progress bar."""
+
+    def __init__(self, verbose: int = 1) -> None:
+        super().__init__(verbose)
+
+    def _on_training_start(self) -> None:
+        self._total = self.locals["total_timesteps"] // require_n_agents(self.training_env)
+        self._begun = time.perf_counter(), team_steps(self.model)
+        self._tenths = 10 * self._begun[1] // self._total
+
+    def _on_step(self) -> bool:
+        steps = team_steps(self.model)
+        if self.verbose == 0 or 10 * steps // self._total <= self._tenths:
+            return True
+        self._tenths = 10 * steps // self._total
+        rate = (steps - self._begun[1]) / max(time.perf_counter() - self._begun[0], 1e-9)
+        left = timedelta(seconds=round(max(0, self._total - steps) / rate))
+        episodes = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        mean = f", team return {np.mean(episodes):.2f} in training" if episodes else ""
+        print(
+            f"{10 * self._tenths:3} % of {self._total:,} game steps{mean}; {rate:,.0f} game steps per second, about "
+            f"{left} (h:mm:ss) to go",
+            flush=True,
+        )
+        return True
+
+
+class CheckpointInGameSteps(BaseCallback):
+    """Save the model every ``save_freq`` game steps, of all games together, as ``rl_model_<game steps>_steps.zip``."""
+
+    def __init__(self, save_freq: int, folder: str | Path, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.save_freq = save_freq
+        self.folder = Path(folder)
+        self._next = 0
+
+    def _on_training_start(self) -> None:
+        self._next = (team_steps(self.model) // self.save_freq + 1) * self.save_freq
+
+    def _on_step(self) -> bool:
+        steps = team_steps(self.model)
+        if steps >= self._next:
+            self._next = (steps // self.save_freq + 1) * self.save_freq
+            path = self.folder / f"rl_model_{steps}_steps.zip"
+            with atomic_file(path) as file:
+                self.model.save(file)
+            if self.verbose > 0:
+                print(f"Saved {path}")
+        return True
+
 
 #: Evaluations, inspections and checkpoints of a run, unless a frequency is given.
 EVALUATIONS_PER_RUN: Final = 20
@@ -132,7 +333,18 @@ class Training:
             th.set_num_threads(self.options.num_threads)
         with ExitStack() as self._open:  # closes the parts already made if a later one fails
             self.games = self._games(settings, monitor_dir=folder, n_cpus=self.options.n_cpus)
-            self.model = self._make_model()
+            if (log := self.options.tensorboard_log) is not None:
+                log.mkdir(parents=True, exist_ok=True)
+            self.model = settings.make_model(
+                self.games,
+                seed,
+                device=self.options.device,
+                tensorboard_log=None if log is None else str(log),
+                verbose=self.options.verbose,
+            )
+            if (initial := self.options.initial_model) is not None:
+                load_parameters(self.model, initial)
+                load_normalization(self.games, initial.parent)
             self.clock = TrainingClock(settings.game_steps / (2 * CURVE_POINTS))
             self.evaluation: SeededEvalCallback | None = None
             self.callbacks = [self.clock, *callbacks, *self._make_callbacks()]
@@ -192,25 +404,9 @@ class Training:
         self._open.callback(games.close)
         return games
 
-    def _make_model(self) -> BaseAlgorithm:
-        options, log = self.options, self.options.tensorboard_log
-        if log is not None:
-            log.mkdir(parents=True, exist_ok=True)
-        model = self.settings.make_model(
-            self.games,
-            self.seed,
-            device=options.device,
-            tensorboard_log=None if log is None else str(log),
-            verbose=options.verbose,
-        )
-        if options.initial_model is not None:
-            load_parameters(model, options.initial_model)
-            load_normalization(self.games, options.initial_model.parent)
-        return model
-
     def _make_callbacks(self) -> list[BaseCallback]:
-        options = self.options
-        callbacks = make_callbacks(self.settings.wrapping)
+        options, settings = self.options, self.settings
+        callbacks = make_callbacks(settings.wrapping)
         if options.progress:
             bar = GameStepsProgressBar()
             self._open.callback(bar.close)
@@ -218,32 +414,30 @@ class Training:
         if self.folder is not None and options.save_freq > 0:
             callbacks.append(CheckpointInGameSteps(options.save_freq, self.folder, options.verbose))
         if eval_freq := self._every(options.eval_freq, EVALUATIONS_PER_RUN):
-            self.evaluation = self._evaluation(eval_freq)
+            of_evaluation, folder = options.eval_settings or settings, None if self.folder is None else str(self.folder)
+            if of_evaluation.n_agents != settings.n_agents:
+                raise ValueError(
+                    f"evaluation needs the {settings.n_agents} agents of training, got "
+                    f"n_agents={of_evaluation.n_agents}"
+                )
+            n_games = min(options.n_eval_envs, options.eval_episodes)
+            self.evaluation = SeededEvalCallback(
+                self._games(of_evaluation, evaluation=True, n_envs=n_games),
+                seed=self.seed,
+                settings=of_evaluation,
+                callback_after_eval=options.after_evaluation,
+                best_model_save_path=folder,
+                log_path=folder,
+                n_eval_episodes=options.eval_episodes,
+                eval_freq=eval_freq,
+                deterministic=options.deterministic_eval or not of_evaluation.spec.draws_actions,
+                verbose=options.verbose,
+            )
             callbacks.append(self.evaluation)
         inspect_freq = self._every(options.inspect_freq, INSPECTIONS_PER_RUN)
-        if options.tensorboard_log is not None and inspect_freq and "normalize" not in self.settings.wrapping:
+        if options.tensorboard_log is not None and inspect_freq and "normalize" not in settings.wrapping:
             callbacks.append(self._inspection(inspect_freq))
         return callbacks
-
-    def _evaluation(self, eval_freq: int) -> SeededEvalCallback:
-        options, settings = self.options, self.options.eval_settings or self.settings
-        if settings.n_agents != self.settings.n_agents:
-            raise ValueError(
-                f"evaluation needs the {self.settings.n_agents} agents of training, got n_agents={settings.n_agents}"
-            )
-        folder = None if self.folder is None else str(self.folder)
-        return SeededEvalCallback(
-            self._games(settings, evaluation=True, n_envs=min(options.n_eval_envs, options.eval_episodes)),
-            seed=self.seed,
-            settings=settings,
-            callback_after_eval=options.after_evaluation,
-            best_model_save_path=folder,
-            log_path=folder,
-            n_eval_episodes=options.eval_episodes,
-            eval_freq=eval_freq,
-            deterministic=options.deterministic_eval or not settings.spec.draws_actions,
-            verbose=options.verbose,
-        )
 
     def _inspection(self, every_game_steps: int) -> InspectionCallback:
         """Make the callback that inspects the policy for TensorBoard, on games not used in training."""

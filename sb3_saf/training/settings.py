@@ -4,28 +4,48 @@ result except the seed, and makes the games and the model.
 
 They come from ``zoo_configs``: ``levels.yml`` has the games of each size, the algorithm's file its hyperparameters. The
 files have only differences from the constructors' defaults. E games, N agents.
+
+:func:`ppo_settings` returns PPO's for teams, for use in scripts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import inspect
+import math
+import reprlib
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_hints
 
+import msgspec
+import torch as th
+from msgspec import Meta
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.utils import is_masking_supported
+from stable_baselines3 import PPO
+from stable_baselines3.common import vec_env
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
+from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.make import make_team_env
+from sb3_saf.networks.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
+from sb3_saf.networks.memory import MemoryName
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS, DECLARATIONS
 from sb3_saf.suites.registry import HOME, TeamEnvironment, find_environment, suites
 from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
-from sb3_saf.training.values import algorithm_arguments, convert, policy_arguments
+from sb3_saf.teams.rows import TeamSpaces
+from sb3_saf.teams.vec_env import require_n_agents, shares_reward
 from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows
 from sb3_saf.training.yaml_files import DEFAULT, SIZES, Size, entry_of, merge, read_settings
 
@@ -349,3 +369,181 @@ def _build(
     return Settings(
         algo, environment.id, size, n_agents, env_kwargs, time_limit, n_envs, game_steps, hyperparams, plain, wrapping
     )
+
+
+# --- plain values as arguments of constructors ------------------------------------------------------------------------
+
+
+#: Classes by name for each key that takes a class. Names are looked up here only; nothing is imported or evaluated.
+CLASSES: Final[dict[str, dict[str, type]]] = {
+    "rollout_buffer_class": {"TeamRolloutBuffer": TeamRolloutBuffer},
+    "features_extractor_class": {
+        encoder.__name__: encoder for encoder in (LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN)
+    },
+    "activation_fn": {
+        "tanh": nn.Tanh,
+        "relu": nn.ReLU,
+        "elu": nn.ELU,
+        "gelu": nn.GELU,
+        "silu": nn.SiLU,
+        "leaky_relu": nn.LeakyReLU,
+    },
+    "optimizer_class": {"Adam": th.optim.Adam, "AdamW": th.optim.AdamW, "RMSprop": th.optim.RMSprop},
+}
+
+#: Ranges that the algorithms' constructors do not check.
+RANGES: Final[dict[str, Meta]] = {
+    **dict.fromkeys(("gamma", "gae_lambda", "tau"), Meta(ge=0, le=1)),
+    **dict.fromkeys(("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), Meta(ge=0, le=1)),
+    **dict.fromkeys(("learning_rate", "ent_coef", "vf_coef", "learning_starts"), Meta(ge=0)),
+    **dict.fromkeys(("clip_range", "max_grad_norm", "target_kl"), Meta(gt=0)),
+    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "n_minibatches", "game_steps"), Meta(ge=1)),
+    **dict.fromkeys(("buffer_size", "train_freq", "target_update_interval", "stats_window_size"), Meta(ge=1)),
+    "n_envs": Meta(ge=1, le=100_000),
+    "frame_stack": Meta(ge=1, le=1_000),
+}
+
+#: Constructor arguments that are set by the run, not by its settings.
+_RUN_ARGUMENTS: Final = {
+    *("self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
+}
+_POLICY_RUN_ARGUMENTS: Final = {"self", "observation_space", "action_space", "lr_schedule", "args", "kwargs"}
+
+
+def convert(name: str, value: object, hint: Any) -> Any:
+    """
+    Convert a plain value to a constructor argument.
+
+    Numbers may be text, since YAML 1.1 reads ``7e-4`` as text. ``lin_0.001`` is RL-Zoo3's schedule, linear from 0.001
+    to 0.
+
+    :param name: the argument's name, which selects its classes and its range
+    :param value: value from YAML or a command line; classes and functions are returned unchanged
+    :raises ValueError: for a wrong type or range
+    """
+    members = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    is_schedule = any(get_origin(member) is Callable for member in members)
+    if isinstance(value, str):
+        if name in CLASSES:
+            if value not in CLASSES[name]:
+                raise unknown_name(name, value, CLASSES[name])
+            return CLASSES[name][value]
+        if is_schedule and value.startswith("lin_"):
+            return LinearSchedule(convert(name, value.removeprefix("lin_"), float), 0.0, 1.0)
+    if Any in members or callable(value):
+        return value
+    kinds = [member for member in members if get_origin(member) not in (Callable, type)]
+    if name in RANGES:
+        kinds = [Annotated[kind, RANGES[name]] if kind in (int, float) else kind for kind in kinds]
+    try:
+        if not kinds:
+            raise ValueError(f"expected one of {', '.join(CLASSES.get(name, ()))}")
+        result = msgspec.convert(value, Union[tuple(kinds)], strict=False)  # noqa: UP007 (made of a list)
+        if isinstance(result, float) and not math.isfinite(result):
+            raise ValueError("expected a finite number")
+        return result
+    except ValueError as error:
+        schedules = " (or a schedule such as 'lin_7e-4')" if is_schedule else ""
+        raise ValueError(f"invalid setting {name}={reprlib.repr(value)}: {error}{schedules}") from None
+
+
+def algorithm_arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """Return the valid settings of an algorithm with types: its constructor's arguments but for the run's."""
+    return _init_hints(algorithm, _RUN_ARGUMENTS)
+
+
+def policy_arguments(policy: type[BasePolicy]) -> dict[str, Any]:
+    """
+    Return the valid ``policy_kwargs`` with types: the arguments of the constructors of the policy and of its base
+    classes, and the fields of its parts.
+    """
+    arguments: dict[str, Any] = {}
+    for base in reversed(policy.__mro__):
+        if issubclass(base, BasePolicy) and "__init__" in vars(base):
+            arguments |= _init_hints(base, _POLICY_RUN_ARGUMENTS)
+    parts = getattr(policy, "parts_class", None)
+    if parts is not None and is_dataclass(parts):
+        hints = get_type_hints(parts)
+        arguments |= {field.name: hints[field.name] for field in fields(parts)}
+    return arguments
+
+
+def _init_hints(owner: type, without: set[str]) -> dict[str, Any]:
+    init = owner.__init__  # type: ignore[misc]
+    hints = get_type_hints(init, localns=vars(vec_env) | {"vec_env": vec_env})  # of SB3's type of environments
+    return {name: hints.get(name, Any) for name in inspect.signature(init).parameters if name not in without}
+
+
+# --- settings for scripts ---------------------------------------------------------------------------------------------
+
+
+#: Settings of ``sb3_saf.train --size small`` that also apply to scripts.
+_OF_BUFFER: Final = ("rollout_buffer_class", "rollout_buffer_kwargs")
+_TAKEN: Final = ("learning_rate", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", *_OF_BUFFER)
+#: The same for HECOGrid's games only.
+_TAKEN_OF_HECOGRID: Final = (*_TAKEN, "gamma")
+
+
+def ppo_settings(
+    env: VecEnv,
+    algo: str = "mappo",
+    algorithm: type[OnPolicyAlgorithm] = PPO,
+    memory: MemoryName | None = None,
+    **overrides: Any,
+) -> dict[str, Any]:
+    """
+    Return PPO hyperparameters for an environment of teams::
+
+        model = PPO("MAPPOPolicy", env, **sb3_saf.ppo_settings(env))
+        model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf"))
+        model = MaskablePPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf", MaskablePPO))
+        model = PPO("SAFPolicy", env, **sb3_saf.ppo_settings(env, "saf", memory="gru"))
+
+    They are those of ``sb3_saf.train --size small``: ``TeamRolloutBuffer``, and a few minibatches per rollout with the
+    same number of game steps for any number of games. HECOGrid with tile codes has its own settings: the light encoder,
+    narrow heads, normalised values, its discount, and a learning rate that decreases to 0.
+
+    Where agents have rewards of their own (``team_reward="given"``, unless the suite gives all the team's), advantages
+    are normalised for each agent, and so are values if ``policy_kwargs`` has ``normalize_values``: agents that are paid
+    less learn as fast as those that are paid more.
+
+    :param env: from ``make_team_env``, with any number of games
+    :param algo: the method, a name of ``sb3_saf.train --algo`` that PPO trains. The settings of ``"saf"`` include its
+        widths, which other policies do not take
+    :param algorithm: the class for which the settings are, those that it takes: PPO, MaskablePPO, TRPO, or A2C, which
+        keeps its own short rollouts
+    :param memory: ``"gru"`` or ``"lstm"`` for agents that remember their episode
+    :param overrides: arguments of the algorithm that take precedence; ``policy_kwargs`` are merged
+    :raises ValueError: if ``env`` has no teams, or the algorithm does not train ``algo``
+    """
+    trained = [name for name, spec in ALGOS.items() if spec.algorithm is PPO]
+    if algo not in trained:
+        raise unknown_name("method of PPO", algo, trained)
+    n_agents, spec = require_n_agents(env), find_algorithm(algo, algorithm.__name__)
+    n_games, own = env.num_envs // n_agents, TeamSpaces.from_observation_space(env.observation_space).own
+    encoder = LightEncoder if hasattr(own, "atlas") else None
+    source = entry_of(read_settings(spec.config), ("default",) if encoder is None else ("default", HOME), "small")
+    hints, taken = algorithm_arguments(algorithm), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
+    policy: Any = algorithm.policy_aliases[spec.policy]
+    found = {key: convert(key, source[key], hints[key]) for key in taken if key in source and key in hints}
+    if not policy.takes_team_buffer:  # masks and sequences need buffers of their own
+        found = {key: value for key, value in found.items() if key not in _OF_BUFFER}
+    if "batch_size" in hints:
+        rollout = source["n_steps"] * source["n_envs"]  # game steps, in all games
+        n_minibatches = source["n_minibatches"]
+        n_steps = max(source["n_steps"], -(-rollout // (n_games * n_minibatches)) * n_minibatches)
+        teams = int(overrides.get("n_steps", n_steps)) * n_games
+        found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
+    policy_kwargs = source.get("policy_kwargs", {}) | spec.policy_kwargs
+    if memory is not None:
+        policy_kwargs["memory"] = memory
+    if encoder is not None:
+        policy_kwargs["features_extractor_class"] = encoder
+    if not policy.takes_team_buffer:
+        policy_kwargs.pop("normalize_values", None)
+    policy_kwargs |= overrides.get("policy_kwargs") or {}
+    if shares_reward(env):
+        found.pop("rollout_buffer_kwargs", None)
+    elif policy_kwargs.get("normalize_values") is True:
+        policy_kwargs["normalize_values"] = "agent"
+    return {**found, **overrides, "policy_kwargs": policy_kwargs}

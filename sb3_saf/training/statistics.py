@@ -113,17 +113,23 @@ def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Float
 
 def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
     """Return the interquartile mean of each method's (S, K) scores with a stratified bootstrap interval over seeds."""
-    values, intervals = _bootstrap(scores, lambda runs: np.array([_interquartile_mean(runs)]))
-    return {
-        method: Estimate(float(values[method][0]), *(float(end) for end in intervals[method][:, 0]))
-        for method in scores
-    }
+
+    def mean(runs: Floats) -> float:  # rliable's aggregate_iqm without scipy's checks, which take most of its time
+        ordered = np.sort(runs, axis=None)
+        cut = len(ordered) // 4
+        return float(ordered[cut : len(ordered) - cut].mean())
+
+    return _estimates(scores, mean)
 
 
 def optimality_gaps(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
     """Return the mean missing part of a score of 1 for each method's (S, K) scores, as :func:`interquartile_means`."""
-    values, intervals = _bootstrap(scores, lambda runs: np.array([1 - np.minimum(runs, 1).mean()]))
-    return {method: Estimate(float(values[method][0]), *map(float, intervals[method][:, 0])) for method in scores}
+    return _estimates(scores, lambda runs: float(1 - np.minimum(runs, 1).mean()))
+
+
+def _estimates(scores: Mapping[str, Floats], statistic: Callable[[Floats], float]) -> dict[str, Estimate]:
+    profiles = _bootstrap(scores, lambda runs: np.array([statistic(runs)]))
+    return {method: Estimate(*(float(part[0]) for part in parts)) for method, parts in profiles.items()}
 
 
 def probability_of_improvement(first: Floats, second: Floats) -> Estimate:
@@ -140,30 +146,16 @@ def probability_of_improvement(first: Floats, second: Floats) -> Estimate:
         pairs = x[:, np.newaxis], y[np.newaxis]
         return np.array([np.mean(pairs[0] > pairs[1]) + 0.5 * np.mean(pairs[0] == pairs[1])])
 
-    from rliable.library import get_interval_estimates
-
-    with own_randomness(BOOTSTRAP_SEED, th.device("cpu")):
-        values, intervals = get_interval_estimates({"": [first, second]}, probability, reps=N_RESAMPLES)
-    ends = intervals[""][:, 0] if min(len(first), len(second)) > 1 else (np.nan, np.nan)
-    return Estimate(float(values[""][0]), *map(float, ends))
-
-
-def _interquartile_mean(runs: Floats) -> float:
-    """Return rliable's ``aggregate_iqm`` without scipy's checks, which take most of its time."""
-    scores = np.sort(runs, axis=None)
-    cut = len(scores) // 4
-    return float(scores[cut : len(scores) - cut].mean())
+    parts = _bootstrap({"": [first, second]}, probability)[""]
+    return Estimate(*(float(part[0]) for part in parts))
 
 
 def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> dict[str, Profile]:
     """Return the fraction of each method's (S, K) scores above thresholds (X,), with stratified bootstrap intervals."""
-    shares, intervals = _bootstrap(scores, lambda runs: (runs[..., None] > thresholds).mean(axis=(0, 1)))
-    return {method: Profile(shares[method], *intervals[method]) for method in scores}
+    return _bootstrap(scores, lambda runs: (runs[..., None] > thresholds).mean(axis=(0, 1)))
 
 
-def _bootstrap(
-    scores: Mapping[str, Floats], statistic: Callable[[Floats], Floats]
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
+def _bootstrap(scores: Mapping[str, Any], statistic: Callable[..., Floats]) -> dict[str, Profile]:
     """Return rliable's point estimates and 95 % intervals; the intervals are NaN for a single seed."""
     from rliable.library import get_interval_estimates
 
@@ -171,6 +163,6 @@ def _bootstrap(
     with own_randomness(BOOTSTRAP_SEED, th.device("cpu")):
         values, intervals = get_interval_estimates(dict(scores), statistic, reps=N_RESAMPLES)
     for method, runs in scores.items():
-        if len(runs) < 2:
+        if min(map(len, runs if isinstance(runs, list) else [runs])) < 2:
             intervals[method] = np.full_like(intervals[method], np.nan)
-    return values, intervals
+    return {method: Profile(values[method], *intervals[method]) for method in scores}

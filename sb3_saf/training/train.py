@@ -17,10 +17,8 @@ from typing import Any, Final
 
 import yaml
 
-from sb3_saf.teams.checks import MAX_SEED, check_seed
-from sb3_saf.teams.errors import CheckpointError, NonFiniteError, SettingsError
+from sb3_saf.teams.checks import MAX_SEED, CheckpointError, NonFiniteError, SettingsError, check_seed
 from sb3_saf.teams.files import digest
-from sb3_saf.training.callbacks import ProgressLines
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -35,7 +33,7 @@ from sb3_saf.training.commands import (
     user_errors,
 )
 from sb3_saf.training.folders import RUN_FILE, find_unfinished, make_run_folder, python_command, write_run
-from sb3_saf.training.run import RunOptions, Training
+from sb3_saf.training.run import ProgressLines, RunOptions, Training
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
 

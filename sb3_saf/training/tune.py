@@ -23,10 +23,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.teams.checks import MAX_SEED
-from sb3_saf.training.callbacks import SeededEvalCallback
-from sb3_saf.training.run import RunOptions, Training
-from sb3_saf.training.settings import Settings
-from sb3_saf.training.values import algorithm_arguments, policy_arguments
+from sb3_saf.training.run import RunOptions, SeededEvalCallback, Training
+from sb3_saf.training.settings import Settings, algorithm_arguments, policy_arguments
 
 #: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.
 _COUNTED: Final = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
@@ -178,7 +176,11 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
         study.set_user_attr("goal", goal)
-    _fail_dead_trials(study)
+    # Trials of killed processes of this machine would stay RUNNING and count for ever.
+    for dead in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        host, process = dead.user_attrs.get(_PROCESS, ("", 0))
+        if host == socket.gethostname() and not psutil.pid_exists(process):
+            study.tell(dead.number, state=TrialState.FAIL)
     callbacks: list[MaxTrialsCallback] = []
     n_trials: int | None = tuning.n_trials
     if tuning.max_total_trials is not None:
@@ -193,14 +195,6 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
         gc_after_trial=True,
     )
     return study
-
-
-def _fail_dead_trials(study: optuna.Study) -> None:
-    """End the trials of killed processes of this machine, which would stay RUNNING and count for ever."""
-    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        host, process = trial.user_attrs.get(_PROCESS, ("", 0))
-        if host == socket.gethostname() and not psutil.pid_exists(process):
-            study.tell(trial.number, state=TrialState.FAIL)
 
 
 def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:

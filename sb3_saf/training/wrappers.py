@@ -110,21 +110,17 @@ def wrap_rows(
             raise ValueError(f"vec_env_wrapper must be a class of SB3's VecEnvWrapper, got {wrapper}")
         rows = wrap(rows)
     if normalize is not False:
-        rows = _normalized(rows, {} if normalize is True else dict(normalize), gamma, is_training)
+        space = rows.observation_space
+        own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
+        # Pictures and tile codes are not normalised, since encoders scale them.
+        norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
+        arguments = {"gamma": gamma, "norm_obs": norm_obs, **({} if normalize is True else normalize)}
+        if own is not space and arguments["norm_obs"]:
+            arguments["norm_obs_keys"] = [OBS_KEY]
+        if not is_training:
+            arguments |= {"training": False, "norm_reward": False}
+        rows = _called("normalize", VecNormalize, arguments, rows)
     return CentralizedValueWrapper(rows, time_limit=env.time_limit)
-
-
-def _normalized(rows: VecEnv, arguments: dict[str, Any], gamma: float, is_training: bool) -> VecEnv:
-    """Add VecNormalize; pictures and tile codes are not normalised, since encoders scale them."""
-    space = rows.observation_space
-    own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
-    norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
-    arguments = {"gamma": gamma, "norm_obs": norm_obs, **arguments}
-    if own is not space and arguments["norm_obs"]:
-        arguments["norm_obs_keys"] = [OBS_KEY]
-    if not is_training:
-        arguments |= {"training": False, "norm_reward": False}
-    return _called("normalize", VecNormalize, arguments, rows)
 
 
 def stages_of(wrapping: Mapping[str, Any], game_steps: int) -> list[Stage]:

@@ -79,7 +79,16 @@ def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[st
         raise ValueError(f"{file} must map 'default' and environment ids to settings, got {reprlib.repr(content)}")
     base = content.pop(BASE, None)
     for key, entry in content.items():
-        content[key] = _checked_entry(entry, f"{file}: the entry {key!r}")
+        what = f"{file}: the entry {key!r}"
+        entry = content[key] = {} if entry is None else entry
+        if not isinstance(entry, dict):
+            raise ValueError(f"{what} must map names to values, got {reprlib.repr(entry)}")
+        sections = entry.get(SIZES_KEY, {})
+        if not isinstance(sections, dict) or not all(isinstance(section, dict) for section in sections.values()):
+            raise ValueError(f"{what}: {SIZES_KEY!r} must map sizes to settings, got {reprlib.repr(sections)}")
+        for size in sections:
+            if size not in SIZES:
+                raise ValueError(f"{what}: {unknown_name('size', size, SIZES)}")
     if base is None:
         return content
     others = [name for name in config_names() if name not in refined_by]
@@ -103,19 +112,6 @@ def _config(name: str) -> Any:
 def config_names() -> list[str]:
     """Return the names of the files of ``zoo_configs``, without ``.yml``."""
     return sorted(file.name[:-4] for file in files("zoo_configs").iterdir() if file.name.endswith(".yml"))
-
-
-def _checked_entry(entry: Any, what: str) -> dict[str, Any]:
-    entry = {} if entry is None else entry
-    if not isinstance(entry, dict):
-        raise ValueError(f"{what} must map names to values, got {reprlib.repr(entry)}")
-    sizes = entry.get(SIZES_KEY, {})
-    if not isinstance(sizes, dict) or not all(isinstance(section, dict) for section in sizes.values()):
-        raise ValueError(f"{what}: {SIZES_KEY!r} must map sizes to settings, got {reprlib.repr(sizes)}")
-    for size in sizes:
-        if size not in SIZES:
-            raise ValueError(f"{what}: {unknown_name('size', size, SIZES)}")
-    return entry
 
 
 def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dict[str, Any]:

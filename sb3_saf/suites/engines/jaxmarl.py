@@ -7,8 +7,11 @@ suite's ``reset`` after ``step_env``: its ``step`` also resets, but loses the la
 
 from __future__ import annotations
 
+import contextlib
+import io
+import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -17,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch
+from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch, ResumableBatchVecEnv
+from sb3_saf.suites.engines.jaxmarl_package import MABRAX_AVAILABLE, SUBMODULE_ENVIRONMENTS, jaxmarl
 from sb3_saf.suites.engines.jaxmarl_package import spaces as jax_spaces
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
@@ -362,3 +366,167 @@ class JaxGames(ResumableBatch):
         games = jax.tree.unflatten(tree, [jnp.array(state[jax.tree_util.keystr(path)]) for path, _ in own])
         self._buffers = jax.vmap(self._programs.packing.pack)(games)
         self._n_steps = int(state["n_steps"])
+
+
+Picture = npt.NDArray[np.uint8]
+
+#: Side of matplotlib pictures in inches.
+_INCHES: Final = 4
+
+
+def _sides(env: Any, state: Any) -> tuple[Any, Any]:
+    """Return whether any ally, and any enemy, is alive in SMAX."""
+    alive = _battle(state).unit_alive
+    return alive[: env.num_allies].any(), alive[env.num_allies :].any()
+
+
+def _battle(state: Any) -> Any:
+    """Return the battle within the state of an environment with scripted enemies."""
+    return getattr(state, "state", state)
+
+
+def _both_alive(env: Any, state: Any) -> Any:
+    allies, enemies = _sides(env, state)
+    return allies & enemies
+
+
+def _enemies_dead(env: Any, state: Any) -> Any:
+    allies, enemies = _sides(env, state)
+    return allies & ~enemies
+
+
+def _draw_smax(env: Any, state: Any) -> Picture:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(_INCHES, _INCHES))
+    FigureCanvasAgg(figure)
+    battle = _battle(state)
+    names = getattr(env, "all_agents", env.agents)
+    attacks = dict(zip(names, battle.prev_attack_actions.tolist(), strict=True))
+    image = env.init_render(figure.subplots(), (None, battle, attacks), 0, int(battle.step))
+    return np.array(image.get_array())[..., :3]
+
+
+def _draw_overcooked(env: Any, state: Any) -> Picture:
+    import imageio.v3 as imageio
+    from jaxmarl.viz.overcooked_visualizer import OvercookedVisualizer
+
+    film = io.BytesIO()
+    OvercookedVisualizer().animate([state], env.agent_view_size, film)
+    return np.asarray(imageio.imread(film.getvalue(), extension=".gif"))[0, ..., :3]
+
+
+def _draw_overcooked_v2(env: Any, state: Any) -> Picture:
+    from jaxmarl.viz.overcooked_v2_visualizer import OvercookedV2Visualizer
+
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[np.newaxis], state)
+    return np.asarray(OvercookedV2Visualizer().render_sequence(one)[0], dtype=np.uint8)
+
+
+def _draw_particles(env: Any, state: Any) -> Picture:
+    from jaxmarl.environments.mpe import MPEVisualizer
+    from matplotlib import pyplot
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        figure = MPEVisualizer(env, [state]).fig
+    pyplot.close(figure)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3]
+
+
+def _shaped(infos: Mapping[str, Any]) -> Mapping[str, Any]:
+    return infos["shaped_reward"]
+
+
+_SMAX: Final = Rules(is_undecided=_both_alive, is_won=_enemies_dead, pays_the_dead=True, draw=_draw_smax)
+_RULES: Final[dict[str, Rules]] = {
+    "SMAX": _SMAX._replace(is_won=None),  # both sides are trained, one wins
+    "HeuristicEnemySMAX": _SMAX,
+    "overcooked": Rules(extra_reward=_shaped, draw=_draw_overcooked),
+    "overcooked_v2": Rules(extra_reward=_shaped, draw=_draw_overcooked_v2),
+}
+
+
+def rules_of(name: str) -> Rules:
+    """Return the rules of an environment."""
+    if name.startswith("MPE_"):
+        return Rules(draw=_draw_particles)
+    return _RULES.get(name, Rules())
+
+
+#: Environments that need another package (brax, jaxrobotarium), or a trained enemy.
+_BRAX: Final = ("ant_4x2", "halfcheetah_6x1", "hopper_3x1", "humanoid_9|8", "walker2d_2x3")
+_NEEDS_A_POLICY: Final = "LearnedPolicyEnemySMAX"
+#: Environments whose observations and rewards are not by agent name.
+_NOT_BY_AGENT: Final = ("storm", "storm_2p", "storm_np")
+#: Maximum number of cached compiled environments; one takes tens of MB.
+_N_KEPT: Final = 8
+
+
+def registered() -> list[str]:
+    """Return the names of the supported environments."""
+    missing = {_NEEDS_A_POLICY, *_NOT_BY_AGENT}
+    if not MABRAX_AVAILABLE:
+        missing.update(_BRAX)
+    names = [name for name in jaxmarl.registered_envs if name not in missing]
+    return [name for name in names if SUBMODULE_ENVIRONMENTS or not name.startswith("JaxRobotarium")]
+
+
+class _Params:
+    """Arguments of an environment, compared by value; arrays are compared by identity."""
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        self.params = dict(params)
+        self._key = tuple(sorted((name, _identity(value)) for name, value in self.params.items()))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Params) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def _identity(value: Any) -> str:
+    return repr(value) if isinstance(value, (bool, int, float, str, tuple, type(None))) else str(id(value))
+
+
+@lru_cache(_N_KEPT)
+def _programs(name: str, params: _Params, with_state: bool) -> JaxPrograms:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Overcooked recommends its second version
+        env = jaxmarl.make(name, **params.params)
+    return JaxPrograms(env, rules_of(name), with_state)
+
+
+def vec_env(
+    name: str,
+    n_envs: int,
+    seed: int | None,
+    *,
+    state: bool = False,
+    render_mode: str | None = None,
+    stagger: bool = False,
+    reward_shaping: float = 0.0,
+    reward_shaping_steps: int | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    **params: Any,
+) -> ResumableBatchVecEnv:
+    """
+    Make games of an environment.
+
+    :param render_mode: None or ``"rgb_array"``
+    :param reward_shaping: weight of the shaped rewards, if the environment has any
+    :param reward_shaping_steps: game steps, summed over games, over which that weight decreases to 0; None for never
+    :param fixed: arguments of the environment that the task sets
+    :raises ValueError: if the state, picture or reward is missing, or the environment has no teams of named agents
+    """
+    programs = _programs(name, _Params({**params, **(fixed or {})}), state)
+    if reward_shaping and programs.rules.extra_reward is None:
+        raise ValueError(f"{name} has no rewards for steps on the way, got reward_shaping={reward_shaping}")
+    if render_mode is not None and programs.rules.draw is None:
+        raise ValueError(f"JaxMARL draws no pictures of {name}; leave render_mode={render_mode!r} out")
+    games = JaxGames(programs, n_envs, reward_shaping, reward_shaping_steps)
+    return ResumableBatchVecEnv(games, seed, render_mode, stagger)
