@@ -41,7 +41,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 RAW: Final = ROOT / "results" / "paper"
 PAGES: Final = (ROOT / "results" / "README.md", RAW / "README.md", ROOT / "docs" / "algorithms" / "memory.md")
 #: Tests at other levels than that of the training.
-OTHER_LEVELS: Final = ("ood-coordination",)
+OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
 #: The experiments of the grid; others have settings of their own.
 GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
 #: With a GRU, in settings of the grid.

@@ -1,10 +1,10 @@
 """
 Measure training time by stage: ``python -m benchmarks.stages``.
 
-One table per setting: SAF, MAPPO and IPPO in the size ``small`` of the zoo, with its 80 games and with 16 and 128, and
-SAF with the paper's network. A stage excludes the stages inside it: for example, the rollout does not include the games
-that it steps. Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are of the real program and
-sum to the total.
+One table per setting: SAF, MAPPO and IPPO in the size ``small`` of the zoo, with its 80 games and with 16 and 128, SAF
+and MAPPO with a GRU, and SAF with the paper's network. A stage excludes the stages inside it: for example, the rollout
+does not include the games that it steps. Wall-clock; the functions that SB3's PPO calls are wrapped, so the numbers are
+of the real program and sum to the total.
 
 On a GPU, ``--device cuda --only "SAF, paper size"`` waits for the device between stages, so that each includes its own
 kernels, and prints the time of 10 million game steps; ``--no-wait`` lets stages overlap as in training.
@@ -142,6 +142,7 @@ SETTINGS: Final[Mapping[str, Callable[[str], PPO]]] = {
         for n_games in SMALL_GAMES
         for algo in ("saf", "mappo", "ippo")
     },
+    **{f"{algo.upper()}, small, 80 games": partial(small_model, algo, 80) for algo in ("saf-gru", "mappo-gru")},
     "SAF, paper network, 16 games": partial(paper_model, 16),
 }
 #: This size needs a GPU; without one, a rollout takes a minute.
@@ -168,6 +169,10 @@ def watch(model: Any, wait: bool = True) -> Stopwatch:
     watch.watch(policy, "evaluate_actions", "update: likelihood, entropy, gathering")
     for module, name in ((policy.features_extractor, "encoder"), (policy.actor, "actor"), (policy.value_net, "critic")):
         watch.watch(module, "forward", f"{name}, forward")
+    for memory in (policy.actor_memory, policy.value_net.memory):
+        if memory is not None:
+            for method in ("forward", "step", "every"):
+                watch.watch(memory, method, "memories, forward")
     watch.watch(policy.row_encoder, "find", "which observations are equal")
     watch.watch(th.Tensor, "backward", "backward")
     watch.watch(th.nn.utils, "clip_grad_norm_", "clipping of gradients")

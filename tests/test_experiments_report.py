@@ -246,6 +246,16 @@ def test_results_stand_beside_what_is_known_of_the_same_games(tmp_path: Path) ->
     assert [part[2:] for part in text.splitlines()[2:]] == [line]
 
 
+def test_a_suites_task_has_a_slash(tmp_path: Path) -> None:
+    pytest.importorskip("mpe2")
+    env, name = "mpe/simple_spread_v3", "spread"
+    config = RunConfig("smoke", {"game_steps": 24, "n_envs": 2, "n_steps": 3, "n_minibatches": 1}, 2, 12, 2)
+    experiment = own_experiment(name, [env], {"max_cycles": [3]})
+    run(experiment, Selection((0,), ("ippo",)), config, Results(tmp_path), InlineEngine())
+    assert cli.main(["report", name, "-f", str(tmp_path)]) == 0
+    assert (tmp_path / name / "curve-mpe-simple_spread_v3-max_cycles3.png").is_file()
+
+
 def test_an_environment_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -47,7 +47,7 @@ from sb3_saf.experiments.tables import (
     strata,
     write_tables,
 )
-from sb3_saf.suites.registry import find_environment, standing
+from sb3_saf.suites.registry import find_environment, folder_name, standing
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_differences, draw_levels
 from sb3_saf.training.statistics import (
@@ -191,8 +191,7 @@ def _curves(experiment: Experiment, frames: Frames) -> dict[str, Figure]:
             names=WORDS,
         )
         figure.axes[1].set_xlabel("processor time of the training (s)")
-        slug = str(task).replace(":", "-")
-        figures[f"curve-{slug}-{level}.png"] = figure
+        figures[f"curve-{folder_name(str(task))}-{level}.png"] = figure
     return figures
 
 
