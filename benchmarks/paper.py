@@ -28,6 +28,7 @@ from sb3_saf.experiments.tables import (
     Difference,
     Frames,
     holm,
+    keys_of,
     marl_eval,
     pooled,
     read_results,
@@ -35,7 +36,7 @@ from sb3_saf.experiments.tables import (
 )
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.figures import draw_curves, draw_differences
-from sb3_saf.training.statistics import Estimate
+from sb3_saf.training.statistics import Estimate, mean_over_seeds
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 RAW: Final = ROOT / "results" / "paper"
@@ -228,34 +229,34 @@ def other_table(names: Iterable[str]) -> str:
     return table(["experiment", "setting", "method", "seeds", "return of 100"], body)
 
 
-def memory_table(tests: pd.DataFrame, remembering: pd.DataFrame) -> str:
+def memory_table(frames: Frames, remembering: Frames) -> str:
     """Return each method without and with a GRU in the settings that both have, paired by seed and test games."""
     body = []
-    for (task, level), here in remembering.query("game_steps > 0").groupby(_COLUMNS, sort=False):
+    tests = pd.concat([frames.tests, remembering.tests.query("game_steps > 0")])
+    curves = pd.concat([frames.curves, remembering.curves])
+    for task, level in dict.fromkeys(keys_of(remembering.tests.query("game_steps > 0"), *_COLUMNS)):
+        here, evaluations = (rows[(rows["task"] == task) & (rows["level"] == level)] for rows in (tests, curves))
         for method in ("mappo", "saf", "ippo"):
-            both = pd.concat([tests[(tests["task"] == task) & (tests["level"] == level)], here])
-            found = difference(both, f"{method}-gru", method)
+            pair = (method, f"{method}-gru")
+            found = difference(here, *reversed(pair))
             if found is None:
                 continue
-            seeds = set.intersection(
-                *(set(both.loc[both["method"] == one, "seed"]) for one in (method, f"{method}-gru"))
-            )
-            rows = both[both["seed"].isin(seeds)].groupby("method")
+            seeds = set.intersection(*(set(here.loc[here["method"] == one, "seed"]) for one in pair))
+            rows = here[here["seed"].isin(seeds)].groupby("method")
             means, seconds = rows["return_mean"].mean(), rows["processor_seconds"].mean()
-            pair = (method, f"{method}-gru")
-            cells = [f"{means[one]:.1f}" for one in pair] + [show(found.estimate)]
+            early = [_lead_at_equal_time(evaluations[evaluations["seed"] == seed], pair) for seed in sorted(seeds)]
+            cells = [f"{means[one]:.1f}" for one in pair] + [show(found.estimate), show(mean_over_seeds(early))]
             spent = "; ".join(f"{seconds[one]:.0f}" for one in pair)
             body.append([f"{task}, {level}", WORDS[method], str(len(seeds)), *cells, spent])
-    head = [
-        "setting",
-        "method",
-        "seeds",
-        "without",
-        "with a GRU",
-        "difference, % of the treasures",
-        "processor seconds",
-    ]
-    return table(head, body)
+    head = ["setting", "method", "seeds", "without", "with a GRU", "difference, % of the treasures"]
+    return table([*head, "at equal processor time", "processor seconds"], body)
+
+
+def _lead_at_equal_time(curves: pd.DataFrame, pair: tuple[str, str]) -> float:
+    """Return by how much the second method's evaluations are above the first's when the first one's training ends."""
+    first, second = (curves[curves["method"] == method].sort_values("processor_seconds") for method in pair)
+    end = first.iloc[-1]
+    return float(np.interp(end["processor_seconds"], second["processor_seconds"], second["score"]) - end["score"])
 
 
 def costs(names: Iterable[str]) -> str:
@@ -306,13 +307,14 @@ def pages() -> dict[Path, str]:
     """Return the pages with their blocks made of the raw data."""
     names = sorted(path.parent.name for path in RAW.glob(f"*/{RUNS}"))
     others = [name for name in names if name not in (*GRID, MEMORY)]
-    tests = grid().tests
+    frames = grid()
+    tests = frames.tests
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
         "answer": answer(tests),
         "methods": methods_table(tests),
         "claims": claims_table(claims(tests, other_levels(), pixels)),
-        "memory": memory_table(tests, read(MEMORY).tests),
+        "memory": memory_table(frames, read(MEMORY)),
         "losses": losses(tests),
         "settings": settings_table(tests),
         "others": other_table(others),
