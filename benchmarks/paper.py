@@ -47,6 +47,8 @@ OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
 GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
 #: With a GRU, in settings of the grid.
 MEMORY: Final = "memory"
+#: Every actor with every critic: names begin so.
+FACTORIAL: Final = "factorial"
 #: Methods of the grid; SAF is compared with the others.
 MAIN: Final = ("saf", "mappo", "ippo-separate", "ippo")
 WORDS: Final = {
@@ -54,6 +56,8 @@ WORDS: Final = {
     **{f"{name}-gru": f"{METHODS[name].words}, GRU" for name in ("saf", "mappo", "ippo")},
 }
 _COLUMNS: Final = ["task", "level"]
+#: Columns that tell trainings apart.
+_RUN: Final = ["cell", "processor_seconds"]
 
 
 class Claim(NamedTuple):
@@ -209,12 +213,15 @@ def losses(tests: pd.DataFrame) -> str:
 
 
 def settings_table(tests: pd.DataFrame) -> str:
-    """Return the mean return in each setting, with the smallest number of seeds."""
+    """Return the mean return at each level of training and test, with the smallest number of seeds."""
     body = []
-    for (task, c, h), rows in tests.groupby(["task", "coordination", "heterogeneity"], sort=False):
+    columns = ["task", "train_coordination", "train_heterogeneity", "coordination", "heterogeneity"]
+    for (task, c, h, test_c, test_h), rows in tests.groupby(columns, sort=False):
+        tested = "" if (c, h) == (test_c, test_h) else f", tested at c = {test_c}, h = {test_h}"
         means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"].isin(MAIN)]
         cells = [f"{means[method]:.1f}" if method in means else "" for method in (RANDOM, *MAIN)]
-        body.append([f"{task}, c = {c}, h = {h}", *cells, str(trained.groupby("method")["seed"].nunique().min())])
+        n_seeds = trained.groupby("method")["seed"].nunique().min()
+        body.append([f"{task}, c = {c}, h = {h}{tested}", *cells, str(n_seeds)])
     return table(["setting", *(WORDS[method] for method in (RANDOM, *MAIN)), "seeds"], body)
 
 
@@ -227,6 +234,20 @@ def other_table(names: Iterable[str]) -> str:
             mean = f"{rows['return_mean'].mean():.1f}"
             body.append([name, f"{task}, {level}", WORDS.get(method, method), str(len(rows)), mean])
     return table(["experiment", "setting", "method", "seeds", "return of 100"], body)
+
+
+def factorial_table(names: Iterable[str]) -> str:
+    """Return the mean return of each actor with each critic."""
+    actors, critics = ("own", "shared", "pool"), ("own", "team", "mean", "source")
+    body = []
+    for name in names:
+        means = read(name).tests.groupby("method")["return_mean"].mean()
+        for actor in actors:
+            methods = [f"actor-{actor}-critic-{critic}" for critic in critics]
+            cells = [f"{means[method]:.1f}" if method in means else "" for method in methods]
+            body.append([name, WORDS[methods[0]].split(", ")[0], *cells])
+    heads = [WORDS[f"actor-own-critic-{critic}"].split(", ")[1] for critic in critics]
+    return table(["experiment", "actor", *(f"critic: {head}" for head in heads)], body)
 
 
 def memory_table(frames: Frames, remembering: Frames) -> str:
@@ -259,13 +280,22 @@ def _lead_at_equal_time(curves: pd.DataFrame, pair: tuple[str, str]) -> float:
     return float(np.interp(end["processor_seconds"], second["processor_seconds"], second["score"]) - end["score"])
 
 
-def costs(names: Iterable[str]) -> str:
-    """Return processor hours of training and tests, commits, and processors of all raw data."""
-    tests = pd.concat([read(name).tests for name in names])
-    tests = tests.drop_duplicates(["cell", "processor_seconds"])
-    hours = [tests[column].sum() / 3600 for column in ("processor_seconds", "wall_seconds_test")]
+def costs(tests: pd.DataFrame) -> str:
+    """Return processor hours of training and tests, commits, and processors of these tests."""
+    hours = (tests.drop_duplicates(_RUN)["processor_seconds"].sum() / 3600, tests["wall_seconds_test"].sum() / 3600)
     commits, processors = (", ".join(sorted(set(tests[column]))) for column in ("commit", "processor"))
     return f"{hours[0]:.1f} core-hours of training, {hours[1]:.1f} of tests, commit {commits}, {processors}."
+
+
+def blocks_table(tests: pd.DataFrame) -> str:
+    """Return trainings and processor hours of each block of runs."""
+    body = []
+    runs = tests.drop_duplicates(_RUN)
+    for name, here in tests.groupby("block", sort=False):
+        trained = runs[(runs["block"] == name) & (runs["game_steps"] > 0)]
+        hours = trained["processor_seconds"].sum() / 3600, here["wall_seconds_test"].sum() / 3600
+        body.append([str(name), str(len(trained)), *(f"{spent:.1f}" for spent in hours)])
+    return table(["block", "trainings", "core-hours of training", "of tests"], body)
 
 
 def forest(tests: pd.DataFrame) -> pd.DataFrame:
@@ -306,19 +336,26 @@ def fill(text: str, blocks: dict[str, str]) -> str:
 def pages() -> dict[Path, str]:
     """Return the pages with their blocks made of the raw data."""
     names = sorted(path.parent.name for path in RAW.glob(f"*/{RUNS}"))
-    others = [name for name in names if name not in (*GRID, MEMORY)]
+    everything = pd.concat([read(name).tests.assign(block=name) for name in names])
+    everything = everything.drop_duplicates([*_RUN, "level"])
+    factorial = [name for name in names if name.startswith(FACTORIAL)]
+    others = [name for name in names if name not in (*GRID, MEMORY, *factorial)]
     frames = grid()
     tests = frames.tests
+    unseen = other_levels()
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
         "answer": answer(tests),
         "methods": methods_table(tests),
-        "claims": claims_table(claims(tests, other_levels(), pixels)),
+        "claims": claims_table(claims(tests, unseen, pixels)),
         "memory": memory_table(frames, read(MEMORY)),
         "losses": losses(tests),
         "settings": settings_table(tests),
+        "unseen": settings_table(unseen),
         "others": other_table(others),
-        "costs": costs(names),
+        "factorial": factorial_table(factorial),
+        "costs": costs(everything),
+        "blocks": blocks_table(everything),
     }
     return {page: fill(page.read_text(encoding="utf-8"), blocks) for page in PAGES}
 

@@ -129,9 +129,10 @@ def test_the_listing(capsys: pytest.CaptureFixture[str]) -> None:
         assert suite.title in listed
         problem = suite.problem()
         assert problem in listed if problem else f"{suite.name}/{suite.examples[0]}: " in listed
-    with pytest.raises(SystemExit, match="2"):
-        main(["lbff"])
-    assert "did you mean 'lbf'" in capsys.readouterr().err
+    for wrong, right in (("lbff", "lbf"), ("TeamSuport", "TeamSupport")):
+        with pytest.raises(SystemExit, match="2"):
+            main([wrong])
+        assert f"did you mean '{right}'" in capsys.readouterr().err
 
 
 def test_the_table_of_results_is_that_of_the_raw_data(tmp_path: Path) -> None:

@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif "/" in name or suites()[HOME].find_task(name):
             print("\n".join(known(name)))
         elif name not in suites():
-            raise unknown_name("suite", name, suites())
+            short = (task.removesuffix("-v0") for task in suites()[HOME].tasks)
+            raise unknown_name("suite or task", name, [*suites(), *short])
         else:
             print("\n".join(f"{name}/{task}" for task in suites()[name].tasks))
     except ValueError as error:
