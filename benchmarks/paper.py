@@ -112,7 +112,7 @@ def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> l
         Claim("high coordination favours SAF", ("saf", "mappo"), "c > 1", coordinated),
         Claim("high heterogeneity favours SAF", ("saf", "mappo"), "h > 1", zones),
         Claim("SAF is robust to unseen levels", ("saf", "mappo"), "other levels than in training", unseen),
-        Claim("the same, zones as the paper's agents see them", ("saf", "mappo"), hidden, pixels),
+        Claim("high heterogeneity favours SAF, as the paper's agents see it", ("saf", "mappo"), hidden, pixels),
         Claim("the pool helps in heterogeneous maps", ("saf", "saf-no-pool"), hidden, pixels),
         Claim("the knowledge source helps", ("saf", "saf-no-ks"), hidden, pixels),
     ]
