@@ -36,7 +36,7 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import TEAMS, check_team, python_command, team_names
+from sb3_saf.training.folders import TEAMS, check_team, missing_package, python_command, team_names
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
@@ -341,7 +341,8 @@ def _teams(options: argparse.Namespace) -> int:
     failed = 0
     for name in team_names(options.folder):
         try:
-            print(check_team(name, options.folder))
+            missing = missing_package(name, options.folder)
+            print(f"{name}: not played, {missing}" if missing else check_team(name, options.folder))
         except ValueError as error:
             failed = 1
             print(error, file=sys.stderr)

@@ -458,6 +458,13 @@ def find_team(name: str, folder: str | Path | None = None) -> Run:
     return run
 
 
+def missing_package(name: str, folder: str | Path | None = None) -> str | None:
+    """Return which package the games of a published team need that is not installed; None if they can be played."""
+    description = Run((TEAMS if folder is None else Path(folder)) / name).description
+    suite = suites().get(str(description["settings"].get("env")).partition("/")[0])
+    return None if suite is None else suite.problem()
+
+
 def check_runs_no_code(settings: Mapping[str, Any], folder: Path) -> None:
     """Check that saved settings name games of suites only, and nothing else to import; otherwise raise ExportError."""
     env = str(settings.get("env"))
