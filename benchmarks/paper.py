@@ -47,6 +47,8 @@ OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
 GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
 #: With a GRU, in settings of the grid.
 MEMORY: Final = "memory"
+#: Ten times as many game steps.
+LENGTH: Final = "length"
 #: Every actor with every critic: names begin so.
 FACTORIAL: Final = "factorial"
 #: Methods of the grid; SAF is compared with the others.
@@ -314,12 +316,17 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
 
 
 def curves(frames: Frames) -> pd.DataFrame:
-    """Return the evaluations of two settings."""
-    parts = [("TeamSupport", "c2-h1", "TeamSupport, c = 2"), ("TeamSupport", "c1-h5", "TeamSupport, h = 5")]
-    here = frames.curves[frames.curves["method"].isin(MAIN)]
-    return pd.concat(
-        [here[(here["task"] == task) & (here["level"] == level)].assign(panel=name) for task, level, name in parts]
-    )
+    """Return the evaluations of two settings, and those of longer trainings."""
+    parts = [
+        (frames, "TeamSupport", "c2-h1", "TeamSupport, c = 2"),
+        (frames, "TeamSupport", "c1-h5", "TeamSupport, h = 5"),
+        (read(LENGTH), "TeamSupport", "c2-h1", "TeamSupport, c = 2, ten times as long"),
+    ]
+    shown = []
+    for source, task, level, name in parts:
+        here = source.curves[source.curves["method"].isin(MAIN)]
+        shown.append(here[(here["task"] == task) & (here["level"] == level)].assign(panel=name))
+    return pd.concat(shown)
 
 
 def fill(text: str, blocks: dict[str, str]) -> str:
