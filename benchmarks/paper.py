@@ -240,14 +240,15 @@ def settings_table(tests: pd.DataFrame) -> str:
 
 
 def other_table(names: Iterable[str]) -> str:
-    """Return the mean return of each method of experiments with settings of their own."""
+    """Return the mean return of each method in experiments with settings of their own."""
     body = []
     for name in names:
         trained = read(name).tests.query("game_steps > 0")
-        for (task, level, method), rows in trained.groupby(["task", "level", "method"], sort=False):
-            mean = f"{rows['return_mean'].mean():.1f}"
-            body.append([name, f"{task}, {level}", WORDS.get(method, method), str(len(rows)), mean])
-    return table(["experiment", "setting", "method", "seeds", "return of 100"], body)
+        for (task, level), here in trained.groupby(_COLUMNS, sort=False):
+            means = here.groupby("method", sort=False)["return_mean"].mean()
+            text = "; ".join(f"{WORDS.get(method, method)} {mean:.1f}" for method, mean in means.items())
+            body.append([name, f"{task}, {level}", str(here.groupby("method")["seed"].nunique().min()), text])
+    return table(["experiment", "setting", "seeds", "returns of 100"], body)
 
 
 def factorial_table(names: Iterable[str]) -> str:
