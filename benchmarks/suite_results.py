@@ -85,9 +85,13 @@ def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFram
 
 
 def _published(task: Task) -> Iterator[str]:
-    """Yield published results of trainings that are at least half and at most twice as long."""
+    """Yield others' published results of trainings that are at least half and at most twice as long."""
     for one in references(task.env_id):
-        if not one.params and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
+        if (
+            not one.method.startswith("sb3-saf")
+            and not one.params
+            and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps
+        ):
             yield f"{one} ({one.source})"
 
 
