@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_saf import CentralizedValueWrapper, game_seeds, make_team_env
+from sb3_saf import CentralizedValueWrapper, MLPEncoder, game_seeds, make_team_env
 from sb3_saf.checkpoints.states import environment_state, load_environment_state
 from sb3_saf.inspection.recording import picture
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
@@ -179,11 +179,14 @@ def test_battles_of_smax() -> None:
 
 @needs_jaxmarl
 def test_the_kitchen() -> None:
-    """Observations are bytes; shaped rewards (3 for an onion in the pot) are added with a decreasing weight."""
+    """Observations are flags and counts; shaped rewards (3 for an onion in the pot) have a decreasing weight."""
     shaped: dict[str, Any] = {"reward_shaping": 2.0, "reward_shaping_steps": 30}
     venv = rows_of("overcooked/cramped_room", 3, max_steps=11, **shaped)
     rows = venv.reset()
-    assert rows["obs"].dtype == np.uint8 and rows["obs"].shape == (6, 520)
+    assert rows["obs"].dtype == np.float32 and rows["obs"].shape == (6, 520)
+    assert isinstance(venv.observation_space, spaces.Dict)
+    encoder = MLPEncoder(venv.observation_space["obs"])
+    assert not encoder.is_scaled, "flags and counts in bytes are no pictures: divided by 255, nothing is learned"
     gained = []
     left, right, up, interact = 3, 2, 0, 5
     for action in (left, interact, right, up, interact, left, left, interact, right, up, interact):

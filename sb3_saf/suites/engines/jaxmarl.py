@@ -106,11 +106,11 @@ class JaxPrograms:
         self._has_world_entry = _WORLD_STATE in observations
         self._action_spaces = [env.action_space(agent) for agent in self.agents]
         width = max(_size(one) for one in self._observations.values())
-        high = 255 if self._own_dtype == np.uint8 else np.inf
         counts = self._n_actions
         has_masks = bool(counts) and (self.gives_masks or len(set(counts)) > 1)
         self.rows = TeamSpaces(
-            spaces.Box(0 if high == 255 else -high, high, (width,), self._own_dtype),
+            # Also flags and counts in bytes: as a Box of bytes they would be scaled as pictures are.
+            spaces.Box(-np.inf, np.inf, (width,), np.float32),
             len(self.agents),
             has_active=not rules.pays_the_dead,
             n_masked_actions=max(counts) if has_masks else None,
@@ -123,12 +123,6 @@ class JaxPrograms:
         self.step = jax.jit(self._step_all)
 
     # ---- spaces
-
-    @cached_property
-    def _own_dtype(self) -> type[np.uint8] | type[np.float32]:
-        """Uint8 if all observations are bytes or flags, else float32."""
-        small = all(one.dtype in (np.uint8, np.bool_) for one in self._observations.values())
-        return np.uint8 if small else np.float32
 
     @cached_property
     def gives_masks(self) -> bool:
@@ -254,7 +248,7 @@ class JaxPrograms:
         :param shown: (N,) agents whose observations are shown, other rows are zeros
         """
         width = self.rows.own.shape[0]  # type: ignore[index]
-        own = jnp.stack([_padded(observations[agent], width, self._own_dtype) for agent in self.agents])
+        own = jnp.stack([_padded(observations[agent], width, np.float32) for agent in self.agents])
         rows = {OBS_KEY: jnp.where(shown[:, None], own, 0)}
         if self.rows.active:
             rows[ACTIVE_KEY] = active
