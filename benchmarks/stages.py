@@ -116,11 +116,11 @@ def small_model(algo: str, n_games: int, device: str) -> PPO:
     return model
 
 
-def paper_model(n_games: int, device: str) -> PPO:
-    """Create SAF with the paper's games and network."""
+def paper_model(policy: str, n_games: int, device: str) -> PPO:
+    """Create SAF, MAPPO or IPPO with the paper's games and network."""
     env = make_team_env("TeamSupport", n_envs=n_games, seed=0)
     return PPO(
-        "SAFPolicy",
+        policy,
         env,
         n_steps=50,
         batch_size=50 * env.num_envs,
@@ -143,10 +143,12 @@ SETTINGS: Final[Mapping[str, Callable[[str], PPO]]] = {
         for algo in ("saf", "mappo", "ippo")
     },
     **{f"{algo.upper()}, small, 80 games": partial(small_model, algo, 80) for algo in ("saf-gru", "mappo-gru")},
-    "SAF, paper network, 16 games": partial(paper_model, 16),
+    "SAF, paper network, 16 games": partial(paper_model, "SAFPolicy", 16),
 }
 #: This size needs a GPU; without one, a rollout takes a minute.
-PAPER_SIZE: Final[Mapping[str, Callable[[str], PPO]]] = {"SAF, paper size": partial(paper_model, 128)}
+PAPER_SIZE: Final[Mapping[str, Callable[[str], PPO]]] = {
+    f"{name}, paper size": partial(paper_model, f"{name}Policy", 128) for name in ("SAF", "MAPPO", "IPPO")
+}
 
 
 def watch(model: Any, wait: bool = True) -> Stopwatch:
