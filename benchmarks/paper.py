@@ -381,13 +381,16 @@ def pages() -> dict[Path, str]:
 
 
 def add(name: str, folder: Path, raw: Path = RAW) -> None:
-    """Add the finished cells of an experiment's folder, ``RESULTS/EXPERIMENT``, to the raw data."""
-    frames = [read_results(folder.parent, folder.name)]
+    """Add the finished cells of an experiment, ``RESULTS/EXPERIMENT``, to the raw data, in the place of older ones."""
+
+    def cells(frame: pd.DataFrame) -> pd.Series:
+        return frame[["method", *_COLUMNS, "seed"]].astype(str).agg("/".join, axis=1)
+
+    tests, together = read_results(folder.parent, folder.name)
     if (raw / name).is_dir():
-        frames.insert(0, read_results(raw, name))
-    tests = pd.concat([frame.tests for frame in frames]).drop_duplicates(["cell", "level"])
-    keys = ["method", *_COLUMNS, "seed", "game_steps"]
-    together = pd.concat([frame.curves for frame in frames]).drop_duplicates(keys)
+        kept = read_results(raw, name)
+        tests = pd.concat([kept.tests[~cells(kept.tests).isin(cells(tests))], tests])
+        together = pd.concat([kept.curves[~cells(kept.curves).isin(cells(together))], together])
     (raw / name).mkdir(parents=True, exist_ok=True)
     for file, frame in ((RUNS, tests), (CURVES, together)):
         write_text(raw / name / file, frame.to_csv(index=False, lineterminator="\n"))

@@ -41,12 +41,14 @@ class Task(NamedTuple):
     :param game_steps: of one training, equal for all methods
     :param methods: that are trained, besides a random team
     :param settings: ``name:value`` in the place of those in ``zoo_configs``
+    :param params: ``name:value`` of the environment
     """
 
     env_id: str
     game_steps: int
     methods: tuple[str, ...] = METHODS[:3]
     settings: tuple[str, ...] = ()
+    params: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -54,11 +56,17 @@ class Task(NamedTuple):
         return self.env_id.replace("/", "-")
 
 
+LAYOUTS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
+#: Rollouts, learning rate and shaping of JaxMARL: with those of the size ``small``, long trainings end at 0.
+KITCHEN: Final = {
+    "settings": ("n_envs:64", "n_steps:256", "n_minibatches:16", "learning_rate:lin_5.0e-4"),
+    "params": ("reward_shaping_steps:2500000",),
+}
 #: The cheapest ones first.
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000),
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
-    Task("overcooked/cramped_room", 5_000_000),
+    *(Task(f"overcooked/{layout}", 5_000_000, **KITCHEN) for layout in LAYOUTS),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     Task("smax/2s3z", 10_000_000, settings=("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0")),
 )
@@ -68,7 +76,8 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     """Train and test the missing cells of a task and seed, one after the other."""
     words = ["run", task.name, "--env", task.env_id, "--size", "small", "--workers", "1", "--seeds", str(seed)]
     words += ["-n", str(task.game_steps), "--methods", *task.methods, "-f", str(options.folder / task.name)]
-    experiments([*words, "-params", *task.settings] if task.settings else words)
+    words += ["-params", *task.settings] if task.settings else []
+    experiments([*words, "--env-kwargs", *task.params] if task.params else words)
 
 
 def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFrame) -> list[str]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pandas as pd
+
 from benchmarks import paper
+from sb3_saf.experiments.tables import CURVES, RUNS
 
 
 def test_pages_of_results_equal_their_raw_data() -> None:
@@ -10,3 +15,18 @@ def test_pages_of_results_equal_their_raw_data() -> None:
     for page, text in pages.items():
         assert page.read_text(encoding="utf-8") == text, f"{page}: run python -m benchmarks.paper"
     assert max(text.count("\n") for text in pages.values()) <= 150
+
+
+def test_cells_trained_again_replace_the_older_ones(tmp_path: Path) -> None:
+    for factor, folder in ((1, "older"), (2, "newer")):
+        (tmp_path / folder / "parts").mkdir(parents=True)
+        for file, column in ((RUNS, "return_mean"), (CURVES, "score")):
+            frame = pd.read_csv(paper.RAW / "parts" / file)
+            frame[column] *= factor
+            rows = frame if factor == 1 else frame[frame["method"] == "saf-no-ks"]
+            rows.to_csv(tmp_path / folder / "parts" / file, index=False)
+        paper.add("parts", tmp_path / folder / "parts", raw=tmp_path / "raw")
+    for file, column in ((RUNS, "return_mean"), (CURVES, "score")):
+        before, after = (pd.read_csv(folder / "parts" / file) for folder in (paper.RAW, tmp_path / "raw"))
+        twice = (after.groupby("method")[column].sum() / before.groupby("method")[column].sum()).round(3)
+        assert len(after) == len(before) and dict(twice[twice != 1]) == {"saf-no-ks": 2}
