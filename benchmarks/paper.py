@@ -265,6 +265,35 @@ def factorial_table(names: Iterable[str]) -> str:
     return table(["experiment", "actor", *(f"critic: {head}" for head in heads)], body)
 
 
+def elsewhere(trainings: pd.DataFrame, here: pd.DataFrame) -> str:
+    """
+    Return the returns of trainings on other processors, and how far those of the same seeds were from them here.
+
+    :param trainings: ``block``, ``setting``, ``method``, ``seed``, ``return``, and processor ``on``
+    :param here: tests at the levels of the training, with ``block``
+    """
+    keys = ["block", "setting", "method", "seed"]
+    setting = here["task"] + ", c=" + here["coordination"].astype(str) + ", h=" + here["heterogeneity"].astype(str)
+    trained = trainings[trainings["method"] != RANDOM].merge(here.assign(setting=setting), "left", keys)
+    body = []
+    for (block, setting), rows in trained[trained["return_mean"].isna()].groupby(keys[:2], sort=False):
+        by_method = rows.groupby("method", sort=False)["return"]
+        texts = [f"{WORDS[method]} {', '.join(f'{value:.1f}' for value in values)}" for method, values in by_method]
+        body.append([block, setting, rows["on"].iloc[0], "; ".join(texts)])
+    both = trained.dropna(subset="return_mean")
+    apart = both["return"] - both["return_mean"]
+    alike = here[here["task"].isin(both["task"]) & (here["block"] != MEMORY) & (here["method"] != RANDOM)]
+    seeds = alike.groupby(["block", *_COLUMNS, "method"])["return_mean"]
+    variances = seeds.var()[seeds.size() >= 5]
+    limit = 2 * (2 * variances.mean()) ** 0.5
+    return (
+        f"{table(['experiment', 'setting', 'processor', 'returns of 100'], body)}\n\n{len(both)} more were run on the "
+        f"processor of the tables, too: there minus here {apart.mean():+.1f} on average, from {apart.min():+.1f} to "
+        f"{apart.max():+.1f}; {(apart.abs() <= limit).sum()} are within {limit:.1f}, as two seeds of a setting are in "
+        f"95 of 100 cases ({len(variances)} settings and methods with five seeds)."
+    )
+
+
 def memory_table(frames: Frames, remembering: Frames) -> str:
     """Return each method without and with a GRU in the settings that both have, paired by seed and test games."""
     body = []
@@ -374,6 +403,7 @@ def pages() -> dict[Path, str]:
         "unseen": settings_table(unseen),
         "others": other_table(others),
         "factorial": factorial_table(factorial),
+        "elsewhere": elsewhere(pd.read_csv(RAW / "other_processor.csv"), everything.query("level == train_level")),
         "costs": costs(everything),
         "blocks": blocks_table(everything),
     }
