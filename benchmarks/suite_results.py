@@ -56,17 +56,12 @@ class Task(NamedTuple):
         return self.env_id.replace("/", "-")
 
 
-LAYOUTS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
-#: Rollouts, learning rate and shaping of JaxMARL: with those of the size ``small``, long trainings end at 0.
-KITCHEN: Final = {
-    "settings": ("n_envs:64", "n_steps:256", "n_minibatches:16", "learning_rate:lin_5.0e-4"),
-    "params": ("reward_shaping_steps:2500000",),
-}
+_KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
 #: The cheapest ones first.
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000),
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
-    *(Task(f"overcooked/{layout}", 5_000_000, **KITCHEN) for layout in LAYOUTS),
+    *(Task(f"overcooked/{layout}", 5_000_000, params=("reward_shaping_steps:2500000",)) for layout in _KITCHENS),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     Task("smax/2s3z", 10_000_000, settings=("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0")),
 )

@@ -18,6 +18,7 @@ from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.files import decode, encode
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.training.settings import load_settings
+from sb3_saf.training.yaml_files import Size
 from tests.test_suites import needs
 
 Array = npt.NDArray[Any]
@@ -218,16 +219,16 @@ def test_soups_alone_are_evaluated() -> None:
 @needs_jaxmarl
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
-    ("env_id", "params", "least"),
+    ("env_id", "size", "least"),
     [
-        ("overcooked/cramped_room", {"reward_shaping_steps": 50_000}, 50),
-        ("smax/3m", {}, 0.8),
-        ("jaxmarl/MPE_simple_speaker_listener_v4", {}, -60),
+        ("overcooked/cramped_room", "medium", 50),
+        ("smax/3m", "small", 0.8),
+        ("jaxmarl/MPE_simple_speaker_listener_v4", "small", -60),
     ],
 )
-def test_teams_learn(env_id: str, params: dict[str, Any], least: float) -> None:
+def test_teams_learn(env_id: str, size: Size, least: float) -> None:
     """MAPPO in 100,000 game steps, far from a random team's 0.8, 0.2 and -96 and from what three seeds reach."""
-    settings = load_settings("mappo", env_id, "small", env_kwargs=params)
+    settings = load_settings("mappo", env_id, size)
     model = settings.make_model(settings.make_env(0), 0).learn(100_000 * settings.n_agents)
     games = settings.make_env(1, evaluation=True)
     returns = evaluate_team(model, games, n_eval_episodes=64, deterministic=False).returns
