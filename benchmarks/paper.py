@@ -47,8 +47,8 @@ OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
 GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
 #: With a GRU, in settings of the grid.
 MEMORY: Final = "memory"
-#: Ten times as many game steps.
-LENGTH: Final = "length"
+#: The paper's number of game steps.
+LENGTH: Final = "length10"
 #: Every actor with every critic: names begin so.
 FACTORIAL: Final = "factorial"
 #: Methods of the grid; SAF is compared with the others.
@@ -362,7 +362,7 @@ def curves(frames: Frames) -> pd.DataFrame:
     parts = [
         (frames, "TeamSupport", "c2-h1", "TeamSupport, c = 2"),
         (frames, "TeamSupport", "c1-h5", "TeamSupport, h = 5"),
-        (read(LENGTH), "TeamSupport", "c2-h1", "TeamSupport, c = 2, ten times as long"),
+        (read(LENGTH), "TeamSupport", "c2-h1", "TeamSupport, c = 2, the paper's length"),
     ]
     shown = []
     for source, task, level, name in parts:

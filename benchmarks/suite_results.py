@@ -12,7 +12,7 @@ install together are trained in turn (``--tasks``), each in its own environment.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,15 +22,14 @@ from benchmarks.paper import add, fill
 from sb3_saf.experiments.cli import main as experiments
 from sb3_saf.experiments.definitions import METHODS as NAMED
 from sb3_saf.experiments.tables import read_results
-from sb3_saf.suites.registry import references
+from sb3_saf.suites.registry import RANDOM, references
 from sb3_saf.training.statistics import mean_over_seeds
 
-METHODS: Final = ("saf", "mappo", "ippo", "qplex")
+METHODS: Final = ("saf", "mappo", "ippo")
 SEEDS: Final = (0, 1, 2)
 BASELINES: Final = Path("results", "suites_baselines.csv")
 PAGE: Final = Path("results", "suites.md")
 RAW: Final = Path("results", "field")
-_NOT_RUN: Final = "not run"
 
 
 class Task(NamedTuple):
@@ -46,7 +45,7 @@ class Task(NamedTuple):
 
     env_id: str
     game_steps: int
-    methods: tuple[str, ...] = METHODS[:3]
+    methods: tuple[str, ...] = METHODS
     settings: tuple[str, ...] = ()
     params: tuple[str, ...] = ()
 
@@ -75,66 +74,59 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     experiments([*words, "--env-kwargs", *task.params] if task.params else words)
 
 
-def row(task: Task, folder: Path, methods: Sequence[str], baselines: pd.DataFrame) -> list[str]:
-    """Return the cells of a task's row; missing ones say so."""
-    beside = "; ".join([*_published(task), *_others(baselines)])
-    try:
-        tests = read_results(folder, task.name).tests
-    except ValueError:
-        return [task.env_id, f"{task.game_steps:,}", *[_NOT_RUN] * (len(methods) + 2), beside]
-    by_method = {method: tests[tests["method"] == method] for method in ("random", *methods)}
-    spent = [_seconds(rows["processor_seconds"]) for method, rows in by_method.items() if method != "random"]
-    figures = map(_figures, by_method.values())
-    return [task.env_id, f"{tests['game_steps'].max():,}", *figures, " / ".join(spent), beside]
-
-
-def _published(task: Task) -> Iterator[str]:
-    """Yield others' published results of trainings that are at least half and at most twice as long."""
+def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
+    """Yield results of others, and their sources, of trainings that are at least half and at most twice as long."""
     for one in references(task.env_id):
         if (
             not one.method.startswith("sb3-saf")
             and not one.params
             and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps
         ):
-            yield f"{one} ({one.source})"
+            yield str(one), one.source
+    here = baselines[(baselines["task"] == task.env_id) & (baselines["game_steps"] >= task.game_steps / 2)]
+    for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):
+        value = _over_seeds(trainings["return"])
+        yield f"{program} {value} after {game_steps:,} game steps", f"`{BASELINES.name}`"
 
 
-def _others(rows: pd.DataFrame) -> Iterator[str]:
-    for (program, game_steps), trainings in rows.groupby(["program", "game_steps"]):
-        spent = trainings["processor_seconds"].mean()
-        figures = _figures(trainings.rename(columns={"return": "return_mean", "won": "success_rate"}))
-        yield f"{program}, {game_steps:,} game steps: {figures}, {spent:.0f} s"
+def _over_seeds(values: pd.Series) -> str:
+    value, low, high = mean_over_seeds(values.to_numpy())
+    return f"{value:.2f}" if pd.isna(low) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _seconds(values: pd.Series) -> str:
-    return "-" if values.empty else f"{values.mean():.0f}"
-
-
-def _figures(tests: pd.DataFrame) -> str:
-    """Return the mean return over seeds with its interval, the share of games won, and the number of seeds."""
-    if tests.empty:
-        return _NOT_RUN
-    value, low, high = mean_over_seeds(tests["return_mean"].to_numpy())
-    text = f"{value:.2f}" if pd.isna(low) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
-    won = tests["success_rate"].mean()
-    return f"{text}{'' if pd.isna(won) else f', {won:.0%} won'} ({len(tests)})"
-
-
-def table(tasks: Iterable[Task], folder: Path, methods: Sequence[str]) -> Iterator[str]:
-    """Yield the lines of the table and of its sources."""
+def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
+    """Yield the lines of the table, of the sources of others' results, and of the tasks that were not trained yet."""
+    head = ["task", "game steps", "random", "method", "best policy", "last policy", "won", "seeds", "processor minutes"]
+    yield f"| {' | '.join([*head, 'others'])} |"
+    yield f"|{' --- |' * (len(head) + 1)}"
     baselines = pd.read_csv(BASELINES)
-    names = [NAMED[method].words for method in methods]
-    head = ["task", "game steps", "random", *names, f"processor s ({' / '.join(names)})", "others"]
-    yield f"| {' | '.join(head)} |"
-    yield f"|{' --- |' * len(head)}"
+    sources: list[str] = []
     commits: set[str] = set()
+    missing = []
     for task in tasks:
-        others = baselines[(baselines["task"] == task.env_id) & (baselines["game_steps"] >= task.game_steps / 2)]
-        yield f"| {' | '.join(row(task, folder, methods, others))} |"
-        if (folder / task.name).is_dir():
-            commits |= set(read_results(folder, task.name).tests["commit"])
+        others = []
+        for result, source in beside(task, baselines):
+            sources += [] if source in sources else [source]
+            others.append(f"{result} ({sources.index(source) + 1})")
+        if not (folder / task.name).is_dir():
+            missing.append(f"`{task.env_id}` ({'; '.join(others) or 'nothing is published'})")
+            continue
+        tests = read_results(folder, task.name).tests
+        commits |= set(tests["commit"])
+        random = tests[tests["method"] == RANDOM]["return_mean"].mean()
+        for method in task.methods:
+            here = tests[tests["method"] == method]
+            if here.empty:
+                continue
+            won = "" if here["success_rate"].isna().any() else f"{here['success_rate'].mean():.0%}"
+            cells = [f"`{task.env_id}`", f"{here['game_steps'].max():,}", f"{random:.2f}", NAMED[method].words]
+            cells += [_over_seeds(here["return_mean"]), _over_seeds(here["return_last"]), won, str(len(here))]
+            cells += [f"{here['processor_seconds'].mean() / 60:.0f}", "; ".join(others)]
+            yield f"| {' | '.join(cells)} |"
     yield ""
-    yield f"Commits: {', '.join(sorted(commits)) or 'none'}."
+    yield "; ".join(f"({number}) {source}" for number, source in enumerate(sources, 1)) + "."
+    yield ""
+    yield f"Not trained yet: {', '.join(missing)}. Commits: {', '.join(sorted(commits))}."
 
 
 def main() -> None:
@@ -153,7 +145,7 @@ def main() -> None:
         if (options.folder / task.name).is_dir():
             add(task.name, options.folder / task.name / task.name, RAW)
     text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(fill(text, {"table": "\n".join(table(TASKS, RAW, METHODS))}), encoding="utf-8")
+    PAGE.write_text(fill(text, {"table": "\n".join(table(TASKS, RAW))}), encoding="utf-8")
 
 
 if __name__ == "__main__":
