@@ -247,7 +247,9 @@ def other_table(names: Iterable[str]) -> str:
         for (task, level), here in trained.groupby(_COLUMNS, sort=False):
             means = here.groupby("method", sort=False)["return_mean"].mean()
             text = "; ".join(f"{WORDS.get(method, method)} {mean:.1f}" for method, mean in means.items())
-            body.append([name, f"{task}, {level}", str(here.groupby("method")["seed"].nunique().min()), text])
+            n_seeds = here.groupby("method")["seed"].nunique()
+            seeds = f"{n_seeds.min()} to {n_seeds.max()}" if n_seeds.nunique() > 1 else str(n_seeds.min())
+            body.append([name, f"{task}, {level}", seeds, text])
     return table(["experiment", "setting", "seeds", "returns of 100"], body)
 
 
@@ -286,11 +288,13 @@ def elsewhere(trainings: pd.DataFrame, here: pd.DataFrame) -> str:
     seeds = alike.groupby(["block", *_COLUMNS, "method"])["return_mean"]
     variances = seeds.var()[seeds.size() >= 5]
     limit = 2 * (2 * variances.mean()) ** 0.5
+    blocks = ", ".join(sorted(set(both["block"])))
     return (
-        f"{table(['experiment', 'setting', 'processor', 'returns of 100'], body)}\n\n{len(both)} more were run on the "
-        f"processor of the tables, too: there minus here {apart.mean():+.1f} on average, from {apart.min():+.1f} to "
-        f"{apart.max():+.1f}; {(apart.abs() <= limit).sum()} are within {limit:.1f}, as two seeds of a setting are in "
-        f"95 of 100 cases ({len(variances)} settings and methods with five seeds)."
+        table(["experiment", "setting", "processor", "returns of 100"], body)
+        + f"\n\n{len(both)} more ({blocks}) have the seeds of trainings in the tables: their returns are "
+        f"{apart.mean():+.1f} on average from those, {apart.min():+.1f} to {apart.max():+.1f}. Two seeds of a setting "
+        f"are within {limit:.1f} in 95 of 100 cases ({len(variances)} settings and methods with five seeds), these in "
+        f"{(apart.abs() <= limit).sum()} of {len(both)}."
     )
 
 
