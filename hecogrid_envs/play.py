@@ -255,9 +255,11 @@ def play_window(session: Session, tile_size: int | None = None) -> None:
     :param tile_size: pixels per cell; by default as many as fit the screen of a laptop
     """
     env, tile = session.env, tile_size or fit_tile_size(session.env.params.grid_size, 840)
-    print(KEYS_HELP)
     with closing(HumanWindow(f"HECOGrid: {env.task}", fps=_WINDOW_FPS)) as window:
         picture = env.picture(tile, session.selected)
+        window.show(picture)
+        # Only now: Ctrl-C while libraries are imported may be lost.
+        print(KEYS_HELP)
         while True:
             window.show(picture)
             for key in window.poll():

@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import venv
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -22,9 +24,10 @@ def make_environment(folder: Path) -> Path:
     return packages
 
 
-def start(command: str, folder: Path, activation: str = "", **settings: str) -> subprocess.Popen[str]:
+@contextmanager
+def start(command: str, folder: Path, activation: str = "", **settings: str) -> Iterator[subprocess.Popen[str]]:
     """
-    Start a command in a folder; what it prints is in ``stdout``.
+    Start a command in a folder and wait for its end; what it prints is in ``stdout``. Errors and timeouts kill it.
 
     :param command: one program and its arguments
     :param folder: where it runs
@@ -32,7 +35,7 @@ def start(command: str, folder: Path, activation: str = "", **settings: str) -> 
     :param settings: environment variables
     """
     environment = {name: value for name, value in os.environ.items() if name not in _INHERITED}
-    return subprocess.Popen(
+    with subprocess.Popen(
         ["bash", "-c", f"{activation}exec {command}"],
         cwd=folder,
         env={**environment, "PATH": os.defpath, "PYTHONUNBUFFERED": "1", **settings},
@@ -41,7 +44,12 @@ def start(command: str, folder: Path, activation: str = "", **settings: str) -> 
         text=True,
         # As in a terminal: a background job, such as these tests may be, ignores Ctrl-C, and so would its children.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    ) as process:
+        try:
+            yield process
+        except BaseException:
+            process.kill()
+            raise
 
 
 def shell(command: str, folder: Path, activation: str = "", **settings: str) -> str:
