@@ -107,7 +107,7 @@ def other_levels() -> pd.DataFrame:
 def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> list[Claim]:
     """Return the claims that these data can test."""
     general = 'SAF is better than {} "across different tasks and different heterogeneity and coordination levels"'
-    everywhere = "all settings"
+    everywhere = "all games"
     hidden = "TeamSupport, h = 5, zones as pixels"
     coordinated, zones = tests[tests["coordination"] > 1], tests[tests["heterogeneity"] > 1]
     return [
@@ -122,9 +122,20 @@ def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> l
     ]
 
 
+def by_game(tests: pd.DataFrame, first: str, second: str) -> pd.DataFrame:
+    """
+    Return paired differences (:func:`shares`) whose ``setting`` is the game of the training.
+
+    With c = 1 TeamTogether is TeamSupport in other colours. Tests of a team at several levels count once, too.
+    """
+    pairs = shares(tests, first, second)
+    trained = pairs["setting"].str.rsplit(n=1).str[0]
+    return pairs.assign(setting=trained.str.replace("TeamTogether c1-", "TeamSupport c1-"))
+
+
 def difference(rows: pd.DataFrame, first: str, second: str) -> Difference | None:
-    """Return the paired difference of two methods, over settings if there are three or more, else over seeds."""
-    return pooled(shares(rows, first, second))
+    """Return the paired difference of two methods, over games if there are three or more, else over seeds."""
+    return pooled(by_game(rows, first, second))
 
 
 def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
@@ -142,23 +153,21 @@ def answer(tests: pd.DataFrame) -> str:
     """Return SAF's differences from the three other methods in one sentence each."""
     lines = []
     for other in MAIN[1:]:
-        pairs = shares(tests, "saf", other)
+        pairs = by_game(tests, "saf", other)
         found = pooled(pairs)
         if found is not None:
             more = (pairs["difference"] > 0).sum()
             lines.append(
-                f"- SAF minus {WORDS[other]}: **{show(found.estimate)} % of the treasures** over {found.n} settings: "
+                f"- SAF minus {WORDS[other]}: **{show(found.estimate)} % of the treasures** over {found.n} games: "
                 f"{found.verdict}. SAF collected more in {more} of {len(pairs)} pairs of runs."
             )
     above = tests[tests.groupby(_COLUMNS)["score"].transform("max") >= _FLOOR]
-    found, means = (
-        pooled(shares(above, "saf", "mappo")),
-        shares(tests, "saf", "mappo").groupby("setting")["difference"].mean(),
-    )
+    found = difference(above, "saf", "mappo")
+    means = shares(tests, "saf", "mappo").groupby("setting")["difference"].mean()
     if found is not None:
         lines.append(
-            f"- Without the settings where no method collects {100 * _FLOOR:.0f} %: SAF minus {WORDS['mappo']} "
-            f"{show(found.estimate)} over {found.n}; {means.min():+.1f} to {means.max():+.1f} in single ones."
+            f"- Without the games where no method collects {100 * _FLOOR:.0f} %: SAF minus {WORDS['mappo']} "
+            f"{show(found.estimate)} over {found.n}; {means.min():+.1f} to {means.max():+.1f} in single settings."
         )
     return "\n".join(lines)
 
@@ -230,13 +239,14 @@ def settings_table(tests: pd.DataFrame) -> str:
     """Return the mean return at each level of training and test, with the smallest number of seeds."""
     body = []
     columns = ["task", "train_coordination", "train_heterogeneity", "coordination", "heterogeneity"]
+    methods = [method for method in (RANDOM, *MAIN) if (tests["method"] == method).any()]
     for (task, c, h, test_c, test_h), rows in tests.groupby(columns, sort=False):
         tested = "" if (c, h) == (test_c, test_h) else f", tested at c = {test_c}, h = {test_h}"
         means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"].isin(MAIN)]
-        cells = [f"{means[method]:.1f}" if method in means else "" for method in (RANDOM, *MAIN)]
+        cells = [f"{means[method]:.1f}" if method in means else "" for method in methods]
         n_seeds = trained.groupby("method")["seed"].nunique().min()
         body.append([f"{task}, c = {c}, h = {h}{tested}", *cells, str(n_seeds)])
-    return table(["setting", *(WORDS[method] for method in (RANDOM, *MAIN)), "seeds"], body)
+    return table(["setting", *(WORDS[method] for method in methods), "seeds"], body)
 
 
 def other_table(names: Iterable[str]) -> str:
@@ -293,8 +303,8 @@ def elsewhere(trainings: pd.DataFrame, here: pd.DataFrame) -> str:
         table(["experiment", "setting", "processor", "returns of 100"], body)
         + f"\n\n{len(both)} more ({blocks}) have the seeds of trainings in the tables: their returns are "
         f"{apart.mean():+.1f} on average from those, {apart.min():+.1f} to {apart.max():+.1f}. Two seeds of a setting "
-        f"are within {limit:.1f} in 95 of 100 cases ({len(variances)} settings and methods with five seeds), these in "
-        f"{(apart.abs() <= limit).sum()} of {len(both)}."
+        f"are within {limit:.1f} in 95 of 100 cases ({len(variances)} settings and methods with five seeds, "
+        f"{', '.join(sorted(set(alike['task'])))}); {(apart.abs() <= limit).sum()} of the {len(both)} are."
     )
 
 
@@ -355,7 +365,7 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
         named = [(f"{task}, c = {c}, h = {h}", here) for (task, c, h), here in settings]
         for label, here in [*named, (f"{group}, together", of_group)]:
             for other in MAIN[1:3]:
-                found = pooled(shares(here, "saf", other))
+                found = difference(here, "saf", other)
                 if found is not None:
                     rows.append((panel, label, other, *found.estimate, here is of_group))
     return pd.DataFrame(rows, columns=["panel", "level", "method", "value", "low", "high", "pooled"])

@@ -22,8 +22,9 @@ class TeamTogetherEnv(HECOGridEnv):
     Agents meet on a treasure to collect it.
 
     An agent that enters a treasure's cell, or picks up while standing on it, collects the treasure if at least
-    ``coordination`` agents stand on that cell, itself included. With ``coordination=1`` everyone collects alone; with 2
-    or more, agents wait for each other on the treasure and the last to arrive collects.
+    ``coordination`` agents stand on that cell, itself included. With ``coordination=1`` everyone collects alone, in the
+    game of TeamSupport with other colours; with 2 or more, agents wait for each other on the treasure and the last to
+    arrive collects.
 
     ```python
     from hecogrid_envs import parallel_env
