@@ -20,11 +20,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf.buffers.rollout import check_rows
 from sb3_saf.teams.checks import check_count, check_form, check_whole_teams
-from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
+from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, TRUNCATED, Array, TeamSpaces
 
 Indices = npt.NDArray[np.int64]
 
-_TRUNCATED: Final = "TimeLimit.truncated"
 _NO_ACTION: Final = -1
 #: The observation after a step is that of the next slot.
 _IN_NEXT_SLOT: Final = -1
@@ -207,7 +206,7 @@ class TeamReplayBuffer(ReplayBuffer):
         slot = self.pos
         self._begin(slot, now, None if episode_starts is None else np.asarray(episode_starts)[:: self.n_agents])
         ended = np.asarray(done).reshape(self.n_games, self.n_agents)[:, 0].astype(bool)
-        truncated = np.array([bool(info.get(_TRUNCATED, False)) for info in infos[:: self.n_agents]])
+        truncated = np.array([bool(info.get(TRUNCATED, False)) for info in infos[:: self.n_agents]])
         self.actions[slot] = np.asarray(action).reshape(self.n_games, self.n_agents)
         self.rewards[slot] = np.asarray(reward).reshape(self.n_games, self.n_agents).sum(axis=1, dtype=np.float64)
         self.ended[slot], self.terminal[slot] = ended, ended & ~truncated

@@ -178,11 +178,6 @@ class Run(NamedTuple):
 _RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary()
 
 
-def enter_run(model: BaseAlgorithm, run: Run) -> None:
-    """Set the run that a model continues."""
-    _RUNS[model] = run
-
-
 class TeamCheckpointCallback(BaseCallback):
     """
     Write checkpoints from which :func:`sb3_saf.resume` continues exactly.
@@ -235,7 +230,7 @@ class TeamCheckpointCallback(BaseCallback):
         show_game_steps(self.model)
         self.store.acquire()
         if self.model not in _RUNS:
-            enter_run(self.model, Run(uuid.uuid4().hex, description(self.model, self.others)))
+            _RUNS[self.model] = Run(uuid.uuid4().hex, description(self.model, self.others))
         self._run = _RUNS[self.model]
         newest = self.store.newest()
         if newest is not None and newest.tree["run"] != self._run.name:
@@ -397,7 +392,7 @@ def resume(
             env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
             model._last_obs = None
         continue_logs(model, tree["logger"])
-        enter_run(model, Run(tree["run"], tree["description"]))
+        _RUNS[model] = Run(tree["run"], tree["description"])
         load_generator_states(tree["generators"], model)  # last: the calls above may draw from them
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error

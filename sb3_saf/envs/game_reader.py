@@ -16,7 +16,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
 from sb3_saf.envs.gymnasium_team import INFO_MASKS
 from sb3_saf.networks.encoders import Part, PartsSpace
-from sb3_saf.teams.conversion import AgentConversion, Leaf, innermost
+from sb3_saf.teams.conversion import AgentConversion, Leaf, innermost, padded
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -301,8 +301,8 @@ def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
 def _common_box(boxes: Sequence[Any]) -> spaces.Box:
     shape = tuple(int(size) for size in np.max([box.shape for box in boxes], axis=0))
     dtype = np.result_type(*(box.dtype for box in boxes))
-    low = np.min([_padded(box.low, shape, dtype) for box in boxes], axis=0)
-    high = np.max([_padded(box.high, shape, dtype) for box in boxes], axis=0)
+    low = np.min([padded(box.low, shape, dtype) for box in boxes], axis=0)
+    high = np.max([padded(box.high, shape, dtype) for box in boxes], axis=0)
     return spaces.Box(low, high, dtype=dtype.type)
 
 
@@ -320,13 +320,13 @@ def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
     if all(isinstance(x, spaces.Discrete) or (isinstance(x, spaces.MultiDiscrete) and x.nvec.ndim == 1) for x in every):
         choices = [Leaf.of(space).choices for space in every]
         length = max(map(len, choices))
-        return spaces.MultiDiscrete(np.max([_padded(one, (length,), np.int64) for one in choices], axis=0))
+        return spaces.MultiDiscrete(np.max([padded(one, (length,), np.int64) for one in choices], axis=0))
     if all(isinstance(space, spaces.Box) and len(space.shape) == 1 for space in every):
         boxes: Any = every
         shape = (max(box.shape[0] for box in boxes),)
         # The padding of an agent that lacks an entry does not widen the bounds of that entry.
-        low = np.min([_padded(box.low, shape, np.float32, np.inf) for box in boxes], axis=0)
-        high = np.max([_padded(box.high, shape, np.float32, -np.inf) for box in boxes], axis=0)
+        low = np.min([padded(box.low, shape, np.float32, np.inf) for box in boxes], axis=0)
+        high = np.max([padded(box.high, shape, np.float32, -np.inf) for box in boxes], axis=0)
         return spaces.Box(low, high, dtype=np.float32)
     raise ValueError(
         "expected actions that are discrete for all agents (Discrete or MultiDiscrete), or vectors for all (Box of one "
@@ -334,9 +334,3 @@ def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
         "has one kind of actions: in a wrapper of the environment, give the agents with Box actions a table of vectors "
         "to choose from (Discrete), or take the largest entry of a Box for the agents with Discrete actions"
     )
-
-
-def _padded(array: Any, shape: tuple[int, ...], dtype: Any, fill: float = 0) -> Any:
-    result = np.full(shape, fill, dtype=dtype)
-    result[tuple(slice(size) for size in np.shape(array))] = array
-    return result

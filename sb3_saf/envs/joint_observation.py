@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -279,7 +279,10 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         rows = np.flatnonzero(ended.repeat(self.n_agents))
         last = self._terminal_parts([infos[row] for row in rows.tolist()], np.flatnonzero(ended).tolist())
         of_games = last.keys() & {TEAM_KEY, ACTIVE_KEY}
-        by_row = [_repeated(part, self.n_agents) if key in of_games else part for key, part in last.items()]
+        by_row = [
+            (one for one in part for _ in range(self.n_agents)) if key in of_games else part
+            for key, part in last.items()
+        ]
         is_limit_an_end = self.time_limit == "terminal"
         for row, *entries in zip(rows.tolist(), *by_row, strict=True):
             info = {**infos[row], TERMINAL_OBSERVATION: TerminalRow(zip(last, entries, strict=True), row)}
@@ -325,11 +328,6 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"expected terminal observations of one shape for the agents of game {games[odd // self.n_agents]}, "
                 f"got {sorted(set(shapes))}; make the environment return what its space promises"
             ) from None
-
-
-def _repeated(parts: Array, n_agents: int) -> Iterator[Array]:
-    """Yield the entry of each game once per agent, without copies."""
-    return (part for part in parts for _ in range(n_agents))
 
 
 class Untransposed(VecTransposeImage):

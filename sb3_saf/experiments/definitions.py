@@ -173,6 +173,13 @@ class Experiment(NamedTuple):
         """Whether the experiment has cells to train."""
         return bool(self.views)
 
+    @property
+    def vary(self) -> dict[str, list[Any]]:
+        """Varied parameters with their values, as :func:`own_experiment` takes them."""
+        return {
+            view.parameter: [view.position(level) for level in view.levels] for view in self.views if view.parameter
+        }
+
     def tests(self) -> dict[Level, tuple[Level, ...]]:
         """Return the training levels, each with its test levels."""
         tests: dict[Level, dict[Level, None]] = {}

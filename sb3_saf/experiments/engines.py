@@ -37,10 +37,6 @@ _QUEUED_PER_SLOT: Final = 2
 _FEWEST_QUEUED: Final = 64
 
 
-class CellError(RuntimeError):
-    """Raised if a cell's process has failed; the text is its log, or its exit status."""
-
-
 class Engine(ABC):
     """Base of engines that run jobs. A context manager; leaving it ends running jobs."""
 
@@ -110,7 +106,7 @@ class LocalEngine(Engine):
                 text = log.read()[-_LOG_TAIL:]
             death = f"exit code {code}" if code > 0 else signal.Signals(-code).name
             hint = "; if the machine ran out of memory, use fewer --workers" if death == "SIGKILL" else ""
-            raise CellError(text if code == 1 and text else f"{text}\nthe worker process died ({death}{hint})\n")
+            raise RuntimeError(text if code == 1 and text else f"{text}\nthe worker process died ({death}{hint})\n")
 
     def close(self) -> None:
         """End the processes: SIGTERM lets them write a last checkpoint."""
@@ -141,7 +137,6 @@ class RayEngine(Engine):
     def __init__(
         self, address: str | None = None, cpus: float = 1, gpus: float = 0, workers: int | None = None
     ) -> None:
-        self.address = address
         self.cpus = cpus
         self.gpus = gpus
         self._ray = require_ray(is_local=address is None)
@@ -194,7 +189,7 @@ class RayEngine(Engine):
             if (error := answer.exception()) is not None:
                 is_lost = not isinstance(error, self._ray.exceptions.RayTaskError)
                 lost = f"\n\nlost by Ray ({type(error).__name__}): {_first_line(error)}\n" if is_lost else ""
-                raise CellError(f"{error}{lost}")
+                raise RuntimeError(f"{error}{lost}")
             if (archive := answer.result()) is not None:
                 with zipfile.ZipFile(io.BytesIO(archive)) as packed:
                     packed.extractall(folder / "result")

@@ -467,11 +467,7 @@ def experiment_words(experiment: Experiment) -> list[str]:
     """Return the command line words for an experiment."""
     if experiment.name in EXPERIMENTS:
         return [experiment.name]
-    words = [experiment.name, "--env", *experiment.envs]
-    (view,) = experiment.views
-    if view.parameter:
-        words += option_words("--vary", {view.parameter: [view.position(level) for level in view.levels]})
-    return words
+    return [experiment.name, "--env", *experiment.envs, *option_words("--vary", experiment.vary)]
 
 
 def _versions(content: Content) -> str:

@@ -298,6 +298,4 @@ class Results:
 
 def _own(experiment: Experiment) -> dict[str, Any]:
     """Return a user's experiment as plain data."""
-    vary = {view.parameter: [view.position(level) for level in view.levels] for view in experiment.views}
-    vary.pop("", None)
-    return plain({"envs": experiment.envs, "vary": vary})
+    return plain({"envs": experiment.envs, "vary": experiment.vary})

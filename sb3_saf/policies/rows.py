@@ -225,8 +225,8 @@ class TeamRowsPolicy(BasePolicy):
             starts = starts | th.as_tensor(np.reshape(episode_start, -1).astype(bool), device=self.device)
         return starts
 
-    def _action_mask(self, obs: PyTorchObs, padded: bool = False) -> th.Tensor | None:
-        """Return the rows' legal actions, (B, A) bool; None if all always are. Only padding rows may have none."""
+    def _action_mask(self, obs: PyTorchObs) -> th.Tensor | None:
+        """Return the rows' legal actions, (B, A) bool; None if all always are."""
         if self.team_spaces.action_mask is None:
             return None
         if isinstance(obs, th.Tensor) or ACTION_MASK_KEY not in obs:
@@ -237,7 +237,7 @@ class TeamRowsPolicy(BasePolicy):
             )
         mask = obs[ACTION_MASK_KEY].reshape(-1, *self.team_spaces.action_mask.shape) != 0
         stuck = ~mask.any(dim=1)
-        if not padded and stuck.any():
+        if stuck.any():
             raise ValueError(
                 f"expected at least one legal action in each {ACTION_MASK_KEY!r}, got none in row "
                 f"{int(stuck.nonzero()[0])} of {len(mask)}"

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, Final
 
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-from sb3_saf.suites.registry import HOME, Suite, find_environment, references, suites
+from sb3_saf.suites.registry import HOME, Suite, find_environment, installed_version, references, suites
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.teams.rows import TeamSpaces
 
@@ -68,7 +68,8 @@ def summary(suite: Suite) -> str:
     if (problem := suite.problem()) is not None:
         return "\n".join([*lines, f"  {problem}"])
     package = suite.requirements[0].name
-    lines.append(f"  {package} {suite.installed_version()} is installed, {len(suite.tasks)} tasks")
+    version = installed_version(package) or "of a source folder"
+    lines.append(f"  {package} {version} is installed, {len(suite.tasks)} tasks")
     return "\n".join([*lines, *(f"  {example(suite, task)}" for task in suite.examples)])
 
 

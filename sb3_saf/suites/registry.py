@@ -100,33 +100,16 @@ class Suite:
         parsed = (Requirement(line) for line in self.requires)
         return tuple(one for one in parsed if one.marker is None or one.marker.evaluate())
 
-    @property
-    def pip_line(self) -> str:
-        """Command that installs the suite, in a clone of this repository."""
-        return f"pip install 'sb3-saf[{self.extra}]'"
-
-    def installed_version(self) -> str | None:
-        """Return the version of the suite's own package, None if it is not installed."""
-        installed = _version(self._package)
-        return "of a source folder" if installed is None and self._is_source_folder(self._package) else installed
-
-    @property
-    def _package(self) -> str:
-        return Requirement(self.requires[0]).name
-
-    def _is_source_folder(self, package: str) -> bool:
-        return package == self._package and self.module is not None and find_spec(self.module) is not None
-
     def problem(self) -> str | None:
         """Return why no game can be made, None if all requirements are installed."""
         if not self.requirements:
             return f"needs another version of Python: {'; '.join(self.requires)}"
-        for requirement in self.requirements:
-            installed = _version(requirement.name)
-            if installed is None and self._is_source_folder(requirement.name):
-                continue
+        for number, requirement in enumerate(self.requirements):
+            installed = installed_version(requirement.name)
+            if installed is None and number == 0 and self.module is not None and find_spec(self.module) is not None:
+                continue  # of a source folder
             if installed is None:
-                return f"needs {requirement.name}, which is not installed: {self.pip_line}"
+                return f"needs {requirement.name}, which is not installed: pip install 'sb3-saf[{self.extra}]'"
             if not requirement.specifier.contains(installed, prereleases=True):
                 return (
                     f"works with {requirement.name}{requirement.specifier}, got version {installed}: "
@@ -178,7 +161,8 @@ def parallel_env(package: str, task: str, *, render_mode: str | None = None, **p
     return module.parallel_env(render_mode=render_mode, **params)
 
 
-def _version(distribution: str) -> str | None:
+def installed_version(distribution: str) -> str | None:
+    """Return the version of an installed package, None if it is not installed."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -231,11 +215,7 @@ class TeamEnvironment:
         """Count the agents, N; a game is made unless the suite knows them."""
         if self.suite is not None and self.suite.complete is not None:
             return int(params["n_agents"])
-        game: Any = None
-        if self.make is not None:
-            game = self.make_game(params)
-        elif self.suite is not None and self.suite.vec_env is not None:
-            game = self.make_engine(1, None, params)
+        game: Any = self.make_engine(1, None, params) if self.make is None else self.make_game(params)
         agents = getattr(game, "possible_agents", None)
         game.close()
         if not agents:
@@ -256,7 +236,7 @@ class TeamEnvironment:
             raise ValueError(f"{self.id} cannot be made with {dict(params)}: {error}") from error
         return venv
 
-    def make_game(self, params: Mapping[str, Any], render_mode: str | None = None, **changes: Any) -> Any:
+    def make_game(self, params: Mapping[str, Any], render_mode: str | None = None) -> Any:
         """
         Make one game.
 
@@ -265,7 +245,7 @@ class TeamEnvironment:
         """
         if self.make is None:
             raise ValueError(f"{self.id} has an engine only, which makes no single games to wrap: use vec_env_wrapper")
-        kwargs = {**params, **changes} if render_mode is None else {**params, **changes, "render_mode": render_mode}
+        kwargs = dict(params) if render_mode is None else {**params, "render_mode": render_mode}
         try:
             game = as_parallel(self.make(**kwargs))
         except TypeError as error:  # most often an argument that it does not have

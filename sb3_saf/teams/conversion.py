@@ -285,7 +285,7 @@ class AgentConversion:
         else:
             array = np.moveaxis(arrays[0], -1, 0) if self.channels_last else arrays[0]
         if array.shape != self.shape:
-            array = _padded(array, self.shape)
+            array = padded(array, self.shape)
         if array.dtype == self.dtype:
             return array
         with np.errstate(over="ignore"):
@@ -306,7 +306,7 @@ class AgentConversion:
         if own == row_choices:
             return array
         parts = [*np.split(array, np.cumsum(own)[:-1]), *[np.ones(1, np.int8)] * (len(row_choices) - len(own))]
-        return np.concatenate([_padded(part, (n,)) for part, n in zip(parts, row_choices, strict=True)])
+        return np.concatenate([padded(part, (n,)) for part, n in zip(parts, row_choices, strict=True)])
 
     @cached_property
     def keeps_actions(self) -> bool:
@@ -339,10 +339,10 @@ class AgentConversion:
         return True
 
 
-def _padded(array: Array, shape: tuple[int, ...]) -> Array:
-    """Add zeros at the end of each axis."""
-    row = np.zeros(shape, dtype=array.dtype)
-    row[tuple(slice(size) for size in array.shape)] = array
+def padded(array: Any, shape: tuple[int, ...], dtype: npt.DTypeLike | None = None, fill: float = 0) -> Array:
+    """Add ``fill`` at the end of each axis; None: the array's own dtype."""
+    row = np.full(shape, fill, dtype=array.dtype if dtype is None else dtype)
+    row[tuple(slice(size) for size in np.shape(array))] = array
     return row
 
 

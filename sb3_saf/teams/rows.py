@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,17 +19,13 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 
 from sb3_saf.teams.conversion import AgentConversion
 
-TeamKey = Literal["obs", "team", "agent"]
-
 #: The row's own observation.
 OBS_KEY: Final = "obs"
 #: The own observations of all agents of the row's team, in index order.
 TEAM_KEY: Final = "team"
 #: The index of the row's agent in its team.
 AGENT_KEY: Final = "agent"
-TEAM_KEYS: Final[tuple[TeamKey, ...]] = get_args(TeamKey)
-
-OptionalKey = Literal["active", "action_mask", "state"]
+TEAM_KEYS: Final = (OBS_KEY, TEAM_KEY, AGENT_KEY)
 
 #: SB3's keys of infos: the last observation of an episode, and whether a time limit ended it.
 TERMINAL_OBSERVATION: Final = "terminal_observation"
@@ -48,7 +44,7 @@ STATE_KEY: Final = "state"
 #: Whether the row's agent took no part in the step before: its episode begins here, and its memory is empty.
 EPISODE_START_KEY: Final = "episode_start"
 #: Keys that only some environments provide.
-OPTIONAL_KEYS: Final[tuple[OptionalKey, ...]] = get_args(OptionalKey)
+OPTIONAL_KEYS: Final = (ACTIVE_KEY, ACTION_MASK_KEY, STATE_KEY)
 ALL_KEYS: Final[frozenset[str]] = frozenset((*TEAM_KEYS, *OPTIONAL_KEYS, EPISODE_START_KEY))
 
 Array = npt.NDArray[Any]

@@ -6,6 +6,7 @@ import argparse
 import importlib
 import json
 import os
+import reprlib
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import Any, NoReturn, TypeVar
 import torch as th
 
 from sb3_saf.suites.registry import HOW_TO_NAME
-from sb3_saf.training.yaml_files import parse_value
+from sb3_saf.training.yaml_files import load_yaml
 
 USAGE_ERROR = 2
 
@@ -70,7 +71,7 @@ class KeyValues(argparse.Action):
             if not colon or not key or not value:
                 parser.error(f"{option_string} expects key:value, such as coordination:2, got {text!r}")
             try:
-                pairs[key] = parse_value(value)
+                pairs[key] = load_yaml(value, f"the value {reprlib.repr(value)}")
             except ValueError as error:
                 parser.error(str(error))
         setattr(namespace, self.dest, pairs)

@@ -53,11 +53,6 @@ def load_yaml(text: str, source: str) -> Any:
         raise ValueError(f"{source} is not valid YAML: {reason}") from None
 
 
-def parse_value(text: str) -> Any:
-    """Read a value typed on a command line."""
-    return load_yaml(text, f"the value {reprlib.repr(text)}")
-
-
 def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[str, Any]:
     """
     Read a settings file, merged into its base files.

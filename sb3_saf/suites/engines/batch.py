@@ -182,7 +182,6 @@ class BatchVecEnv(TeamVecEnv):
             self._is_short = self.batch.shorten()
         self._next_seeds = None
         self._reset_options()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
         self._running = True
         return self._observations(rows)
 
@@ -229,7 +228,6 @@ class BatchVecEnv(TeamVecEnv):
             for row in range(game * self.n_agents, (game + 1) * self.n_agents):
                 observation = dict(zip(step.last, next(last), strict=True))
                 infos[row] = {**of_game, TERMINAL_OBSERVATION: self._observations(observation)}
-                self.reset_infos[row] = {}
             if step.won is not None:
                 infos[game * self.n_agents][IS_SUCCESS] = bool(step.won[game])
         return infos

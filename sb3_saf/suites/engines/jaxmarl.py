@@ -12,6 +12,7 @@ import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache, partial
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -431,10 +432,8 @@ def _draw_particles(env: Any, state: Any) -> Picture:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def _shaped(infos: Mapping[str, Any]) -> Mapping[str, Any]:
-    return infos["shaped_reward"]
-
-
+#: Of the infos of both kitchens.
+_shaped: Final = itemgetter("shaped_reward")
 _SMAX: Final = Rules(is_undecided=_both_alive, is_won=_enemies_dead, pays_the_dead=True, draw=_draw_smax)
 _RULES: Final[dict[str, Rules]] = {
     "SMAX": _SMAX._replace(is_won=None),  # both sides are trained, one wins

@@ -1,14 +1,12 @@
 """Import of JaxMARL, which resets ``sys.stdout`` and ``sys.stderr`` of notebooks and tests: undone here."""
 
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 
-_streams = sys.stdout, sys.stderr
-try:
+with redirect_stdout(sys.stdout), redirect_stderr(sys.stderr):
     import jaxmarl
     from jaxmarl.environments import MABRAX_AVAILABLE, SUBMODULE_ENVIRONMENTS, overcooked_layouts, spaces
     from jaxmarl.environments.smax.smax_env import MAP_NAME_TO_SCENARIO
-finally:
-    sys.stdout, sys.stderr = _streams
 
 __all__ = [
     "MABRAX_AVAILABLE",
