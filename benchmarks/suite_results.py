@@ -126,7 +126,8 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
     yield ""
     yield "; ".join(f"({number}) {source}" for number, source in enumerate(sources, 1)) + "."
     yield ""
-    yield f"Not trained yet: {', '.join(missing)}. Commits: {', '.join(sorted(commits))}."
+    untrained = f"Not trained yet: {', '.join(missing)}. " if missing else ""
+    yield f"{untrained}Commits: {', '.join(sorted(commits))}."
 
 
 def main() -> None:
