@@ -9,6 +9,7 @@ a warning, is an error.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -58,6 +59,8 @@ def execute(path: Path, parameters: Mapping[str, object]) -> NotebookNode:
     :raises NotebookError: for an exception, or for anything on stderr
     """
     notebook = with_parameters(nbformat.read(path, as_version=4), parameters)
+    # As in an active environment: commands say "python", not where it is.
+    paths = os.pathsep.join((os.path.dirname(sys.executable), os.environ["PATH"]))
     with tempfile.TemporaryDirectory(prefix="notebook") as folder:
         client = NotebookClient(
             notebook,
@@ -67,7 +70,7 @@ def execute(path: Path, parameters: Mapping[str, object]) -> NotebookNode:
             resources={"metadata": {"path": folder}},
         )
         try:
-            client.execute()
+            client.execute(env={**os.environ, "PATH": paths})
         except CellExecutionError as error:
             raise NotebookError(f"{path.name}: {error}") from None
     for cell in code_cells(notebook):

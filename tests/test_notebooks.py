@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 from pathlib import Path
 
@@ -83,3 +84,12 @@ def save(path: Path, *cells: str) -> Path:
 def test_warnings_are_errors(tmp_path: Path) -> None:
     with pytest.raises(NotebookError, match="UserWarning: old"):
         execute(save(tmp_path / "a.ipynb", "n = 3", "import warnings\nwarnings.warn('old', stacklevel=1)"), {})
+
+
+def test_commands_say_python_also_where_no_environment_is_active(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", os.defpath)
+    says = "from sb3_saf.training.folders import python_command\nprint(python_command('sb3_saf.train'))"
+    notebook = execute(save(tmp_path / "a.ipynb", "n = 3", says), {})
+    assert written_by(code_cells(notebook)[1]).strip() == "python -m sb3_saf.train"
