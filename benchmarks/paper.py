@@ -22,7 +22,6 @@ import pandas as pd
 from sb3_saf.experiments.definitions import METHODS, RANDOM
 from sb3_saf.experiments.tables import (
     CURVES,
-    FEWEST_SEEDS,
     MARGIN,
     RUNS,
     Difference,
@@ -36,7 +35,7 @@ from sb3_saf.experiments.tables import (
 )
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.figures import draw_curves, draw_differences
-from sb3_saf.training.statistics import Estimate, mean_over_seeds
+from sb3_saf.training.statistics import FEWEST_SEEDS, Estimate, mean_over_seeds
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 RAW: Final = ROOT / "results" / "paper"
@@ -357,7 +356,11 @@ def blocks_table(tests: pd.DataFrame) -> str:
 
 
 def forest(tests: pd.DataFrame) -> pd.DataFrame:
-    """Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group."""
+    """
+    Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group.
+
+    From three seeds on with intervals: those of two would hide the others.
+    """
     rows = []
     for group, of_group in tests.groupby("group", sort=False):
         panel = "coordination" if group == "coordination" else "heterogeneity"
@@ -367,12 +370,14 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
             for other in MAIN[1:3]:
                 found = difference(here, "saf", other)
                 if found is not None:
-                    rows.append((panel, label, other, *found.estimate, here is of_group))
+                    value, *ends = found.estimate
+                    ends = ends if found.n >= FEWEST_SEEDS else [np.nan, np.nan]
+                    rows.append((panel, label, other, value, *ends, here is of_group))
     return pd.DataFrame(rows, columns=["panel", "level", "method", "value", "low", "high", "pooled"])
 
 
 def curves(frames: Frames) -> pd.DataFrame:
-    """Return the evaluations of two settings, and the means of longer trainings."""
+    """Return the evaluations of two settings, and of longer trainings."""
     parts = [
         (frames, "TeamSupport", "c2-h1", "TeamSupport, c = 2"),
         (frames, "TeamSupport", "c1-h5", "TeamSupport, h = 5"),
@@ -381,9 +386,6 @@ def curves(frames: Frames) -> pd.DataFrame:
     shown = []
     for source, task, level, name in parts:
         here = source.curves[source.curves["method"].isin(MAIN)]
-        if source is not frames:  # means alone: intervals of two or three seeds would fill the panel
-            means = here.groupby(["method", "game_steps"])["score"].transform("mean")
-            here = here.assign(score=means).drop_duplicates(["method", "game_steps"])
         shown.append(here[(here["task"] == task) & (here["level"] == level)].assign(panel=name))
     return pd.concat(shown)
 

@@ -65,6 +65,7 @@ def test_curves_are_drawn_where_they_are() -> None:
     assert to_hex(str(lines["mappo (1 seed)"].get_color())) == method_styles(["mappo"])["mappo"].colour.lower()
     assert (axes.get_xlabel(), axes.get_title()) == ("game steps", "t")
     assert figure.get_suptitle() == "T"
+    assert [len(draw_curves(runs(saf=[[1, 2, 3]] * n)).axes[0].collections) for n in (2, 3)] == [0, 1], "bands"
     two = draw_curves(pd.concat([table, runs(saf=[[0, 0, 1]]).assign(task="u")]), panel="task")
     assert [text.get_text() for text in two.legends[0].get_texts()] == ["saf (1 to 2 seeds)", "mappo (1 seed)"]
 

@@ -55,7 +55,7 @@ from sb3_saf.teams.files import read_json, write_json, write_text
 from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run, check_runs_no_code, finish_run, python_command, read_curve
 from sb3_saf.training.replay import write_page
-from sb3_saf.training.statistics import Estimate, Floats, mean_over_seeds, require_columns
+from sb3_saf.training.statistics import FEWEST_SEEDS, Estimate, Floats, mean_over_seeds, require_columns
 
 RUNS: Final = "runs.csv"
 CURVES: Final = "curves.csv"
@@ -327,8 +327,6 @@ def complete(rows: pd.DataFrame) -> pd.DataFrame:
 # --- comparisons ------------------------------------------------------------------------------------------------------
 
 
-#: Minimum seeds for a verdict.
-FEWEST_SEEDS: Final = 3
 #: Differences below this share of the largest return do not matter.
 MARGIN: Final = 0.02
 _LEVEL: Final = 0.05

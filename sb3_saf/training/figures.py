@@ -21,6 +21,7 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_saf.training.statistics import (
     CURVE_COLUMNS,
+    FEWEST_SEEDS,
     Floats,
     interquartile_means,
     learning_curve,
@@ -141,7 +142,7 @@ def draw_curves(
     references: Mapping[str, float] | None = None,
 ) -> Figure:
     """
-    Draw learning curves: mean and 95 % interval (Student's t) over seeds.
+    Draw learning curves: mean and, from three seeds on, 95 % interval (Student's t) over seeds.
 
     :param runs: columns ``method``, ``seed``, ``game_steps``, ``score``
     :param panel: column with one panel per value, for instance ``"task"``
@@ -164,7 +165,8 @@ def draw_curves(
             marker = "o" if len(curve) == 1 else None
             steps = curve["game_steps"]
             ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
-            ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
+            if of_method["seed"].nunique() >= FEWEST_SEEDS:
+                ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
         for (label, score), line in zip((references or {}).items(), cycle(_REFERENCE_LINES), strict=False):
             ax.axhline(score, color=_REFERENCE, linestyle=line, label=label)
         ax.set(xlabel="game steps", ylabel=y_label, title=fill(name, _TITLE_WIDTH))

@@ -24,6 +24,9 @@ Floats = npt.NDArray[np.float64]
 N_RESAMPLES: Final = 2_000
 BOOTSTRAP_SEED: Final = 0
 
+#: Intervals and comparisons need as many seeds: with two, Student's t interval is 18 times the standard deviation wide.
+FEWEST_SEEDS: Final = 3
+
 CURVE_COLUMNS: Final = ("method", "seed", "game_steps", "score")
 
 
