@@ -57,6 +57,8 @@ WORDS: Final = {
     **{f"{name}-gru": f"{METHODS[name].words}, GRU" for name in ("saf", "mappo", "ippo")},
 }
 _COLUMNS: Final = ["task", "level"]
+#: What a setting varies, and its letter.
+_GROUPS: Final = {"coordination": "c", "heterogeneity": "h", "joint": "c and h"}
 #: Share of the treasures below which a setting says nothing about methods.
 _FLOOR: Final = 0.01
 #: Columns that tell trainings apart.
@@ -128,8 +130,11 @@ def by_game(tests: pd.DataFrame, first: str, second: str) -> pd.DataFrame:
     With c = 1 TeamTogether is TeamSupport in other colours. Tests of a team at several levels count once, too.
     """
     pairs = shares(tests, first, second)
-    trained = pairs["setting"].str.rsplit(n=1).str[0]
-    return pairs.assign(setting=trained.str.replace("TeamTogether c1-", "TeamSupport c1-"))
+    return pairs.assign(setting=pairs["setting"].str.rsplit(n=1).str[0].map(_game))
+
+
+def _game(setting: str) -> str:
+    return setting.replace("TeamTogether c1-", "TeamSupport c1-")
 
 
 def difference(rows: pd.DataFrame, first: str, second: str) -> Difference | None:
@@ -148,9 +153,9 @@ def show(estimate: Estimate) -> str:
     return f"{value:+.1f}" if np.isnan(low) else f"{value:+.1f} [{low:.1f}, {high:.1f}]"
 
 
-def answer(tests: pd.DataFrame) -> str:
+def answer(frames: Frames) -> str:
     """Return SAF's differences from the three other methods in one sentence each."""
-    lines = []
+    tests, lines = frames.tests, []
     for other in MAIN[1:]:
         pairs = by_game(tests, "saf", other)
         found = pooled(pairs)
@@ -168,6 +173,16 @@ def answer(tests: pd.DataFrame) -> str:
             f"- Without the games where no method collects {100 * _FLOOR:.0f} %: SAF minus {WORDS['mappo']} "
             f"{show(found.estimate)} over {found.n}; {means.min():+.1f} to {means.max():+.1f} in single settings."
         )
+    early = {
+        (_game(f"{task} {level}"), task, seed): _lead_at_equal_time(rows, ("mappo", "saf"))
+        for (task, level, seed), rows in frames.curves.groupby([*_COLUMNS, "seed"])
+        if {"saf", "mappo"} <= set(rows["method"])
+    }
+    lead = mean_over_seeds(pd.Series(early).groupby(level=0).mean().to_numpy())
+    lines.append(
+        f"- At equal processor time, when MAPPO's training ends, SAF's evaluations minus MAPPO's: {show(lead)}; SAF's "
+        "learning rate has not reached 0 by then."
+    )
     return "\n".join(lines)
 
 
@@ -177,9 +192,9 @@ def methods_table(tests: pd.DataFrame) -> str:
     common = tests.loc[trained_methods.index[trained_methods == len(MAIN)], _COLUMNS].drop_duplicates()
     tests = tests.merge(common, on=_COLUMNS)
     columns = {
-        **{task: tests["task"] == task for task in dict.fromkeys(tests["task"])},
-        **{group: tests["group"] == group for group in ("coordination", "heterogeneity", "joint")},
         "all": tests["seed"] >= 0,
+        **{task: tests["task"] == task for task in dict.fromkeys(tests["task"])},
+        **{words: tests["group"] == group for group, words in _GROUPS.items()},
     }
     body = []
     for method in MAIN:
@@ -187,8 +202,8 @@ def methods_table(tests: pd.DataFrame) -> str:
         cells = [_mean_share(tests[here & chosen]) for chosen in columns.values()]
         seconds = f"{tests.loc[here, 'processor_seconds'].mean():.0f}"
         probability = "" if method == "saf" else _probability(tests, method)
-        body.append([WORDS[method], *cells, probability, seconds])
-    return table(["method", *columns, "SAF is better", "processor seconds"], body)
+        body.append([WORDS[method], cells[0], probability, seconds, *cells[1:]])
+    return table(["method", "all", "SAF is better", "seconds", *list(columns)[1:]], body)
 
 
 def _mean_share(rows: pd.DataFrame) -> str:
@@ -413,7 +428,7 @@ def pages() -> dict[Path, str]:
     unseen = other_levels()
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
-        "answer": answer(tests),
+        "answer": answer(frames),
         "methods": methods_table(tests),
         "claims": claims_table(claims(tests, unseen, pixels)),
         "memory": memory_table(frames, read(MEMORY)),

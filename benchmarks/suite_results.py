@@ -75,18 +75,17 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
 
 
 def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
-    """Yield results of others, and their sources, of trainings that are at least half and at most twice as long."""
+    """Yield results of others, and whose they are, of trainings that are at least half and at most twice as long."""
     for one in references(task.env_id):
         if (
             not one.method.startswith("sb3-saf")
             and not one.params
             and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps
         ):
-            yield str(one), one.source
+            yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
     here = baselines[(baselines["task"] == task.env_id) & (baselines["game_steps"] >= task.game_steps / 2)]
     for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):
-        value = _over_seeds(trainings["return"])
-        yield f"{program} {value} after {game_steps:,} game steps", f"`{BASELINES.name}`"
+        yield _over_seeds(trainings["return"]), f"{program} after {game_steps:,} game steps: `{BASELINES.name}`"
 
 
 def _over_seeds(values: pd.Series) -> str:
@@ -95,19 +94,19 @@ def _over_seeds(values: pd.Series) -> str:
 
 
 def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
-    """Yield the lines of the table, of the sources of others' results, and of the tasks that were not trained yet."""
-    head = ["task", "game steps", "random", "method", "best policy", "last policy", "won", "seeds", "processor minutes"]
-    yield f"| {' | '.join([*head, 'others'])} |"
-    yield f"|{' --- |' * (len(head) + 1)}"
+    """Yield the lines of the table, of whose the others' results are, and of the tasks that were not trained yet."""
+    head = ["task", "game steps", "method", "best policy", "others", "last policy", "random", "seeds", "minutes"]
+    yield f"| {' | '.join(head)} |"
+    yield f"|{' --- |' * len(head)}"
     baselines = pd.read_csv(BASELINES)
-    sources: list[str] = []
+    notes: list[str] = []
     commits: set[str] = set()
     missing = []
     for task in tasks:
         others = []
-        for result, source in beside(task, baselines):
-            sources += [] if source in sources else [source]
-            others.append(f"{result} ({sources.index(source) + 1})")
+        for result, note in beside(task, baselines):
+            notes += [] if note in notes else [note]
+            others.append(f"{result} ({notes.index(note) + 1})")
         if not (folder / task.name).is_dir():
             missing.append(f"`{task.env_id}` ({'; '.join(others) or 'nothing is published'})")
             continue
@@ -118,13 +117,17 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
             here = tests[tests["method"] == method]
             if here.empty:
                 continue
-            won = "" if here["success_rate"].isna().any() else f"{here['success_rate'].mean():.0%}"
-            cells = [f"`{task.env_id}`", f"{here['game_steps'].max():,}", f"{random:.2f}", NAMED[method].words]
-            cells += [_over_seeds(here["return_mean"]), _over_seeds(here["return_last"]), won, str(len(here))]
-            cells += [f"{here['processor_seconds'].mean() / 60:.0f}", "; ".join(others)]
+            won = "" if here["success_rate"].isna().any() else f", {here['success_rate'].mean():.0%} won"
+            cells = [f"`{task.env_id}`", f"{here['game_steps'].max():,}", NAMED[method].words]
+            cells += [
+                f"**{_over_seeds(here['return_mean'])}**{won}",
+                "; ".join(others),
+                _over_seeds(here["return_last"]),
+            ]
+            cells += [f"{random:.2f}", str(len(here)), f"{here['processor_seconds'].mean() / 60:.0f}"]
             yield f"| {' | '.join(cells)} |"
     yield ""
-    yield "; ".join(f"({number}) {source}" for number, source in enumerate(sources, 1)) + "."
+    yield from (f"{number}. {note}" for number, note in enumerate(notes, 1))
     yield ""
     untrained = f"Not trained yet: {', '.join(missing)}. " if missing else ""
     yield f"{untrained}Commits: {', '.join(sorted(commits))}."

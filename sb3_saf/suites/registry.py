@@ -339,10 +339,14 @@ class Reference(NamedTuple):
     game_steps: int
     source: str
 
+    @property
+    def result(self) -> str:
+        """The value with its unit."""
+        return f"{100 * self.value:.0f} % won" if self.unit == "won" else f"{self.value:g}"
+
     def __str__(self) -> str:
-        value = f"{100 * self.value:.0f} % won" if self.unit == "won" else f"{self.value:g}"
         steps = f" after {self.game_steps:,} game steps" if self.game_steps else ""
-        return f"{self.method} {value}{steps}"
+        return f"{self.method} {self.result}{steps}"
 
 
 @cache
