@@ -117,9 +117,8 @@ def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(trained_teams, "TEAMS", published)
     assert len(enjoy(["--team", f"{LEVEL}/saf-gru", "--no-render", "--episodes", "2"]).returns) == 2
     assert len(enjoy(["--team", f"{LEVEL}/saf", "--no-render", "--env-kwargs", "n_agents:5"]).returns) == 32
-    assert write_page(
-        ["--model", str(published / LEVEL / "saf" / WEIGHTS), "-o", str(tmp_path / "page.html")]
-    ).is_file()
+    models = [str(published / LEVEL / "saf"), str(published / LEVEL / "saf-gru" / WEIGHTS)]
+    assert write_page(["--model", *models, "-o", str(tmp_path / "page.html")]).is_file()
 
 
 def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,7 +22,7 @@ from sb3_saf.training.commands import (
     user_errors,
 )
 from sb3_saf.training.enjoy import make_policy
-from sb3_saf.training.folders import RUN_FILE, Run
+from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run
 from sb3_saf.training.settings import ALGOS, Settings, load_settings, saved_settings
 
 PROGRAM: Final = "python -m sb3_saf.replay"
@@ -39,7 +39,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="+",
         required=True,
         metavar="FILE",
-        help="a model (.zip), or the folder of exported actors; several are shown side by side",
+        help="a model (.zip), or the folder of a published team or of exported actors; several are shown side by side",
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("replay.html"), help="the page")
     add_environment_options(parser, "another level than was trained on, such as coordination:3")
@@ -58,7 +58,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
     import_packages(options.gym_packages)
     with user_errors(ValueError, OSError, ExportError):
         seed = evaluation_seed(check_seed(options.seed))
-        settings = [_settings_of(path, options) for path in options.model]
+        paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in options.model]
+        settings = [_settings_of(path, options) for path in paths]
         suite = settings[0].environment.suite
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
         with closing(
@@ -66,7 +67,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         ) as games:
             players: dict[str, Any] = {
                 name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
-                for name, path, own in zip(_names(options.model), options.model, settings, strict=True)
+                for name, path, own in zip(_names(options.model), paths, settings, strict=True)
             }
             gamma = settings[0].hyperparams.get("gamma", 0.99)
             return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
