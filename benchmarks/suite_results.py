@@ -23,7 +23,7 @@ from sb3_saf.experiments.cli import main as experiments
 from sb3_saf.experiments.definitions import METHODS as NAMED
 from sb3_saf.experiments.tables import read_results
 from sb3_saf.suites.registry import RANDOM, references
-from sb3_saf.training.statistics import mean_over_seeds
+from sb3_saf.training.statistics import FEWEST_SEEDS, mean_over_seeds
 
 METHODS: Final = ("saf", "mappo", "ippo")
 SEEDS: Final = (0, 1, 2)
@@ -93,7 +93,7 @@ def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
 
 def _over_seeds(values: pd.Series) -> str:
     value, low, high = mean_over_seeds(values.to_numpy())
-    return f"{value:.2f}" if pd.isna(low) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
+    return f"{value:.2f}" if len(values) < FEWEST_SEEDS else f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
 def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:

@@ -17,6 +17,16 @@ def test_pages_of_results_equal_their_raw_data() -> None:
     assert pages[paper.PAGES[0]].count("\n") <= 150
 
 
+def test_curves_are_the_evaluations_of_their_runs() -> None:
+    """Not the episodes of training: a run has 20, and its best policy is that of one of them."""
+    for path in paper.RAW.glob(f"*/{RUNS}"):
+        runs, curves = pd.read_csv(path).query("game_steps > 0"), pd.read_csv(path.parent / CURVES)
+        steps = curves.groupby(["method", "task", "level", "seed"])["game_steps"].agg(list)
+        for run in runs.itertuples():
+            evaluations = steps[run.method, run.task, run.train_level, run.seed]
+            assert len(evaluations) == 20 and run.best_game_steps in evaluations, f"{path}: {run.cell}"
+
+
 def test_cells_trained_again_replace_the_older_ones(tmp_path: Path) -> None:
     for factor, folder in ((1, "older"), (2, "newer")):
         (tmp_path / folder / "parts").mkdir(parents=True)
