@@ -369,11 +369,7 @@ def blocks_table(tests: pd.DataFrame) -> str:
 
 
 def forest(tests: pd.DataFrame) -> pd.DataFrame:
-    """
-    Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group.
-
-    From three seeds on with intervals: those of two would hide the others.
-    """
+    """Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group."""
     rows = []
     for group, of_group in tests.groupby("group", sort=False):
         panel = "coordination" if group == "coordination" else "heterogeneity"
@@ -383,9 +379,7 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
             for other in MAIN[1:3]:
                 found = difference(here, "saf", other)
                 if found is not None:
-                    value, *ends = found.estimate
-                    ends = ends if found.n >= FEWEST_SEEDS else [np.nan, np.nan]
-                    rows.append((panel, label, other, value, *ends, here is of_group))
+                    rows.append((panel, label, other, *found.estimate.drawn(found.n), here is of_group))
     return pd.DataFrame(rows, columns=["panel", "level", "method", "value", "low", "high", "pooled"])
 
 

@@ -37,7 +37,9 @@ def runs(**scores: list[list[float]]) -> pd.DataFrame:
 
 
 def test_mean_and_interval_over_seeds() -> None:
-    assert mean_over_seeds([1.0, 2.0, 6.0]) == (3.0, *confidence_interval([1, 2, 6]))
+    estimate = mean_over_seeds([1.0, 2.0, 6.0])
+    assert estimate == (3.0, *confidence_interval([1, 2, 6])) == estimate.drawn(3)
+    assert np.isnan(estimate.drawn(2)).tolist() == [False, True, True], "intervals of two seeds are not drawn"
     alone = mean_over_seeds([4.0])
     assert alone.value == 4.0
     assert np.isnan([alone.low, alone.high]).all()

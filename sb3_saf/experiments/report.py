@@ -143,7 +143,8 @@ def _views(experiment: Experiment, frames: Frames) -> dict[str, Figure]:
         )
         compared = [one for one in comparisons(frames.tests, view) if one.other != RANDOM]
         if compared:
-            lines = [(one.task, one.other, str(one.level), *one.found.test.estimate) for one in compared]
+            tests = [(one, one.found.test) for one in compared]
+            lines = [(one.task, one.other, str(one.level), *test.estimate.drawn(test.n)) for one, test in tests]
             maximum, ours = _maximum(rows), compared[0].ours
             figures[f"differences-{name}.png"] = draw_differences(
                 pd.DataFrame(lines, columns=["task", "method", "level", "value", "low", "high"]),

@@ -185,7 +185,7 @@ def draw_levels(
     maximum: float | None = None,
 ) -> Figure:
     """
-    Draw bars of the return against a level: mean and 95 % interval (Student's t) over seeds.
+    Draw bars of the return against a level: mean and, from three seeds on, 95 % interval (Student's t) over seeds.
 
     :param results: columns ``method``, ``seed``, ``score`` and the column named by ``level``; several rows of a run
         (episodes) are averaged
@@ -205,10 +205,8 @@ def draw_levels(
         for index, method in enumerate(methods):
             of_method, style = rows[rows["method"] == method], styles[method]
             found = [value for value in levels if (of_method[level] == value).any()]
-            estimates = [
-                mean_over_seeds(of_method[of_method[level] == value].groupby("seed")["score"].mean().to_numpy())
-                for value in found
-            ]
+            means = [of_method[of_method[level] == value].groupby("seed")["score"].mean().to_numpy() for value in found]
+            estimates = [mean_over_seeds(of_seeds).drawn(len(of_seeds)) for of_seeds in means]
             values = np.array([estimate.value for estimate in estimates])
             margins = np.array([[e.value - e.low, e.high - e.value] for e in estimates]).reshape(-1, 2).T
             places = [levels.index(value) + (index - (len(methods) - 1) / 2) * width for value in found]

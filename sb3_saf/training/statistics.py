@@ -37,6 +37,10 @@ class Estimate(NamedTuple):
     low: float
     high: float
 
+    def drawn(self, n_seeds: int) -> Estimate:
+        """Return what figures show of it: no interval of fewer than three seeds, which would hide all others."""
+        return self if n_seeds >= FEWEST_SEEDS else Estimate(self.value, np.nan, np.nan)
+
 
 class Profile(NamedTuple):
     """Fraction of runs with a score above each threshold, with its 95 % interval; (X,) each."""
