@@ -27,10 +27,11 @@ from sb3_saf import (
     make_team_env,
 )
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
+from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.critic import ValueNormalizer
 from sb3_saf.teams.rows import TeamSpaces
 from tests.team_venv import Array
-from tests.toy_envs import CounterEnv, DictEnv, TellingEnv
+from tests.toy_envs import CounterEnv, DictEnv, Game, TellingEnv
 
 N_AGENTS, N_ACTIONS = 3, 4
 #: Agent 0 is active for steps 1 to 3, agent 1 from the observation after step 2, agent 2 until a time limit.
@@ -215,6 +216,40 @@ def test_advantages_end_with_the_agent(n_steps: int) -> None:
                 advantage = sum((0.97 * 0.9) ** (j - k) * errors[j] for j in range(k, len(life)))
                 assert buffer.advantages[t, row] == pytest.approx(advantage, rel=1e-4, abs=1e-4)
                 assert buffer.returns[t, row] == pytest.approx(advantage + values[t, row], rel=1e-4, abs=1e-4)
+
+
+class PaidLater(Game):
+    """The second agent is paid 2 and 8 after its steps 2 and 4; in step 2 it waits, or it has ended after step 1."""
+
+    length = 4
+
+    def __init__(self, ends: bool) -> None:
+        self.ends = ends
+
+    def see(self, agent: Any) -> Any:
+        return np.full(2, self.t / 4, np.float32)
+
+    def change(self, out: list[Any]) -> None:
+        out[0]["b"] = self.see("b")
+        out[1]["b"] = {2: 2.0, 4: 8.0}.get(self.t, 0.0)
+        is_away = self.t == 1 or self.ends
+        out[2]["b"] = self.ends and self.t == 1
+        self.agents = ["a"] if is_away else ["a", "b"]
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_recorded_returns_are_those_of_the_buffer(ends: bool) -> None:
+    env = make_team_env(PaidLater, 1, seed=0, ends=ends)
+    settings: dict[str, Any] = {"n_steps": 4, "batch_size": 8, "n_epochs": 1, "gamma": 0.5, "learning_rate": 0.0}
+    for lam in (1.0, 0.4):
+        model = PPO("IPPOPolicy", env, rollout_buffer_class=TeamRolloutBuffer, gae_lambda=lam, seed=0, **settings)
+        model.learn(8)
+        recording = record_episodes(model.policy, env, 1, gamma=0.5)
+        buffer: Any = model.rollout_buffer
+        rows = buffer.active.reshape(4, 2) == 1
+        assert rows[:, 1].tolist() == [True, False, not ends, not ends]
+        np.testing.assert_allclose(recording.targets(lam)[:4][rows], buffer.returns[rows], rtol=1e-5)
+    assert recording.returns[:4, 1][rows[:, 1]].tolist() == ([2.0] if ends else [2.0, 4.0, 8.0])
 
 
 @pytest.mark.parametrize("n_steps", [3, 8, 13])

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from sb3_contrib import MaskablePPO
@@ -26,6 +27,7 @@ NESTED: Final = spaces.Dict(
 MULTI: Final = spaces.MultiDiscrete([4, 3], start=[0, 2])
 FOUR, THREE = spaces.Discrete(4, start=2), spaces.Discrete(3)
 LONG, WIDE = spaces.Box(-2, 2, (3,), np.float32), spaces.Box(0, 1, (1,), np.float32)
+WHOLE: Final = spaces.Box(-9, 9, (2,), np.int32)
 
 #: Observation and action spaces of three agents.
 KINDS: Final[dict[str, list[tuple[spaces.Space[Any], spaces.Space[Any]]]]] = {
@@ -44,6 +46,7 @@ KINDS: Final[dict[str, list[tuple[spaces.Space[Any], spaces.Space[Any]]]]] = {
     "multi": [(VECTOR, MULTI), (SHORT, spaces.MultiDiscrete([2, 5])), (VECTOR, MULTI)],
     "mixed": [(VECTOR, MULTI), (SHORT, FOUR), (VECTOR, MULTI)],
     "boxes": [(VECTOR, LONG), (SHORT, WIDE), (VECTOR, LONG)],
+    "equal, boxes": [(VECTOR, WHOLE)] * 3,
 }
 
 
@@ -84,7 +87,7 @@ class Kinds(ParallelEnv[str, Any, Any]):
             if self.masks is not None:
                 mask = random_masks(acted, 1, self.rng)[0].astype(np.int8)
                 if self.masks == "info":
-                    infos[agent] = {"action_mask": mask}
+                    infos[agent] = {"avail_actions" if agent == "b" else "action_mask": mask}
                 else:
                     observations[agent] = {"observation": observations[agent], "action_mask": mask}
         return observations, infos
@@ -116,11 +119,16 @@ def make(algorithm: Any, policy: str, env: Any, **kwargs: Any) -> Any:
 @pytest.mark.parametrize("masks", [None, "info", "observation"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: Path) -> None:
-    if kind == "boxes" and masks is not None:
+    if "boxes" in kind and masks is not None:
         pytest.skip("Boxes have no masks")
     game = Kinds(kind, masks)
     env = make_team_env(partial(Kinds, kind, masks), seed=0)
     model: Any = make(PPO, "SAFPolicy", env)
+    if kind == "equal, boxes":
+        with th.no_grad():  # actions that are not near 0
+            model.policy.actor.query_net[-1].bias.add_(1.0)
+            for parameter in model.policy.actor.parameters():
+                parameter.add_(th.randn_like(parameter))
     model.save(tmp_path / "model")
     model = PPO.load(tmp_path / "model", device="cpu")
     (copy,) = env.get_attr("steps_of_games", indices=[0])
@@ -164,6 +172,7 @@ def test_masks_are_passed_by_agent() -> None:
         ("vectors", {"b": {"place": np.zeros(3)}}, r"observation of b: .* of shape \(3,\)"),
         ("vectors", {"d": np.zeros(3, np.float32)}, r"'agent', 'b', 'c', .* got 'd'"),
         ("equal, start", {"b": 2}, "observation of b: expected values from 3 to 6 .* got 2"),
+        ("equal, pictures", {"b": np.full((12, 12, 3), 300, np.uint16)}, "expected values from 0 to 255 .* got 300"),
         ("nested", {"agent": {"z": 4}}, r"observation of agent: .* the parts \['z', 'a'\], got \['z'\]"),
     ],
 )

@@ -41,7 +41,7 @@ from tests import test_contrib
 from tests.contrib_teams import random_masks
 from tests.test_conversion import Kinds
 from tests.test_policies import ACTIONS, SMALL, constant, equal_weights, make_model, make_policy
-from tests.toy_envs import CounterEnv
+from tests.toy_envs import CounterEnv, Game
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, samples
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,6 +50,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 ABSENT = ("stable_baselines3", "sb3_contrib", "gymnasium", "pettingzoo", "supersuit", "cloudpickle", "torch", "onnx")
 AGENT = 2
 GREY = spaces.Box(0, 255, (40, 36), np.uint8)
+WIDE = spaces.Box(-5, 5, (1,), np.float32)
 
 
 class Exported(NamedTuple):
@@ -271,6 +272,42 @@ def test_with_a_memory_it_acts_as_the_model(name: str, exports: Callable[[str], 
             starts[:] = False
     forgetful = actor.log_prob(obs, expected, memory=actor.new_memory())
     assert np.abs(forgetful - likelihoods).max() > 0.01, "memory makes a difference"
+
+
+class Named(Game):
+    """Agents of any name, the last of which waits every second step."""
+
+    def __init__(self, names: Any) -> None:
+        self.possible_agents = list(names)
+
+    def see(self, agent: Any) -> Any:
+        return np.array([self.t / 4, self.possible_agents.index(agent) / 4], np.float32)
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return WIDE
+
+    def change(self, out: list[Any]) -> None:
+        self.agents = self.possible_agents[: -1 if self.t % 2 else None]
+        out[0] = {agent: self.see(agent) for agent in self.possible_agents}
+
+
+@pytest.mark.parametrize("names", ["ab", [("x", 1), ("y",)], np.arange(4, 6)], ids=str)
+def test_agents_of_any_name_keep_their_own_memory_while_they_play(names: Any, tmp_path: Path) -> None:
+    env = make_team_env(Named, 1, seed=0, names=names)
+    model = PPO("IPPOPolicy", env, seed=0, policy_kwargs={"memory": "gru", "actor_identity": True})
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(0.5 * th.randn_like(parameter))
+    actor = Actor.load(export_actors(model, tmp_path))
+    game, memory, state = Named(names), actor.new_memory(), None
+    observations, _ = game.reset()
+    while game.agents:
+        turned = {agent: observations[agent] for agent in reversed(game.agents)}
+        expected, state = model.predict(turned, state, deterministic=True)
+        acted = actor.act(turned, memory=memory)
+        assert acted == {agent: pytest.approx(action, abs=1e-5) for agent, action in expected.items()}
+        observations, *_ = game.step(expected)
+        observations = {agent: game.see(agent) for agent in game.agents}
 
 
 def test_wrong_memories(exports: Callable[[str], Exported]) -> None:

@@ -38,6 +38,15 @@ def ppo(env: Any, **kwargs: Any) -> PPO:
     return PPO("IPPOPolicy", env, **{**settings, **buffer, **kwargs})
 
 
+def test_drawn_floats_are_learned_from_where_actions_are_integers() -> None:
+    class Whole(Game):
+        def action_space(self, agent: Any) -> spaces.Space[Any]:
+            return spaces.Box(-3, 3, (2,), np.int32)
+
+    model = ppo(make_team_env(Whole, 2, seed=0), learning_rate=0.0).learn(32)
+    assert model.logger.name_to_value["train/approx_kl"] == pytest.approx(0, abs=1e-6), "the policy has not changed"
+
+
 # --- action masks -----------------------------------------------------------------------------------------------------
 
 
@@ -72,6 +81,8 @@ def test_masks_are_used_wherever_they_are(game: dict[str, Any]) -> None:
         ({"where": "info:action_mask", "given": lambda step: step != 1}, "'action_mask' is in some infos"),
         ({"where": "info:legal_moves"}, "'legal_moves'"),
         ({"where": "legal_actions", "mask": (1, 1)}, "'legal_actions'.* does not fit"),
+        ({"where": "visible_mask"}, "'visible_mask'.* whose name is 'action_mask'.* an ordinary part"),
+        ({"where": "invalid_actions"}, "'invalid_actions'.* an ordinary part"),
     ],
 )
 def test_masks_that_are_not_always_used_are_named(game: dict[str, Any], message: str) -> None:
@@ -509,6 +520,32 @@ class Nim(AECEnv[str, Any, Any]):
         if self.pile == 0:
             self.rewards = {agent: 1.0 if agent == mover else -1.0 for agent in self.agents}
             self.terminations = dict.fromkeys(self.agents, True)
+
+
+class Leaver(Nim):
+    """Three players, of whom the second is out after the first move, so that its turn is skipped."""
+
+    def __init__(self) -> None:
+        super().__init__(masks=False)
+        self.possible_agents = ["first", "second", "third"]
+
+    def step(self, action: int | None) -> None:
+        if self.terminations[self.agent_selection]:
+            self._was_dead_step(None)
+            return
+        self.moves.append(int(action or 0))
+        self.terminations["second"] = True
+        self.agent_selection = "third" if self.agent_selection == "first" else "first"
+        self.agent_selection = self._deads_step_first()
+
+
+def test_the_next_player_sees_its_turn_after_one_that_is_skipped() -> None:
+    env = TurnsInParallel(Leaver())
+    env.reset(seed=0)
+    observations, _, terminations, _, infos = env.step(dict.fromkeys(env.agents, 0))
+    assert terminations == {"first": False, "second": True, "third": False}
+    assert [observations[agent][1] for agent in ("first", "third")] == [0, 1], "whose turn it is"
+    assert [infos[agent]["action_mask"].sum() for agent in ("first", "third")] == [1, 3]
 
 
 def parallel(**kwargs: Any) -> TurnsInParallel:

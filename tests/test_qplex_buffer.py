@@ -58,7 +58,9 @@ class Story:
         rewards = self.rng.random((N_GAMES, N_AGENTS)).astype(np.float32)
         after, ended = self._views(), self.rng.random(N_GAMES) < 0.3
         truncated = ended & (self.rng.random(N_GAMES) < 0.5)
-        infos = [{"TimeLimit.truncated": bool(truncated[row // N_AGENTS])} for row in range(N_GAMES * N_AGENTS)]
+        # Not of the first agent, which may have ended before the time limit of its team.
+        flags = [bool(truncated[row // N_AGENTS] and row % N_AGENTS) for row in range(N_GAMES * N_AGENTS)]
+        infos = [{"TimeLimit.truncated": flag} for flag in flags]
         rows = np.repeat(ended, N_AGENTS)
         starts = np.repeat(self.starts, N_AGENTS)
         buffer.add(self.rows(self.now), self.rows(after), actions.reshape(-1), rewards.reshape(-1), rows, infos, starts)

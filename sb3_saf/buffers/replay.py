@@ -206,7 +206,9 @@ class TeamReplayBuffer(ReplayBuffer):
         slot = self.pos
         self._begin(slot, now, None if episode_starts is None else np.asarray(episode_starts)[:: self.n_agents])
         ended = np.asarray(done).reshape(self.n_games, self.n_agents)[:, 0].astype(bool)
-        truncated = np.array([bool(info.get(TRUNCATED, False)) for info in infos[:: self.n_agents]])
+        # Agents that ended before the time limit of their team have no such flag.
+        limits = np.array([bool(info.get(TRUNCATED, False)) for info in infos])
+        truncated = limits.reshape(self.n_games, self.n_agents).any(axis=1)
         self.actions[slot] = np.asarray(action).reshape(self.n_games, self.n_agents)
         self.rewards[slot] = np.asarray(reward).reshape(self.n_games, self.n_agents).sum(axis=1, dtype=np.float64)
         self.ended[slot], self.terminal[slot] = ended, ended & ~truncated

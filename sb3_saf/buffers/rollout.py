@@ -358,6 +358,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             by_row = [key for key in (OBS_KEY, ACTION_MASK_KEY) if key in self.obs_shape]
             self.obs_shape = {key: self.obs_shape[key] for key in by_row}
             super().reset()
+            if isinstance(self.action_space, spaces.Box):  # also of integers: likelihoods are those of the floats drawn
+                self.actions = self.actions.astype(np.float32)
             # One entry per step and game, (T, E, ...).
             self._agents_of_steps = th.arange(self.n_agents, device=self.device).repeat(
                 self.buffer_size * self.n_games, 1

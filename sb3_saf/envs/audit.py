@@ -17,8 +17,8 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
-from sb3_saf.envs.gymnasium_team import ALL, INFO_MASKS, as_parallel
-from sb3_saf.teams.conversion import checked_mask, innermost, leaves_of, read_leaves
+from sb3_saf.envs.gymnasium_team import ALL, as_parallel
+from sb3_saf.teams.conversion import MASK_NAMES, checked_mask, innermost, leaves_of, mask_in, read_leaves
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, n_mask_entries
 
@@ -91,7 +91,7 @@ class Trial:
             return None
         masks = {key: space for key, space in observed.spaces.items() if looks_like_mask(key)}
         keys = [key for key, space in masks.items() if space.shape == (n_entries,) and isinstance(space, FIXED_SHAPE)]
-        chosen = ACTION_MASK_KEY if ACTION_MASK_KEY in keys else next(iter(keys), None)
+        chosen = next((key for key in MASK_NAMES if key in keys), None)
         for key, space in masks.items():
             if key == chosen:
                 continue
@@ -100,11 +100,12 @@ class Trial:
                     f"expected {ACTION_MASK_KEY!r} in observations to have one entry per choice of "
                     f"{self.actions[agent]}, {'none can be masked' if n_entries is None else n_entries}, got {space}"
                 )
-            why = (
-                f"beside the action masks in {chosen!r}"
-                if key in keys
-                else (f"which looks like action masks, but {space} does not fit the actions {self.actions[agent]}")
-            )
+            if key not in keys:
+                why = f"which looks like action masks, but {space} does not fit the actions {self.actions[agent]}"
+            elif chosen is None:
+                why = f"which looks like action masks, whose name is {ACTION_MASK_KEY!r}"
+            else:
+                why = f"beside the action masks in {chosen!r}"
             self._note(f"observations have {key!r}, {why}: it is an ordinary part of the observation")
         return chosen
 
@@ -179,13 +180,13 @@ class Trial:
         for agent in self.agents:
             info = info_of(infos, agent, self._place)
             for key in info if agent in playing else ():
-                if key not in INFO_MASKS and looks_like_mask(key):
+                if key not in MASK_NAMES and looks_like_mask(key):
                     self._note(
                         f"infos have {key!r}, which looks like action masks, but is not used; name it "
                         f"{ACTION_MASK_KEY!r}"
                     )
             self.n_turns[agent] += agent in playing
-            key = next((name for name in INFO_MASKS if info.get(name) is not None), None)
+            key = next((name for name in MASK_NAMES if info.get(name) is not None), None)
             if agent in playing and key is not None and n_mask_entries(self.actions[agent]) is not None:
                 self._check_mask(agent, key, info[key], "info")
                 self.n_masks[agent] += 1
@@ -214,8 +215,7 @@ class Trial:
         masks: dict[Any, Any] = {}
         for agent in playing:
             key, info = self.mask_keys[agent], infos.get(agent) or {}
-            given = next((info[name] for name in INFO_MASKS if info.get(name) is not None), None)
-            masks[agent] = given if key is None else observations[agent][key]
+            masks[agent] = mask_in(info) if key is None else observations[agent][key]
         if all(mask is None for mask in masks.values()):
             shown = game_attribute(self.env, "action_masks")() if has_game_attribute(self.env, "action_masks") else {}
             masks = {agent: shown.get(agent) if isinstance(shown, Mapping) else shown for agent in playing}

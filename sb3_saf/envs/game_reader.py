@@ -14,9 +14,8 @@ from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
-from sb3_saf.envs.gymnasium_team import INFO_MASKS
 from sb3_saf.networks.encoders import Part, PartsSpace
-from sb3_saf.teams.conversion import AgentConversion, Leaf, innermost, padded
+from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion, Leaf, innermost, padded
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -182,7 +181,7 @@ class GameReader:
             key, where, given = conversion.mask_key, "observation", observations.get(agent) or {}
         else:
             where, given = "info", infos.get(agent) or {}
-            key = next((name for name in INFO_MASKS if name in given), ACTION_MASK_KEY)
+            key = next((name for name in MASK_NAMES if name in given), ACTION_MASK_KEY)
         if given.get(key) is None and conversion.needs_mask and not is_needed:
             return None
         try:

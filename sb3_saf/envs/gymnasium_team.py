@@ -10,10 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_saf.teams.conversion import MASK_NAMES
 from sb3_saf.teams.rows import IS_SUCCESS
 
-#: Keys of infos under which games give action masks.
-INFO_MASKS: Final = ("action_mask", "action_masks", "avail_actions", "available_actions")
 #: Key by which some games say that all agents have ended.
 ALL: Final = "__all__"
 
@@ -150,7 +149,7 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
         if not isinstance(info, Mapping):
             return {agent: dict(own) for agent, own in self._by_agent("infos", info).items()}
         infos = {agent: dict(info) for agent in self.possible_agents}
-        for key in INFO_MASKS:
+        for key in MASK_NAMES:
             if key in info:
                 for agent, mask in self._by_agent("action masks", info[key]).items():
                     infos[agent][key] = mask

@@ -25,7 +25,8 @@ from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.game_copies import Way, find_way, pickled, unpickled
 from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
-from sb3_saf.envs.gymnasium_team import INFO_MASKS, as_parallel
+from sb3_saf.envs.gymnasium_team import as_parallel
+from sb3_saf.teams.conversion import MASK_NAMES
 from sb3_saf.teams.rows import ACTIVE_KEY, TERMINAL_OBSERVATION, TRUNCATED
 
 Info: TypeAlias = "dict[str, Any]"
@@ -34,7 +35,7 @@ Infos: TypeAlias = "list[Info]"
 #: Keys of infos that Stable-Baselines3 or this package uses. A game's own entries with these names are renamed.
 RESERVED_KEYS: Final = frozenset({TERMINAL_OBSERVATION, TRUNCATED, ACTIVE_KEY, "episode"})
 
-_MASKS = frozenset(INFO_MASKS)
+_MASKS = frozenset(MASK_NAMES)
 _UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32, np.float64)
 
 

@@ -61,6 +61,10 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
     def step(self, actions: dict[Any, Any]) -> Any:
         """Play the move of the agent whose turn it is; actions of waiting agents are ignored."""
         observations, rewards, terminations, truncations, infos = super().step(actions)
+        if any(terminations.values()) or any(truncations.values()):
+            # PettingZoo observes before the turns of agents that have ended, which are then skipped.
+            observations = {**observations, **{agent: self._aec.observe(agent) for agent in self._aec.agents}}
+            infos = {**infos, **{agent: self._aec.infos[agent] for agent in self._aec.agents}}
         observations, infos = self._with_masks(observations, infos)
         return observations, rewards, terminations, truncations, infos
 

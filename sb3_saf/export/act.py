@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 # export_actors writes this code in place of its import.
-from sb3_saf.teams.conversion import CLASSIC, AgentConversion, Given, RowForm, given_by_game, pixels_to_codes
+from sb3_saf.teams.conversion import CLASSIC, AgentConversion, Given, RowForm, given_by_game, pixels_to_codes, tupled
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -95,6 +95,7 @@ class Actor:
         try:
             session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
             description = json.loads(session.get_modelmeta().custom_metadata_map["sb3_saf"])
+            description["agents"] = tupled(description["agents"])
         except Exception as error:  # those of onnxruntime have no common class
             raise ValueError(f"expected {path} to be written by sb3_saf.export_actors, got {error!r:.300}") from error
         n_agents, names = description["n_agents"], description["agents"]
@@ -166,7 +167,8 @@ class Actor:
             actions, after = predict(rows, states)
         else:
             actions, after = given.act(predict, states, None, deterministic)
-        if memory is not None:
+        if memory is not None:  # of those that act now: an agent that waits begins anew, as in training
+            memory.states.clear()
             memory.states.update(after if by_agent else zip(self.description["states"], after, strict=True))
         return actions
 

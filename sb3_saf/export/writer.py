@@ -11,6 +11,7 @@ import logging
 import re
 import warnings
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
@@ -127,6 +128,17 @@ def _checked_policy(model: object) -> ExportablePolicy:
     return policy
 
 
+def _plain_names(names: Sequence[Any]) -> Any:
+    """Return names of agents as JSON holds them: tuples as lists, NumPy's numbers as Python's."""
+    try:
+        plain = json.loads(json.dumps(list(names), default=lambda number: number.item()))
+    except (AttributeError, TypeError, ValueError):
+        plain = None
+    if plain is None or conversion.tupled(plain) != tuple(names):
+        raise ExportError(f"expected agents named by text, whole numbers or tuples of them, got {list(names)}")
+    return plain
+
+
 def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, Any]:
     """Return what :class:`sb3_saf.Actor` needs to know of a graph, as plain data."""
     own, names, conversions = policy.team_spaces.own, policy.team_spaces.names, policy.team_spaces.conversions
@@ -140,7 +152,7 @@ def _description(policy: ExportablePolicy, network: ActingNetwork) -> dict[str, 
         "version": package_version(),
         "policy": type(policy).__name__,
         "n_agents": policy.team_spaces.n_agents,
-        "agents": list(names) if names and all(isinstance(name, (str, int)) for name in names) else None,
+        "agents": _plain_names(names) if names else None,
         "reads_agent": network.reads_agent,
         "action_mask": masks if policy.team_spaces.action_mask is None else "required",
         "greedy": network.greedy,

@@ -295,7 +295,7 @@ class EpisodeRecording(NamedTuple):
     :param action_probabilities: (T, B, A); None unless actions are Discrete
     :param counted: (T, B) whether the row counts
     :param rewards: (T, B) rewards from which the critic learns
-    :param ends: (T, B) whether the episode ended with this step, or (unless values are the team's) the agent's own part
+    :param ends: (T, B) whether the episode ended with this step, or the agent was bootstrapped before its team
     :param last_values: (T, B) value of the last observation at a time limit that is no true end, else 0
     :param values: (T, B)
     :param returns: (T, B) discounted returns
@@ -342,7 +342,8 @@ class EpisodeRecording(NamedTuple):
 
     def targets(self, lam: float) -> Doubles:
         """Compute the TD(lambda) targets of the critic, (T, B)."""
-        return lambda_returns(self.rewards, self.ends, self.last_values, self.values, self.gamma, lam)
+        playing = None if self.of_team else self.counted
+        return lambda_returns(self.rewards, self.ends, self.last_values, self.values, self.gamma, lam, playing)
 
 
 @th.no_grad()
@@ -439,8 +440,7 @@ class _Recorder:
             rewards = np.repeat(rewards.reshape(-1, n_agents).sum(axis=1), n_agents)
         columns["counted"].append(counted)
         columns["rewards"].append(rewards)
-        # An agent's return ends with its own end, as in TeamRolloutBuffer.
-        columns["ends"].append(step.dones if of_team else step.dones | ~_active(step.following, n_agents))
+        columns["ends"].append(step.dones)
         columns["last_values"].append(_last_values(self.reader, step.dones, step.infos))
         if self.keeps_observations:
             columns["observations"].append(np.array(step.observations[OBS_KEY]))
@@ -488,7 +488,13 @@ def _last_values(reader: PolicyReader | QReader, dones: Bools, infos: list[dict[
 
 
 def lambda_returns(
-    rewards: Floats, ends: Bools, last_values: Floats, values: Floats, gamma: float, lam: float = 1.0
+    rewards: Floats,
+    ends: Bools,
+    last_values: Floats,
+    values: Floats,
+    gamma: float,
+    lam: float = 1.0,
+    playing: Bools | None = None,
 ) -> Doubles:
     """
     Compute TD(lambda) targets, the training targets of the critic; with ``lam=1`` they are the discounted returns.
@@ -499,12 +505,14 @@ def lambda_returns(
         R_t = r_t + gamma ((1 - lam) V_{t+1} + lam R_{t+1})               otherwise
 
     ``last`` is the value of the last observation if the time limit is no true end (``time_limit="bootstrap"``), else 0.
-    These are SB3's advantages by GAE plus values. Rows of unfinished episodes must be excluded.
+    These are SB3's advantages by GAE plus values. Where an agent does not take part, V is what its rows hold later, as
+    in :class:`~sb3_saf.TeamRolloutBuffer`. Rows of unfinished episodes must be excluded.
 
     :param rewards: (T, B)
     :param ends: (T, B)
     :param last_values: (T, B)
     :param values: (T, B)
+    :param playing: (T, B) whether the agent takes part; None for always
     :return: (T, B)
     """
     targets: Doubles = np.zeros(rewards.shape)
@@ -513,5 +521,6 @@ def lambda_returns(
     for t in reversed(range(len(targets))):
         going_on = (1 - lam) * next_value + lam * ahead
         targets[t] = rewards[t] + gamma * np.where(ends[t], last_values[t], going_on)
-        ahead, next_value = targets[t], values[t]
+        paid = rewards[t] + gamma * np.where(ends[t], last_values[t], next_value)
+        ahead, next_value = targets[t], values[t] if playing is None else np.where(playing[t], values[t], paid)
     return targets

@@ -27,6 +27,8 @@ Key: TypeAlias = str | int
 OBS, AGENT, ACTION_MASK = "obs", "agent", "action_mask"
 #: Keys of PettingZoo's observations with masks.
 CLASSIC = frozenset({"observation", ACTION_MASK})
+#: Names under which games give action masks, in observations or infos.
+MASK_NAMES = (ACTION_MASK, "action_masks", "avail_actions", "available_actions")
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,8 @@ class Leaf:
             got = f"{array.dtype} of shape {array.shape}"
             raise ValueError(f"{_where(self.path)}expected {self.dtype} of shape {self.shape}, got {got}")
         low, high = self._bounds
+        if array.dtype != self._dtype and self._dtype.kind in "iu":  # a wider type may exceed the limits of this one
+            low, high = (one[0] if len(one) == 1 else np.reshape(one, self.shape) for one in (self.low, self.high))
         if high is not None and (array > high).any():
             raise ValueError(self.outside(array, array > high))
         if low is not None and (array < low).any():
@@ -249,7 +253,7 @@ class AgentConversion:
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> AgentConversion:
         """Return a conversion from what JSON gives back of ``dataclasses.asdict``."""
-        entries = _with_tuples(plain)
+        entries = tupled(plain)
         leaves = {key: Leaf(**entries[key]) for key in ("action", "row_action")}
         return cls(**{**entries, **leaves, "leaves": tuple(Leaf(**leaf) for leaf in entries["leaves"])})
 
@@ -321,7 +325,7 @@ class AgentConversion:
         """
         leaf, array = self.action, np.asarray(action).reshape(-1)[: prod(self.action.shape)]
         if not leaf.choices:
-            array = np.clip(array, leaf.low, leaf.high)
+            array = np.clip(np.rint(array) if np.dtype(leaf.dtype).kind in "iu" else array, leaf.low, leaf.high)
         elif ((array < 0) | (array >= np.array(leaf.choices))).any():
             raise ValueError(
                 f"expected an action of {leaf.space}, got {array.tolist()}, which is masked; use a policy that takes "
@@ -346,11 +350,11 @@ def padded(array: Any, shape: tuple[int, ...], dtype: npt.DTypeLike | None = Non
     return row
 
 
-def _with_tuples(value: Any) -> Any:
+def tupled(value: Any) -> Any:
     """Return nested containers with tuples in place of lists."""
     if isinstance(value, Mapping):
-        return {key: _with_tuples(item) for key, item in value.items()}
-    return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value
+        return {key: tupled(item) for key, item in value.items()}
+    return tuple(tupled(item) for item in value) if isinstance(value, list) else value
 
 
 class RowForm(NamedTuple):
@@ -414,6 +418,11 @@ class Given(NamedTuple):
         return dict(zip(agents, of_game, strict=True)), after
 
 
+def mask_in(info: Mapping[str, Any] | None) -> Any:
+    """Return the action mask in an agent's info, None if there is none."""
+    return next((info[name] for name in MASK_NAMES if info.get(name) is not None), None) if info else None
+
+
 def given_by_game(
     team: RowForm, observation: Any, action_masks: Any, takes_masks: bool, agent: int | None = None
 ) -> Given | None:
@@ -432,7 +441,7 @@ def given_by_game(
     names, conversions = team.names, team.conversions
     agents = _agents_in(team, observation)
     if agents is not None:
-        masks = [(infos.get(name) or {}).get(ACTION_MASK) for name in agents]
+        masks = [mask_in(infos.get(name)) for name in agents]
         if isinstance(action_masks, Mapping):
             masks = [action_masks[name] for name in agents]
         indices = list(range(len(agents))) if names is None else [names.index(name) for name in agents]
