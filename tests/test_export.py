@@ -294,7 +294,7 @@ class Named(Game):
 @pytest.mark.parametrize("names", ["ab", [("x", 1), ("y",)], np.arange(4, 6)], ids=str)
 def test_agents_of_any_name_keep_their_own_memory_while_they_play(names: Any, tmp_path: Path) -> None:
     env = make_team_env(Named, 1, seed=0, names=names)
-    model = PPO("IPPOPolicy", env, seed=0, policy_kwargs={"memory": "gru", "actor_identity": True})
+    model: Any = PPO("IPPOPolicy", env, seed=0, policy_kwargs={"memory": "gru", "actor_identity": True})
     with th.no_grad():
         for parameter in model.policy.parameters():
             parameter.add_(0.5 * th.randn_like(parameter))
