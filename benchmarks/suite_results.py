@@ -92,8 +92,10 @@ def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
 
 
 def _over_seeds(values: pd.Series) -> str:
+    if len(values) < FEWEST_SEEDS:
+        return ", ".join(f"{value:.2f}" for value in values)
     value, low, high = mean_over_seeds(values.to_numpy())
-    return f"{value:.2f}" if len(values) < FEWEST_SEEDS else f"{value:.2f} [{low:.2f}, {high:.2f}]"
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
 def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
