@@ -376,6 +376,12 @@ def evaluate_team(
         returns_now[step.ended], lengths_now[step.ended] = 0, 0
         if render:
             env.render()
+    if 0 < len(successes) < len(returns):
+        warnings.warn(
+            f"{len(successes)} of {len(returns)} episodes ended with {IS_SUCCESS!r} in their infos, and the success "
+            "rate is of these only; give it at every end, also of episodes that are lost",
+            stacklevel=2,
+        )
     return EvaluationResult(returns, lengths, tuple(successes), tuple(agent_returns))
 
 

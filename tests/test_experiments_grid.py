@@ -278,3 +278,15 @@ def test_one_line_errors(
     Path("empty").mkdir()
     assert message in failed(words, capsys, cli.main)
     assert [*Path().iterdir()] == [Path("empty")]  # nothing that would refuse the corrected command
+
+
+def test_random_teams_play_the_games_of_the_methods() -> None:
+    games = {"env_wrapper": [{"supersuit.dtype_v0": {"dtype": "float64"}}], "team_reward": "sum"}
+    config = RunConfig("smoke", {**games, "learning_rate": 0.1})
+    trained, untrained = (Cell(method, "TeamSupport-v0", Level(), 0, (Level(),)) for method in ("mappo", RANDOM))
+    assert all(
+        config.settings(cell).wrapping[key] == value for cell in (trained, untrained) for key, value in games.items()
+    )
+    assert {**config.describe(untrained)["settings"], **games} == config.describe(untrained)["settings"]
+    with pytest.raises(ValueError, match="statistics of normalize"):
+        RunConfig("smoke", {"normalize": {}}).settings(trained)

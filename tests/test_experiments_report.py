@@ -222,6 +222,13 @@ def test_marl_eval_gets_means_over_the_episodes_of_complete_runs(folder: Path) -
         "return": [pytest.approx(np.mean(test["returns"]))],
         "score": [pytest.approx(np.mean(test["returns"]) / 6)],
     }
+    # Where the largest return is not known, scores are shares of the range of all returns.
+    of_range = Frames(frames.tests.assign(max_return=np.nan), frames.curves)
+    means = frames.tests[frames.tests["level"] == "c1-h1"]["return_mean"]
+    run = marl_eval(of_range, "x")["x"]["teamsupport_c1_h1"]["saf"]["seed_1"]
+    for step in ("step_0", "absolute_metrics"):
+        (value,), (score,) = run[step]["return"], run[step]["score"]
+        assert score == pytest.approx((value - means.min()) / (means.max() - means.min()))
     lacking = Frames(frames.tests[(frames.tests["method"] != "ippo") | (frames.tests["seed"] == 0)], frames.curves)
     assert list(marl_eval(lacking, "x")["x"]["teamsupport_c1_h1"]["saf"]) == ["seed_0"]
 

@@ -36,6 +36,7 @@ from sb3_saf import (
     save_weights,
 )
 from sb3_saf.policies.base import TeamActorCriticPolicy
+from sb3_saf.teams.conversion import mask_in
 from sb3_saf.teams.rows import TeamSpaces
 from tests import test_contrib
 from tests.contrib_teams import random_masks
@@ -347,7 +348,7 @@ def test_acts_on_what_the_game_gives(kind: str, masks: str | None, tmp_path: Pat
         assert found.keys() == expected.keys()
         for agent, action in expected.items():
             np.testing.assert_allclose(found[agent], action, atol=1e-5)
-            mask = infos[agent].get("action_mask")
+            mask = mask_in(infos[agent])
             np.testing.assert_allclose(alone[agent].act(observations[agent], action_mask=mask), action, atol=1e-5)
         drawn = actor.act(given, deterministic=False, rng=0)
         observations, _, _, _, infos = game.step(drawn)  # which checks the actions

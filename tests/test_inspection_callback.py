@@ -289,9 +289,8 @@ class TestWhatCounts:
         game = play(env, policy, n_episodes=2)
         active = np.array(ACTIVE, dtype=bool)
         np.testing.assert_array_equal(game.counted, np.tile(active, 2))
-        # Agent 0 ends with step 3, all with step 5; an agent that has not joined does not end.
-        assert game.ends[:, 0].tolist() == [False, False, True, True, True]
-        assert game.ends[:, 2].tolist() == [False, False, False, False, True]
+        # Agent 0 ends with step 3, but is paid until its team ends.
+        assert game.ends[:, 0].tolist() == game.ends[:, 2].tolist() == [False, False, False, False, True]
         assert game.write_attention is not None and game.pool_actions is not None
         assert ((game.write_attention > 0) == active[:, np.newaxis, np.newaxis]).all()
         legal = np.array(

@@ -258,6 +258,15 @@ def test_a_gymnasium_environment_of_several_agents_is_taken_as_it_is() -> None:
 
 
 @needs("lbf")
+def test_wrapped_games_keep_the_settings_of_their_suite() -> None:
+    wrapped = {"env_wrapper": [{"supersuit.dtype_v0": {"dtype": "float64"}}]}
+    for overrides in ({}, wrapped):
+        env = load_settings("mappo", "lbf/Foraging-8x8-2p-3f-v3", "smoke", overrides=overrides).make_env(0)
+        assert isinstance(env.venv, SharedReward), "agents share the reward of LBF"
+        env.close()
+
+
+@needs("lbf")
 def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
     env: Any = find_environment("lbf/Foraging-8x8-2p-3f-v3").make_game({})
     env.reset(seed=0)

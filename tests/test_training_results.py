@@ -226,7 +226,10 @@ def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
     fake_run(tmp_path, 3, **many)
     fake_run(tmp_path, 4, seed=1, **many)
     fake_run(tmp_path, 5, **{**many, "gamma": 0.8})
+    fake_run(tmp_path, 6, time_limit="bootstrap")
     table = describe(find_runs(tmp_path))
+    assert table["method"].iloc[-1] == "saf time_limit=bootstrap"
+    table = table.iloc[:-1]
     assert list(table["method"]) == [
         "saf",
         "saf batch_size=80 game_steps=80",
@@ -249,6 +252,15 @@ def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Pat
     picture = imageio.imread(output)
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 50
+
+
+def test_scores_are_those_of_finished_runs(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(logs, tmp_path / "logs")
+    finished = sorted((tmp_path / "logs" / "mappo").glob("*/finished.json"))
+    finished[0].unlink()
+    where = ["-f", str(tmp_path / "logs"), "-o", str(tmp_path / "a.png")]
+    zoo_plot.main(["levels", "--level", "coordination", "--algos", "saf", "mappo", *where])
+    assert f"left out: {finished[0].parent} is not finished" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -117,8 +117,12 @@ def test_unknown_studies_and_trials_are_one_line(tmp_path: Path, capsys: pytest.
 
 def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tune(tmp_path)
-    line = failed(given(tmp_path, "--algo", "mappo"), capsys)
-    assert f"the trials of the study 's' are of saf on {ENV}, not of mappo on {ENV}" in line
+    for other, words in (
+        (("--algo", "mappo"), "algo was 'saf', now 'mappo'"),
+        (("--env-kwargs", "coordination:2"), "coordination was 1, now 2"),
+    ):
+        line = failed(given(tmp_path, *other), capsys)
+        assert "the trials of the study 's' cannot be compared with these" in line and words in line
 
 
 @pytest.mark.parametrize("storage", ["study.log", "study.db"])

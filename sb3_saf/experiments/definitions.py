@@ -293,6 +293,8 @@ def find_experiment(name: str, others: Collection[str] = ()) -> Experiment:
 
 #: Algorithm whose settings define the environment of the random team; it is the same for all algorithms.
 _ANY_ALGORITHM = "ippo"
+#: Settings of the games, which a random team plays, too.
+_OF_GAMES: Final = "env_kwargs", "env_wrapper", "frame_stack", "state", "team_reward", "time_limit", "vec_env_wrapper"
 
 
 @dataclass(frozen=True)
@@ -363,7 +365,7 @@ class RunConfig:
 
     def _overrides(self, cell: Cell, level: Level) -> dict[str, Any]:
         """Return what replaces settings of ``zoo_configs`` in a cell; a random team needs the environment only."""
-        overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key == "env_kwargs"}
+        overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key in _OF_GAMES}
         overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
         if of_method := find_method(cell.method).policy_kwargs:
             overrides["policy_kwargs"] = {**overrides.get("policy_kwargs", {}), **of_method}
@@ -379,7 +381,7 @@ class RunConfig:
         algo = find_method(cell.method).algo if cell.is_trained else _ANY_ALGORITHM
         overrides = self._overrides(cell, cell.level if level is None else level)
         settings = load_settings(algo, cell.env, self.size, overrides=overrides)
-        if settings.as_dict().get("normalize"):
+        if settings.as_dict().get("normalize") not in (None, False):
             raise ValueError(
                 "experiments do not keep the statistics of normalize, which tests would need; leave it out, or train "
                 "with sb3_saf.train"
@@ -390,7 +392,8 @@ class RunConfig:
         """Return everything that determines a cell's result, as plain data: settings, seed and options of its run."""
         settings = self.settings(cell).as_dict()
         if not cell.is_trained:
-            settings = {"algo": cell.method, "env": settings["env"], "env_kwargs": settings["env_kwargs"]}
+            of_games = {key: self.overrides[key] for key in _OF_GAMES if key in self.overrides}
+            settings = {"algo": cell.method, "env": settings["env"], **of_games, "env_kwargs": settings["env_kwargs"]}
         evaluation = {"eval_freq": self.eval_freq, "eval_episodes": self.eval_episodes} if cell.is_trained else {}
         options = {"method": cell.method, "level": cell.level.env_kwargs, "episodes": self.episodes, **evaluation}
         return plain({"settings": settings, "seed": cell.seed, "options": options})

@@ -109,7 +109,8 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
         trainings of the same length are taken
     """
     rows, here = theirs.tests, ours.tests
-    same_games = keys_of(rows, "task", "level", "n_agents").isin(keys_of(here, "task", "level", "n_agents"))
+    games = "task", "level", "n_agents", "max_return"
+    same_games = keys_of(rows.fillna({"max_return": -1}), *games).isin(keys_of(here.fillna({"max_return": -1}), *games))
     names = "method", "task", "train_level", "level", "seed"
     is_new = ~keys_of(rows, *names).isin(keys_of(here, *names))
     tests = rows[same_games & is_new & rows["game_steps"].isin({0, *here["game_steps"]})]
@@ -117,7 +118,8 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
         return ours
     of_curves = keys_of(theirs.curves, "method", "task", "level", "seed")
     curves = theirs.curves[of_curves.isin(keys_of(tests, "method", "task", "train_level", "seed"))]
-    return Frames(*(pd.concat(pair, ignore_index=True) for pair in ((here, tests), (ours.curves, curves))))
+    together, all_curves = (pd.concat(pair, ignore_index=True) for pair in ((here, tests), (ours.curves, curves)))
+    return Frames(_scored(together)[list(here)], all_curves)
 
 
 def keys_of(table: pd.DataFrame, *columns: str) -> pd.Series:
@@ -138,13 +140,17 @@ def requested(experiment: Experiment, results: Results) -> Grid:
 def frame_of_tests(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
     """Return the finished tests of some cells, in the order of cells, then of tests."""
     table = pd.DataFrame([row for cell in cells for row in _rows(results, cell)])
-    if not table.empty:
-        here = table.groupby(["task", "level"])["return_mean"]
-        low, high = here.transform("min"), here.transform("max")
-        of_range = ((table["return_mean"] - low) / (high - low).where(high > low, 1.0)).astype(float)
-        known = pd.to_numeric(table["max_return"])
-        table["score"] = (table["return_mean"] / known).where(known.notna(), of_range)
-    return table
+    return table if table.empty else _scored(table).drop(columns=["low", "span"])
+
+
+def _scored(tests: pd.DataFrame) -> pd.DataFrame:
+    """Return tests with ``score``, (return - low) / span: 0 and the largest return if that is known, else the range."""
+    of_game = tests.groupby(["task", "level"])["return_mean"]
+    known = pd.to_numeric(tests["max_return"])
+    low = of_game.transform("min").where(known.isna(), 0.0)
+    span = known.fillna(of_game.transform("max") - low)
+    span = span.where(span > 0, 1.0)
+    return tests.assign(score=((tests["return_mean"] - low) / span).astype(float), low=low, span=span)
 
 
 def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
@@ -272,16 +278,15 @@ def marl_eval(frames: Frames, environment: str) -> dict[str, Any]:
     Its functions compare complete data only: settings and seeds that every method has, with as many evaluations.
     Absolute metrics are means over the test episodes of a run; ``score`` is normalised by the largest return.
     """
-    tests = frames.tests[(frames.tests["train_level"] == frames.tests["level"]) & (frames.tests["game_steps"] > 0)]
+    tests = _scored(frames.tests).query("train_level == level and game_steps > 0")
     tests = complete(tests.assign(stratum=tests["task"] + " " + tests["level"]))
     curves = dict(list(frames.curves.groupby(["method", "task", "level", "seed"]))) if len(frames.curves) else {}
     n_steps = min(map(len, curves.values()), default=0)
     content: dict[str, Any] = {}
     for row in tests.itertuples(index=False):
         curve = curves[row.method, row.task, row.train_level, row.seed].sort_values("game_steps").tail(n_steps)
-        scale = row.score / row.return_mean if row.return_mean else 0.0
         steps: dict[str, Any] = {
-            f"step_{index}": {"step_count": int(step), "return": [value], "score": [value * scale]}
+            f"step_{index}": {"step_count": int(step), "return": [value], "score": [(value - row.low) / row.span]}
             for index, (step, value) in enumerate(zip(curve["game_steps"], curve["score"], strict=True))
         }
         steps["absolute_metrics"] = {"return": [row.return_mean], "score": [row.score]}

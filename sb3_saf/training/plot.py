@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.commands import OneLineParser, require, run_command, user_errors
-from sb3_saf.training.folders import RUN_FILE, Run, python_command
+from sb3_saf.training.folders import FINISHED, RUN_FILE, Run, python_command
 from sb3_saf.training.settings import Settings, load_settings
 
 if TYPE_CHECKING:
@@ -74,6 +74,8 @@ def _draw(options: argparse.Namespace) -> Figure:
     for run in find_runs(options.log_folder, options.algos, options.env):
         try:
             run.curve(options.source)
+            if options.kind != "curves" and not (run.folder / FINISHED).is_file():
+                raise ValueError(f"{run.folder} is not finished")
             runs.append(run)
         except ValueError as error:
             reasons.append(str(error))
@@ -164,7 +166,8 @@ def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
     """Return settings that differ from the zoo's present ones for the same game, as text."""
     flat = []
     for one in (settings, load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)):
-        own = {"n_envs": one.n_envs, "game_steps": one.game_steps, **one.plain, **one.wrapping}
+        own = {"n_envs": one.n_envs, "game_steps": one.game_steps, "time_limit": one.time_limit, **one.plain}
+        own |= one.wrapping
         flat.append({**own, **own.pop("policy_kwargs", {})})
     ours, theirs = flat
     values = {

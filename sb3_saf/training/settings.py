@@ -16,7 +16,6 @@ import reprlib
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_hints
 
@@ -149,16 +148,18 @@ class Settings:
         :param render_mode: render mode of the games; None for no rendering
         """
         source: Any = self.env_id
+        backend: Any = None
         params = dict(self.env_kwargs) if render_mode is None else {**self.env_kwargs, "render_mode": render_mode}
         suite = self.environment.suite
         if evaluation and suite is not None:
             params = {key: value for key, value in params.items() if key not in suite.training_params}
         if {"env_wrapper", "frame_stack"} & self.wrapping.keys():  # of single games, not of compiled ones
-            source, params = partial(self.make_game, render_mode), {}
+            source, backend = replace(self.environment, make=self.make_game), "supersuit"
         env = make_team_env(
             source,
             n_envs=self.n_envs if n_envs is None else n_envs,
             seed=evaluation_seed(seed) if evaluation else check_seed(seed),
+            backend=backend,
             time_limit=self.time_limit,
             monitor_dir=None if monitor_dir is None else str(monitor_dir),
             n_cpus=n_cpus,

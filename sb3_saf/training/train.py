@@ -18,7 +18,7 @@ from typing import Any, Final
 import yaml
 
 from sb3_saf.teams.checks import MAX_SEED, CheckpointError, NonFiniteError, SettingsError, check_seed
-from sb3_saf.teams.files import digest
+from sb3_saf.teams.files import digest, plain
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -356,8 +356,9 @@ def _tune(options: argparse.Namespace, command: str) -> None:
         n_evaluations=options.n_evaluations,
         **{key: getattr(options, key) for key in keys},
     )
-    goal = f"{settings.algo} on {settings.env_id}"
-    print(f"Tuning {goal}: {settings.game_steps:,} game steps a trial")
+    steps = settings.game_steps
+    goal = plain({"algo": settings.algo, "env": settings.env_id, "game_steps": steps, **settings.env_kwargs})
+    print(f"Tuning {settings.algo} on {settings.env_id}: {steps:,} game steps a trial")
     with user_errors():
         study = optimize(
             lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options)))[0],

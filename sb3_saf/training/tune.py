@@ -23,6 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.teams.checks import MAX_SEED
+from sb3_saf.teams.files import differences
 from sb3_saf.training.run import RunOptions, SeededEvalCallback, Training
 from sb3_saf.training.settings import Settings, algorithm_arguments, policy_arguments
 
@@ -149,11 +150,13 @@ class Tuning:
     log_path: Path | None = None
 
 
-def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str, goal: str) -> optuna.Study:
+def optimize(
+    settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str, goal: Mapping[str, Any]
+) -> optuna.Study:
     """
     Run trials and return the study.
 
-    :param goal: what is tuned on what; the trials of one study are of one goal
+    :param goal: what is tuned on what, for how long; the trials of one study are of one goal
     :raises ValueError: if the study's trials are of another goal
     """
     pruner: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
@@ -169,9 +172,10 @@ def optimize(settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, co
         load_if_exists=True,
         direction="maximize",
     )
-    if (stored := study.user_attrs.get("goal", goal)) != goal:
+    if changed := differences(study.user_attrs.get("goal", goal), goal):
         raise ValueError(
-            f"the trials of the study {tuning.study_name!r} are of {stored}, not of {goal}; choose another --study-name"
+            f"the trials of the study {tuning.study_name!r} cannot be compared with these: {changed}; choose another "
+            "--study-name"
         )
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
