@@ -80,11 +80,7 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
 def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
     """Yield results of others, and whose they are, of trainings that are at least half and at most twice as long."""
     for one in references(task.env_id):
-        if (
-            not one.method.startswith("sb3-saf")
-            and not one.params
-            and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps
-        ):
+        if not one.is_own and not one.params and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
             yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
     here = baselines[(baselines["task"] == task.env_id) & (baselines["game_steps"] >= task.game_steps / 2)]
     for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):

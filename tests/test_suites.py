@@ -442,6 +442,8 @@ def test_a_result_stands_beside_what_is_known_of_its_task() -> None:
     # Games of another length, or scores in another unit, are never compared.
     assert standing(spread, {"max_cycles": 50}, {"return": -64.1}, 1_000_000) is None
     assert standing(spread, {}, {"won": 0.5}, 1_000_000) is None
+    battle = standing(TeamEnvironment("smax/3s_vs_5z", None), {}, {"won": 0.9}, 10_000_000)
+    assert battle is not None and "JaxMARL's IPPO with memory 60 % won" in battle.text, "not our own, as long"
     level = load_settings("saf", "TeamSupport-v0", "small", env_kwargs={"coordination": 2}).env_kwargs
     assert len(references(find_environment("TeamSupport"), level)) == 2
     assert not references(find_environment("TeamSupport"), {**level, "heterogeneity": 2})

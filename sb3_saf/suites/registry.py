@@ -340,6 +340,11 @@ class Reference(NamedTuple):
     source: str
 
     @property
+    def is_own(self) -> bool:
+        """Whether it is a result of this package."""
+        return self.method.startswith("sb3-saf")
+
+    @property
     def result(self) -> str:
         """The value with its unit."""
         return f"{100 * self.value:.0f} % won" if self.unit == "won" else f"{self.value:g}"
@@ -403,7 +408,7 @@ def standing(
 ) -> Standing | None:
     """
     Compare a result with what is known of its task: players that do not learn, and the published result whose training
-    is closest in game steps, as a ratio.
+    is closest in game steps, as a ratio; of several that of others.
 
     :param scores: the result by unit, from the most telling one: ``won``, ``return``
     :return: None if nothing is known in these units
@@ -419,7 +424,10 @@ def standing(
         texts += [here, *(str(one) for one in known if not one.game_steps)]
         floor = next((one.value for one in known if one.method == RANDOM), None)
         if trained:
-            closest = min(trained, key=lambda one: (abs(math.log(one.game_steps / max(1, game_steps))), -one.value))
+            # Of equally long trainings the best one of others.
+            closest = min(
+                trained, key=lambda one: (abs(math.log(one.game_steps / max(1, game_steps))), one.is_own, -one.value)
+            )
             texts.append(f"{closest} ({closest.source})")
             if share is None and floor is not None and closest.value > floor:
                 share = (score - floor) / (closest.value - floor)
