@@ -78,7 +78,7 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
 
 
 def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
-    """Yield results of others, and whose they are, of trainings that are at least half and at most twice as long."""
+    """Yield results of others' trainings, at least half and at most twice as long, and notes with method and source."""
     for one in references(task.env_id):
         if not one.is_own and not one.params and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
             yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
@@ -95,7 +95,7 @@ def _over_seeds(values: pd.Series) -> str:
 
 
 def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
-    """Yield the lines of the table, of whose the others' results are, and of the tasks that were not trained yet."""
+    """Yield the lines of the table, of the notes on others' results, and of the tasks that were not trained yet."""
     head = ["task", "game steps", "method", "best policy", "others", "last policy", "random", "seeds", "minutes"]
     yield f"| {' | '.join(head)} |"
     yield f"|{' --- |' * len(head)}"

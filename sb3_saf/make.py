@@ -201,7 +201,7 @@ def _make_rows(
             f"backend='native' needs a suite with an engine of its own, got it with {name}; leave backend out or use "
             "backend='supersuit'"
         )
-    if suite is not None and suite.game is None:
+    if env is not None and env.make is None:
         raise ValueError(f"backend='supersuit' needs single games, {name} has an engine only; leave backend out")
     if request.stagger:
         raise ValueError(f"stagger=True needs a suite with an engine of its own, got {name} through SuperSuit")

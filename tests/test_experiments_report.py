@@ -18,7 +18,7 @@ from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, e
 from sb3_saf.experiments.report import Content, known, losses
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
-from sb3_saf.experiments.tables import Frames, complete, marl_eval, read_results
+from sb3_saf.experiments.tables import Frames, beside, complete, marl_eval, read_results
 from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import finish_run
@@ -231,6 +231,14 @@ def test_marl_eval_gets_means_over_the_episodes_of_complete_runs(folder: Path) -
         assert score == pytest.approx((value - means.min()) / (means.max() - means.min()))
     lacking = Frames(frames.tests[(frames.tests["method"] != "ippo") | (frames.tests["seed"] == 0)], frames.curves)
     assert list(marl_eval(lacking, "x")["x"]["teamsupport_c1_h1"]["saf"]) == ["seed_0"]
+
+
+def test_published_results_of_other_games_are_left_out(folder: Path) -> None:
+    theirs = read_results(folder, "coordination")
+    mine = Frames(theirs.tests[theirs.tests["method"] == "saf"].assign(method="mine"), theirs.curves.iloc[:0])
+    assert set(beside(mine, theirs).tests["method"]) == {"mine", "saf", "ippo", "random"}
+    others = Frames(theirs.tests.assign(max_return=100), theirs.curves)
+    assert set(beside(mine, others).tests["method"]) == {"mine"}
 
 
 def test_aggregates_compare_like_with_like() -> None:

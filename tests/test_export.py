@@ -311,6 +311,12 @@ def test_agents_of_any_name_keep_their_own_memory_while_they_play(names: Any, tm
         observations = {agent: game.see(agent) for agent in game.agents}
 
 
+def test_names_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    model: Any = PPO("IPPOPolicy", make_team_env(Named, 1, seed=0, names=[frozenset("a"), frozenset("b")]), seed=0)
+    with pytest.raises(ExportError, match=r"text, numbers or tuples of these, got .*frozenset"):
+        export_actors(model, tmp_path)
+
+
 def test_wrong_memories(exports: Callable[[str], Exported]) -> None:
     actor, obs = exports("heads with memory").actor, samples(VECTOR, 3)
     with pytest.raises(ValueError, match=r"memory = actor.new_memory\(\) at the start of each .*got memory=None"):

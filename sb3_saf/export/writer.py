@@ -135,7 +135,9 @@ def _plain_names(names: Sequence[Any]) -> Any:
     except (AttributeError, TypeError, ValueError):
         plain = None
     if plain is None or conversion.tupled(plain) != tuple(names):
-        raise ExportError(f"expected agents named by text, whole numbers or tuples of them, got {list(names)}")
+        raise ExportError(
+            f"expected names of agents in possible_agents to be text, numbers or tuples of these, got {list(names)}"
+        )
     return plain
 
 

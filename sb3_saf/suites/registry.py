@@ -408,7 +408,7 @@ def standing(
 ) -> Standing | None:
     """
     Compare a result with what is known of its task: players that do not learn, and the published result whose training
-    is closest in game steps, as a ratio; of several that of others.
+    is closest in game steps, as a ratio; of equally long ones the best of others.
 
     :param scores: the result by unit, from the most telling one: ``won``, ``return``
     :return: None if nothing is known in these units
@@ -424,7 +424,6 @@ def standing(
         texts += [here, *(str(one) for one in known if not one.game_steps)]
         floor = next((one.value for one in known if one.method == RANDOM), None)
         if trained:
-            # Of equally long trainings the best one of others.
             closest = min(
                 trained, key=lambda one: (abs(math.log(one.game_steps / max(1, game_steps))), one.is_own, -one.value)
             )
