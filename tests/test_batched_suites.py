@@ -75,7 +75,7 @@ def test_games_without_objects_are_drawn_by_row() -> None:
 @needs_jaxmarl
 def test_games_of_an_engine_cannot_be_wrapped_one_by_one() -> None:
     settings = load_settings("mappo", "smax/3m", "smoke", overrides={"env_wrapper": "supersuit.dtype_v0"})
-    with pytest.raises(ValueError, match="has an engine only, .*: use vec_env_wrapper"):
+    with pytest.raises(ValueError, match=r"has an engine only, .*: use vec_env_wrapper"):
         settings.make_env(0)
 
 
