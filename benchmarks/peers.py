@@ -41,7 +41,8 @@ _VMAS_STEPS: Final = 100
 #: The last training episodes whose mean counts, as a share of all updates.
 _LAST: Final = 20
 #: Speed: what is played (also JaxMARL's own choice), and game steps of a measured run.
-_RATE_TASK: Final = "jaxmarl/MPE_simple_spread_v3"
+_SPREAD: Final = "MPE_simple_spread_v3"
+_RATE_TASK: Final = f"jaxmarl/{_SPREAD}"
 _RATE_STEPS: Final = 200_000
 #: The same with memory, whose units are JaxMARL's, for numbers of games.
 _MEMORY_TASK: Final = "3m"
@@ -85,18 +86,23 @@ class Outcome(NamedTuple):
     source: str
 
 
+_KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
 PEERS: Final = (
     Peer("smax/3m", "JaxMARL's IPPO", "jaxmarl", "3m", "ippo_rnn_smax", 100_000),
     Peer("smax/3m", "JaxMARL's IPPO", "jaxmarl", "3m", "ippo_rnn_smax", 1_000_000),
     Peer("smax/2s3z", "JaxMARL's IPPO", "jaxmarl", "2s3z", "ippo_rnn_smax", 60_000),
     Peer("overcooked/cramped_room", "JaxMARL's IPPO", "jaxmarl", "cramped_room", "ippo_ff_overcooked", 200_000),
-    Peer(
-        "jaxmarl/MPE_simple_spread_v3",
-        "JaxMARL's IPPO",
-        "jaxmarl",
-        "MPE_simple_spread_v3",
-        "ippo_ff_mpe",
-        200_000,
+    *(
+        Peer(f"overcooked/{layout}", "JaxMARL's IPPO", "jaxmarl", layout, "ippo_ff_overcooked", 5_000_000)
+        for layout in _KITCHENS
+    ),
+    *(
+        Peer(f"jaxmarl/{_SPREAD}", "JaxMARL's IPPO", "jaxmarl", _SPREAD, "ippo_ff_mpe", game_steps)
+        for game_steps in (200_000, 10_000_000)
+    ),
+    *(
+        Peer(f"smax/{battle}", "JaxMARL's IPPO", "jaxmarl", battle, "ippo_rnn_smax", 10_000_000)
+        for battle in ("2s3z", "3s_vs_5z")
     ),
     Peer("vmas/balance", "BenchMARL's MAPPO", "benchmarl", "BALANCE", "Mappo", 100_000),
     Peer(

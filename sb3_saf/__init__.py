@@ -48,6 +48,7 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.policies.mappo import MAPPOMaskablePolicy, MAPPOPolicy
     from sb3_saf.policies.saf import SAFMaskablePolicy, SAFPolicy
     from sb3_saf.qplex.policies import QPLEXPolicy, QPLEXPoolPolicy
+    from sb3_saf.qplex.pqn import PQN, PQNPolicy
     from sb3_saf.qplex.qplex import QPLEX
     from sb3_saf.registration import register_all
     from sb3_saf.teams.checks import CheckpointError, NonFiniteError
@@ -67,6 +68,7 @@ else:
 __version__ = package_version()
 
 __all__ = [
+    "PQN",
     "QPLEX",
     "Actor",
     "CentralizedValueWrapper",
@@ -90,6 +92,7 @@ __all__ = [
     "NatureEncoder",
     "NonFiniteError",
     "ObservationEncoder",
+    "PQNPolicy",
     "PaperCNN",
     "PartsEncoder",
     "QPLEXPolicy",

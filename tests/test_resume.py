@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_saf
-from sb3_saf import QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
+from sb3_saf import PQN, QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
 from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv, TellingEnv
 from tests.weights import weights_of
 
@@ -80,7 +80,7 @@ def make(
     monitor_dir, logs = (None, None) if folder is None else (str(folder), str(folder / "tb"))
     level = TASK | {"coordination": coordination}
     env = env or sb3_saf.make_team_env("TeamTogether", N_GAMES, seed=games_seed, monitor_dir=monitor_dir, **level)
-    settings: dict[str, Any] = {} if algorithm is QPLEX else {"n_steps": N_STEPS}
+    settings: dict[str, Any] = {} if issubclass(algorithm, QPLEX) else {"n_steps": N_STEPS}
     if algorithm is PPO:
         settings |= {"batch_size": ROLLOUT // 2, "n_epochs": 2, "rollout_buffer_class": sb3_saf.TeamRolloutBuffer}
     settings |= {"seed": 3, "policy_kwargs": dict(LIGHT)} | arguments  # A2C adds its optimiser to them
@@ -148,6 +148,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "MaskablePPO": masked,
     "QPLEX": qplex,
     "QPLEX with memory": lambda: qplex(memory="lstm", sequence_length=4, burn_in=2),
+    "PQN": lambda: make(algorithm=PQN, policy="PQNPolicy", rollout_steps=6, batch_size=8),
     "VecNormalize": normalised,
     "PPO with memory": lambda: make(
         rollout_buffer_class=sb3_saf.TeamRolloutBuffer, policy_kwargs=LIGHT | {"memory": "lstm", "memory_size": 8}

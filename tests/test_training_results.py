@@ -19,6 +19,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_saf import EvaluationResult, evaluate_team
+from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
@@ -57,13 +58,17 @@ def enjoy(logs: Path, *options: str) -> EvaluationResult:
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_returns_are_those_of_the_saved_model_over_games_of_its_level(logs: Path, deterministic: bool) -> None:
     options = ["--deterministic"] if deterministic else []
-    result = enjoy(logs, "--exp-id", "3", "--no-render", "--seed", "5", *options)
-    run = Run(logs / "saf" / f"{ENV}_3")
-    assert run.settings.env_kwargs["coordination"] == 2
+    result = enjoy(logs, "--exp-id", "1", "--no-render", "--seed", "5", *options)
+    run = Run(logs / "saf" / f"{ENV}_1")
+    assert run.settings.env_kwargs["coordination"] == 1
     model = PPO.load(run.folder / f"{ENV}.zip", device="cpu")
+    games = run.settings.make_env(5, evaluation=True, n_envs=6)
     set_random_seed(5)
-    expected = evaluate_team(model, run.settings.make_env(5, evaluation=True, n_envs=6), 6, deterministic=deterministic)
-    assert result == expected
+    of_evaluation = evaluate_team(model, games, 6, deterministic=deterministic)
+    games.seed(evaluation_seed(5, test=0))
+    set_random_seed(5)
+    assert result == evaluate_team(model, games, 6, deterministic=deterministic)
+    assert result != of_evaluation
 
 
 def test_latest_run_by_default_and_other_models_on_demand(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,6 +106,7 @@ def test_gif_mp4_and_text_show_every_step_of_the_first_game(
     pages = capsys.readouterr().out.split("team return")[0]
     assert [step for step in range(12) if f"step {step} " in pages] == list(range(10))
     games = Run(logs / "saf" / f"{ENV}_3").settings.make_env(9, evaluation=True, n_envs=1, render_mode="ansi")
+    games.seed(evaluation_seed(9, test=0))
     games.reset()
     assert pages.startswith(games.env_method("render", indices=[0])[0])
 
@@ -213,10 +219,10 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     assert "has no evaluations" in failed(["curves", "-f", str(tmp_path), "-o", figure], capsys, zoo_plot.main)
 
 
-def fake_run(folder: Path, number: int, seed: int = 0, **overrides: Any) -> None:
+def fake_run(folder: Path, number: int, seed: int = 0, options: dict[str, Any] | None = None, **overrides: Any) -> None:
     """Write a run's settings, as training does."""
     settings = load_settings("saf", ENV, "smoke", overrides=overrides)
-    write_run(folder / "saf" / f"{ENV}_{number}", settings.as_dict(), seed, "")
+    write_run(folder / "saf" / f"{ENV}_{number}", settings.as_dict(), seed, "", options)
 
 
 def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
@@ -240,6 +246,14 @@ def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
     for number in (1, 2):
         fake_run(tmp_path / "shared", number, seed=number, game_steps=80)
     assert list(describe(find_runs(tmp_path / "shared"))["method"]) == ["saf", "saf"]  # what all share is not named
+
+
+def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: Path) -> None:
+    fake_run(tmp_path, 1, options={"deterministic_eval": False, "eval_env_kwargs": {}})
+    fake_run(tmp_path, 2, options={"deterministic_eval": True, "eval_env_kwargs": {"coordination": 3}})
+    fake_run(tmp_path, 3, options={"initial_model": {"path": "old.zip", "sha256": "1"}})
+    expected = ["saf", "saf deterministic_eval=True eval_env_kwargs=coordination:3", "saf trained_agent=old.zip"]
+    assert list(describe(find_runs(tmp_path))["method"]) == expected
 
 
 @pytest.mark.parametrize(

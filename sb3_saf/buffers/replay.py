@@ -316,6 +316,11 @@ class TeamReplayBuffer(ReplayBuffer):
         steps, games = self._draw(self.size(), batch_size)
         return self._get_samples(steps * self.n_games + games, env)
 
+    def every_step(self) -> TeamReplaySamples:
+        """Return all T E stored team steps, from the oldest on, those of all games at a step together."""
+        self._check_filled()
+        return self._get_samples(np.arange(self.size() * self.n_games))
+
     def sample_sequences(self, n_sequences: int, length: int, burn_in: int) -> TeamReplaySamples:
         """
         Draw sequences of consecutive steps of a game, for agents with memory.

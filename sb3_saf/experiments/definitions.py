@@ -68,6 +68,7 @@ METHODS: Final[dict[str, Method]] = {
     "ippo-separate": Method("ippo-separate", "IPPO, paper's"),
     "qplex": Method("qplex", "QPLEX"),
     "qplex-pool": Method("qplex-pool", "QPLEX with pool"),
+    "pqn": Method("pqn", "PQN-VDN"),
     **{
         f"actor-{actor}-critic-{critic}": Method(
             "saf", f"{_ACTOR_WORDS[actor]}, {_CRITIC_WORDS[critic]}", {**_ACTORS[actor], **_CRITICS[critic]}

@@ -103,6 +103,14 @@ class Linear(nn.Linear):
         self.gain = gain
 
 
+class NormalizedReLU(nn.Module):
+    """ReLU after layer normalisation without weights: inputs (K, d) with mean 0 and variance 1 in each row."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Return (K, d)."""
+        return nn.functional.relu(nn.functional.layer_norm(x, x.shape[-1:]))
+
+
 def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float = 1.0) -> nn.Sequential:
     """
     Make a multi-layer perceptron with a linear output.

@@ -151,6 +151,23 @@ def _mix(
     return networks.mixer(features.flatten(1), choice)
 
 
+def joint_values(policy: QPLEXPolicy, steps: TeamSteps, actions: th.Tensor | None = None) -> th.Tensor:
+    """
+    Compute Q_tot of agents without memory by the networks that act, each distinct observation encoded once.
+
+    :param steps: G team steps
+    :param actions: (G, N) int64; None for each agent's best legal action
+    :return: (G,)
+    """
+    own = steps.own.flatten(0, 1)
+    unique = policy.row_encoder.find(own)
+    encoded = policy.encode_with(policy.online.encoder, own[unique.index])
+    features = gather(encoded, unique.inverse).view(*steps.own.shape[:2], -1)
+    values = _q_values(policy.online, features, steps)
+    actions = values.argmax(dim=2) if actions is None else actions
+    return _mix(policy, policy.online, values, steps, features, actions).q_tot
+
+
 def greedy_q_tot(policy: QPLEXPolicy, obs: dict[str, th.Tensor], values: th.Tensor) -> th.Tensor:
     """
     Compute Q_tot of the greedy joint action, in which each agent takes its own best action.

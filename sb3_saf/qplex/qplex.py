@@ -127,7 +127,9 @@ class QPLEX(OffPolicyAlgorithm):
     ) -> None:
         if isinstance(policy, str) and policy not in self.policy_aliases:
             names = ", ".join(repr(name) for name, kind in self.policy_aliases.items() if name == kind.__name__)
-            raise ValueError(f"expected one of QPLEX's policies, {names}, got {policy!r}; PPO trains the others")
+            raise ValueError(
+                f"expected one of {type(self).__name__}'s policies, {names}, got {policy!r}; PPO trains the others"
+            )
         if mixer is not None:
             policy_kwargs = {**(policy_kwargs or {}), "mixer": mixer}
         super().__init__(
@@ -184,7 +186,7 @@ class QPLEX(OffPolicyAlgorithm):
         buffer = self._buffer()
         if self.verbose >= 1:
             steps = buffer.buffer_size * buffer.n_games
-            print(f"Replay buffer of {steps:,} game steps: {buffer.nbytes / 1e6:,.1f} MB")
+            print(f"Buffer of {steps:,} game steps: {buffer.nbytes / 1e6:,.1f} MB")
 
     def _check_settings(self) -> None:
         for name in ("buffer_size", "batch_size", "train_freq", "target_update_interval"):
@@ -352,12 +354,15 @@ class QPLEX(OffPolicyAlgorithm):
         """Update the target networks and the exploration rate."""
         if self._crossed(self.target_update_interval):
             polyak_update(*self.policy.parameter_pairs(), self.tau)
+        self._update_exploration_rate()
+        self.logger.record("rollout/replay_buffer_size", self._buffer().n_stored)
+
+    def _update_exploration_rate(self) -> None:
         share = 1.0 - self._current_progress_remaining
         fallen = min(1.0, share / self.exploration_fraction) if self.exploration_fraction > 0 else 1.0
         change = self.exploration_final_eps - self.exploration_initial_eps
         self.exploration_rate = self.exploration_initial_eps + fallen * change
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
-        self.logger.record("rollout/replay_buffer_size", self._buffer().n_stored)
 
     # --- learning ---------------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.writer import load_weights
 from sb3_saf.inspection.figures import gif
 from sb3_saf.suites.registry import find_environment, standing
-from sb3_saf.teams.checks import check_seed
+from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
     DefaultsFormatter,
@@ -62,7 +62,9 @@ def make_parser() -> argparse.ArgumentParser:
     which.add_argument("--load-last-checkpoint", action="store_true", help="the model that was saved last on the way")
     parser.add_argument("--episodes", type=at_least(1), default=32, help="team episodes to measure")
     parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
-    parser.add_argument("--seed", type=int, default=0, help="of the games, none of which was trained on")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of the games, which neither training nor its evaluations have"
+    )
     shown = parser.add_mutually_exclusive_group()
     shown.add_argument("--gif", type=Path, metavar="FILE", help="record a game")
     shown.add_argument("--mp4", type=Path, metavar="FILE", help="record a game")
@@ -101,6 +103,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
                 else:  # the actor is that of the trained size
                     with closing(trained.make_env(seed, n_envs=1)) as own_games:
                         policy = make_policy(trained, path, own_games)
+            games.seed(evaluation_seed(seed, test=0))  # the best model is the best one on the games of evaluations
             load_normalization(games, run.folder)
             set_random_seed(seed)
             with open_screen(options, games) as show:

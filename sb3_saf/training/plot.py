@@ -142,7 +142,7 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    from_zoo = [_different_from_the_zoo(run.settings) for run in runs]
+    from_zoo = [_different_from_the_zoo(run.settings) | _measured_otherwise(run) for run in runs]
     kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
     variants: dict[str, dict[str, int]] = {}
     rows = []
@@ -176,6 +176,16 @@ def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
         if repr(ours.get(key)) != repr(theirs.get(key)) and key != "policy_kwargs"
     }
     return {key: f"{value:.3g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+
+
+def _measured_otherwise(run: Run) -> dict[str, str]:
+    """Return options of the run that change what its scores mean: where it began, and how it was evaluated."""
+    given = run.description["options"]
+    level = " ".join(f"{name}:{value}" for name, value in given.get("eval_env_kwargs", {}).items())
+    beginning = given.get("initial_model", {}).get("path", "")
+    actions = "True" if given.get("deterministic_eval") else ""
+    values = {"eval_env_kwargs": level, "trained_agent": beginning, "deterministic_eval": actions}
+    return {name: value for name, value in values.items() if value}
 
 
 def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:

@@ -38,6 +38,7 @@ from sb3_saf.buffers.rollout import TeamRolloutBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.make import make_team_env
 from sb3_saf.networks.encoders import LightEncoder, MLPEncoder, NatureEncoder, ObservationEncoder, PaperCNN
+from sb3_saf.networks.layers import NormalizedReLU
 from sb3_saf.networks.memory import MemoryName
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS, DECLARATIONS
@@ -388,17 +389,18 @@ CLASSES: Final[dict[str, dict[str, type]]] = {
         "gelu": nn.GELU,
         "silu": nn.SiLU,
         "leaky_relu": nn.LeakyReLU,
+        "normalized_relu": NormalizedReLU,
     },
     "optimizer_class": {"Adam": th.optim.Adam, "AdamW": th.optim.AdamW, "RMSprop": th.optim.RMSprop},
 }
 
 #: Ranges that the algorithms' constructors do not check.
 RANGES: Final[dict[str, Meta]] = {
-    **dict.fromkeys(("gamma", "gae_lambda", "tau"), Meta(ge=0, le=1)),
+    **dict.fromkeys(("gamma", "gae_lambda", "td_lambda", "tau"), Meta(ge=0, le=1)),
     **dict.fromkeys(("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), Meta(ge=0, le=1)),
     **dict.fromkeys(("learning_rate", "ent_coef", "vf_coef", "learning_starts"), Meta(ge=0)),
     **dict.fromkeys(("clip_range", "max_grad_norm", "target_kl"), Meta(gt=0)),
-    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "n_minibatches", "game_steps"), Meta(ge=1)),
+    **dict.fromkeys(("n_steps", "rollout_steps", "n_epochs", "batch_size", "n_minibatches", "game_steps"), Meta(ge=1)),
     **dict.fromkeys(("buffer_size", "train_freq", "target_update_interval", "stats_window_size"), Meta(ge=1)),
     "n_envs": Meta(ge=1, le=100_000),
     "frame_stack": Meta(ge=1, le=1_000),
