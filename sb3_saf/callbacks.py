@@ -9,6 +9,8 @@ import math
 import sys
 import time
 import warnings
+from collections.abc import Iterator
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from torch.utils.hooks import RemovableHandle
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
@@ -153,6 +155,33 @@ class GameStepsCallback(BaseCallback):
                 self.logger.record(f"rollout/ep_rew_mean/{name}", mean, exclude="stdout")
 
 
+def copy_normalization(trained: VecEnv, played: VecEnv) -> None:
+    """
+    Copy the statistics of every VecNormalize of the games that are trained on to those that are played.
+
+    :raises ValueError: if one is normalised more often than the other
+    """
+    sources, targets = (list(_normalizations(env)) for env in (trained, played))
+    if not targets and not any(source.norm_obs for source in sources):  # of rewards only
+        return
+    if len(sources) != len(targets):
+        raise ValueError(
+            f"expected as many VecNormalize in the games of evaluation as in those of training, {len(sources)}, got "
+            f"{len(targets)}; wrap them alike: VecNormalize(env.venv, training=False, norm_reward=False)"
+        )
+    for source, target in zip(sources, targets, strict=True):
+        target.ret_rms = deepcopy(source.ret_rms)
+        if source.norm_obs:
+            target.obs_rms = deepcopy(source.obs_rms)
+
+
+def _normalizations(env: VecEnv) -> Iterator[VecNormalize]:
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecNormalize):
+            yield env
+        env = env.venv
+
+
 class TeamEvalCallback(EvalCallback):
     """
     SB3's EvalCallback for teams.
@@ -252,8 +281,7 @@ class TeamEvalCallback(EvalCallback):
     def _evaluate(self) -> bool:
         """Play, store and log; return whether training continues."""
         began = time.monotonic()
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
+        copy_normalization(self.training_env, self.eval_env)
         result = evaluate_team(
             self.model, self.eval_env, self.n_eval_episodes, self.deterministic, render=self.render, warn=self.warn
         )
@@ -288,9 +316,11 @@ class TeamEvalCallback(EvalCallback):
             "agent_results": np.array(self.evaluations_agent_results),
             "ep_lengths": np.array(self.evaluations_length),
         }
-        if result.successes:
-            self.evaluations_successes.append(list(result.successes))
-            arrays["successes"] = np.array(self.evaluations_successes)
+        unknown = [np.nan] * (len(result.returns) - len(result.successes))
+        self.evaluations_successes.append([*result.successes, *unknown])  # type: ignore[list-item]
+        successes = np.array(self.evaluations_successes)
+        if not np.isnan(successes).all():
+            arrays["successes"] = successes
         with atomic_file(Path(f"{self.log_path}.npz")) as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]
 

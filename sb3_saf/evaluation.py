@@ -309,6 +309,13 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
             f"expected games like those on which {name} was trained, with {expected}, got {got}; make them as for its "
             "training" + ("" if not is_other_size else f", with {trained.n_agents} agents")
         )
+    agent = space.spaces.get(AGENT_KEY) if isinstance(space, spaces.Dict) else None
+    names = getattr(agent, "names", None)
+    if policy.acts_by_index and names and trained.names and names != trained.names:
+        raise ValueError(
+            f"expected the agents in the order of the games on which {name} was trained, {list(trained.names)}, since "
+            f"its actors read who acts, got {list(names)}; list possible_agents in that order"
+        )
 
 
 def evaluate_team(
@@ -376,12 +383,6 @@ def evaluate_team(
         returns_now[step.ended], lengths_now[step.ended] = 0, 0
         if render:
             env.render()
-    if 0 < len(successes) < len(returns):
-        warnings.warn(
-            f"{len(successes)} of {len(returns)} episodes ended with {IS_SUCCESS!r} in their infos, and the success "
-            "rate is of these only; give it at every end, also of episodes that are lost",
-            stacklevel=2,
-        )
     return EvaluationResult(returns, lengths, tuple(successes), tuple(agent_returns))
 
 

@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 import sb3_saf
 from sb3_saf import (
@@ -26,6 +26,7 @@ from sb3_saf import (
     resumable_learn,
 )
 from tests.team_venv import TeamVenv
+from tests.toy_envs import CounterEnv
 from tests.weights import weights_of
 
 N_AGENTS, N_GAMES, N_STEPS = 2, 3, 4
@@ -147,6 +148,64 @@ def test_looking_changes_nothing_and_leaves_nothing() -> None:
 
 
 # --- seeds ------------------------------------------------------------------------------------------------------------
+
+
+def normalised(seed: int, is_training: bool) -> CentralizedValueWrapper:
+    """Games of vectors with one VecNormalize below the joint observation."""
+    rows = sb3_saf.make_team_env(CounterEnv, N_GAMES, seed=seed).venv
+    return CentralizedValueWrapper(VecNormalize(rows, training=is_training, norm_reward=False, norm_obs_keys=["obs"]))
+
+
+def test_every_evaluation_has_the_statistics_of_training(tmp_path: Path) -> None:
+    games, evaluated, inspected = normalised(0, True), normalised(1, False), normalised(2, False)
+    evaluation = sb3_saf.TeamEvalCallback(evaluated, eval_freq=1, n_eval_episodes=2, verbose=0)
+    inspection = sb3_saf.InspectionCallback(inspected, 1, 2, pictures=False)
+    ppo(games, tensorboard_log=str(tmp_path)).learn(ROLLOUT, [evaluation, inspection])
+    means = []
+    for env in (games, evaluated, inspected):
+        layer: Any = unwrap_vec_normalize(env)
+        assert layer.obs_rms["obs"].count > 10
+        means.append(layer.obs_rms["obs"].mean.tolist())
+    assert means[2] == means[0] != means[1]  # inspected at the end of the training, evaluated before its last steps
+    plain = sb3_saf.TeamEvalCallback(sb3_saf.make_team_env(CounterEnv, 2, seed=1), eval_freq=1, verbose=0)
+    with pytest.raises(
+        ValueError, match="as many VecNormalize in the games of evaluation as in those of training, 1, got 0"
+    ):
+        ppo(normalised(0, True)).learn(ROLLOUT, plain)
+
+
+class SometimesWon(CounterEnv):
+    """Says only of every second episode that it was won; agent 0 is stopped one step before the others."""
+
+    def __init__(self, only_won: bool) -> None:
+        super().__init__(n_agents=2, cuts={0: 2})
+        self.only_won = only_won
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        *results, infos = super().step(actions)
+        if self.steps == 3 and (self.episode % 2 or not self.only_won):
+            infos["agent_1"]["is_success"] = bool(self.episode % 2)
+        if self.steps == 2 and not self.only_won:
+            infos["agent_0"]["is_success"] = True
+        return (*results, infos)
+
+
+def test_games_that_tell_only_won_episodes(tmp_path: Path) -> None:
+    env, other = (sb3_saf.make_team_env(SometimesWon, 1, seed=seed, only_won=True) for seed in (0, 1))
+    evaluation = sb3_saf.TeamEvalCallback(other, eval_freq=12, n_eval_episodes=3, log_path=str(tmp_path), verbose=0)
+    with pytest.warns(UserWarning, match="some episodes end with 'is_success' in their infos, others do not"):
+        ppo(env, n_steps=12).learn(48, evaluation)
+    with np.load(tmp_path / "evaluations.npz") as arrays:
+        assert arrays["successes"].shape == arrays["results"].shape
+        assert 0 < np.isnan(arrays["successes"]).sum() < arrays["successes"].size
+
+
+def test_successes_are_those_of_teams_also_where_agents_end_alone() -> None:
+    env = sb3_saf.make_team_env(SometimesWon, 1, seed=0, only_won=False, time_limit="bootstrap")
+    model = ppo(env, n_steps=12).learn(24)
+    assert model.ep_success_buffer is not None and model.ep_info_buffer is not None
+    assert len(model.ep_success_buffer) == len(model.ep_info_buffer) == 4
+    assert list(model.ep_success_buffer) == [True, False, True, False]
 
 
 @pytest.mark.parametrize("backend", ["native", "supersuit"])

@@ -29,7 +29,7 @@ from sb3_saf.evaluation import (
 )
 from tests.contrib_teams import MaskedGame, choices_of
 from tests.team_venv import Array, TeamVenv
-from tests.toy_envs import Game
+from tests.toy_envs import CounterEnv, Game
 
 
 def teams(**kwargs: Any) -> CentralizedValueWrapper:
@@ -179,7 +179,7 @@ def test_what_is_of_the_episode_is_found_wherever_the_game_puts_it(told: str, tm
 
 def test_success_that_only_won_games_tell_is_named() -> None:
     env = CentralizedValueWrapper(TeamMonitor(SuperSuitVecEnv(partial(Outcome, "won"), 2, seed=0)))
-    with pytest.warns(UserWarning, match="10 of 20 episodes ended with 'is_success'"):
+    with pytest.warns(UserWarning, match="some episodes end with 'is_success' in their infos, others do not"):
         evaluate_team(RandomPolicy(env, seed=0), env, 20)
 
 
@@ -215,6 +215,25 @@ class TestOtherGames:
             evaluate_team(model, self.make(5), 2)
         with pytest.raises(ValueError, match=r"'agent' must be in 0..2"):
             model.predict(self.make(5).reset())
+
+    @pytest.mark.parametrize("kwargs", [{"actor_identity": True}, {}])
+    def test_agents_in_another_order(self, kwargs: dict[str, Any]) -> None:
+        """Actors that read who acts play only in the order of their training; others in any."""
+
+        class Reordered(CounterEnv):
+            def __init__(self, reverse: bool = False) -> None:
+                super().__init__()
+                self.possible_agents = sorted(self.possible_agents, reverse=reverse)
+
+        env, other = (make_team_env(Reordered, 2, seed=0, reverse=reverse) for reverse in (False, True))
+        model = PPO("MAPPO", env, **ppo_settings(env, policy_kwargs=kwargs), seed=0)
+        if not kwargs:
+            assert len(evaluate_team(model, other, 2).returns) == 2
+            return
+        with pytest.raises(
+            ValueError, match=r"in the order of .*\['agent_0', 'agent_1'\], .*got \['agent_1', 'agent_0'\]"
+        ):
+            evaluate_team(model, other, 2)
 
     def test_weights_of_ippo_go_to_teams_of_other_sizes(self, tmp_path: Path) -> None:
         small, large = self.make(), self.make(5)

@@ -92,6 +92,16 @@ def test_a_team_plays_its_games_again(published: Path, method: str) -> None:
     assert f"{TEST_GAMES} games" in check_team(f"{LEVEL}/{method}", published, batches=1)
 
 
+def test_games_of_a_team_are_those_of_neither_training_nor_evaluation(published: Path) -> None:
+    model = load_team(LEVEL, "ippo", published)
+    games, run = model.get_env(), find_team(f"{LEVEL}/ippo", published)
+    assert games is not None
+    shown: Any = games.reset()
+    for evaluation in (False, True):
+        other: Any = run.settings.make_env(run.seed, evaluation=evaluation).reset()
+        assert not np.array_equal(shown["obs"], other["obs"])
+
+
 def test_the_best_seed_of_each_method_is_published_with_its_row(experiments: Path, published: Path) -> None:
     assert team_names(published) == NAMES
     rows = read_table(experiments / "joint" / "runs.csv")

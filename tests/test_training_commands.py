@@ -28,6 +28,8 @@ from sb3_saf.training import folders
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run
+from sb3_saf.training.replay import main as replay_main
+from sb3_saf.training.replay import write_page
 from sb3_saf.training.run import GameStepsProgressBar, ProgressLines, RunOptions
 from sb3_saf.training.run import train as train_settings
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
@@ -242,11 +244,37 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
     own = model.observation_space["obs"]
     assert own.shape == (6,) and own.dtype == np.float32  # two frames of three numbers, converted
     assert model.num_timesteps < 400 * 2  # stopped by the callback
-    with np.load(run / "vecnormalize.npz") as statistics:
+    with np.load(run / "tests.toy_envs-CounterEnv.vecnormalize.npz") as statistics:
         assert set(statistics) == {f"{name} {part}" for name in ("obs", "returns") for part in ("mean", "var", "count")}
         assert statistics["obs mean"].shape == (6,) and statistics["obs count"] > 10
     gif = str(tmp_path / "game.gif")
     zoo_enjoy.enjoy(["--env", COUNTER, "-f", str(tmp_path), "--episodes", "2", "--gif", gif])
+
+
+def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also with stages, whose games have one layer more than those of evaluation; they are read by all commands."""
+    given = (
+        f"--env {COUNTER} --seed 0 --size smoke -f {tmp_path} --eval-freq 80 --eval-episodes 2 -n 400 --save-freq 200"
+    )
+    settings = ["normalize:True", "curriculum:[{share: 0.5, max_cycles: 4}]"]
+    zoo_train.main([*given.split(), "--verbose", "0", "-params", *settings])
+    run = tmp_path / "saf" / "tests.toy_envs-CounterEnv_1"
+    counts = {}
+    for path in run.glob("*.vecnormalize.npz"):
+        with np.load(path) as statistics:
+            counts[path.name.partition(".vecnormalize")[0]] = float(statistics["obs count"])
+    assert counts["rl_model_200_steps"] < counts["tests.toy_envs-CounterEnv"]
+    assert {path.stem for path in run.glob("*.zip")} == set(counts)
+    watch = ["--env", COUNTER, "-f", str(tmp_path), "--episodes", "2", "--no-render"]
+    zoo_enjoy.enjoy([*watch, "--load-checkpoint", "200"])
+    model = run / "rl_model_200_steps.zip"
+    write_page(["--model", str(model), "-o", str(tmp_path / "page.html")])
+    model.with_suffix(".vecnormalize.npz").unlink()
+    words = "cannot read the statistics of normalize"
+    assert words in failed([*watch, "--load-checkpoint", "200"], capsys, zoo_enjoy.main)
+    both = ["--model", str(model), str(run / "best_model.zip")]
+    assert "a model with normalize is shown alone" in failed(both, capsys, replay_main)
+    assert words in failed(both[:2], capsys, replay_main)
 
 
 @pytest.mark.parametrize(
@@ -256,6 +284,7 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
         ("callback:os.system", "callback must name classes"),
         ("vec_env_wrapper:os.system", "vec_env_wrapper must be a class"),
         ("vec_env_wrapper:stable_baselines3.common.vec_env.VecFrameStack", "vec_env_wrapper: .*'n_stack'"),
+        ("vec_env_wrapper:stable_baselines3.common.vec_env.VecNormalize", "vec_env_wrapper cannot be .* use normalize"),
         ("env_wrapper:nowhere.Wrapper", "cannot import Wrapper from 'nowhere'"),
         ("frame_stack:0", "frame_stack=0"),
         ("ent_coef:0.0 callback:sb3_saf.EntropySchedule", "EntropySchedule has nothing to change"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -20,6 +21,7 @@ from sb3_saf.teams.rows import (
     ACTIVE_KEY,
     AGENT_KEY,
     EPISODE_START_KEY,
+    IS_SUCCESS,
     OBS_KEY,
     STATE_KEY,
     TEAM_KEY,
@@ -191,11 +193,18 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             last = {key: part[row].copy() for key, part in joint.items()}
             last[OBS_KEY] = own if own.shape == self.team_spaces.own_shape else np.moveaxis(own, -1, 0)
             last[TEAM_KEY][agent], last[ACTIVE_KEY][agent] = last[OBS_KEY], 1
-            row_dones[row], infos[row] = True, {**info, TERMINAL_OBSERVATION: TerminalRow(last, row)}
+            # SB3 would count a success in a done row as an episode; the team's monitor has noted it.
+            rest = {key: value for key, value in info.items() if key != IS_SUCCESS}
+            row_dones[row], infos[row] = True, {**rest, TERMINAL_OBSERVATION: TerminalRow(last, row)}
 
     def _warn_of_unused_masks(self) -> None:
         """Warn if games have action masks that are neither in the rows nor queried."""
-        if self.team_spaces.action_mask is None and not self._has_asked_for_masks and self.has_attr(_ACTION_MASKS):
+        if self.team_spaces.action_mask is not None or self._has_asked_for_masks:
+            return
+        has_masks = False
+        with suppress(AttributeError):  # VecEnvs of others may not know has_attr
+            has_masks = self.has_attr(_ACTION_MASKS)
+        if has_masks:
             warnings.warn(
                 "the games have action_masks(), which nobody has asked for: illegal actions may be taken. Train with "
                 'sb3_contrib.MaskablePPO("SAFPolicy", env), which asks (sb3_saf.train: -params algorithm:MaskablePPO), '

@@ -80,6 +80,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         #: Latest entries of infos that are of the episode, by game.
         self._notes: list[dict[str, Any]] = [{} for _ in range(self.n_games)]
         self._has_warned = False
+        self._success_is_told: set[bool] = set()
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
         self._filename = filename
@@ -148,6 +149,15 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._notes[game] = {}
         self.episode_count += 1
         copies = [dict(info) for info in infos]
+        told = self._success_is_told | {IS_SUCCESS in of_episode}
+        if len(told) > len(self._success_is_told) == 1:
+            warnings.warn(
+                f"some episodes end with {IS_SUCCESS!r} in their infos, others do not, and success rates are those of "
+                "the first; give it at every end, also of episodes that are lost",
+                UserWarning,
+                stacklevel=4,
+            )
+        self._success_is_told = told
         if IS_SUCCESS in of_episode:
             for info in copies:
                 info.pop(IS_SUCCESS, None)

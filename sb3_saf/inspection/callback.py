@@ -16,9 +16,9 @@ from gymnasium import spaces
 from stable_baselines3.common import logger
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_saf.callbacks import show_game_steps, team_steps
+from sb3_saf.callbacks import copy_normalization, show_game_steps, team_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection import figures
 from sb3_saf.inspection import scalars as numbers
@@ -264,8 +264,7 @@ class InspectionCallback(BaseCallback):
         began = time.perf_counter()
         now = team_steps(self.model)
         self._last, self._next = now, (now // self.every_game_steps + 1) * self.every_game_steps
-        if isinstance(self.eval_env, VecNormalize) and self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
+        copy_normalization(self.training_env, self.eval_env)
         inspection = inspect_team(
             self.model,
             self.eval_env,

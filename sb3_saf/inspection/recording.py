@@ -36,7 +36,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_saf.evaluation import PlayedStep, check_trained_on, play
 from sb3_saf.networks.actor import PolicyPool
@@ -434,7 +434,8 @@ class _Recorder:
     def _collect(self, step: PlayedStep) -> None:
         n_agents, of_team, columns = self.n_agents, self.reader.of_team, self.columns
         counted = np.repeat(step.counted, n_agents) & _active(step.observations, n_agents)
-        raw = self.env.get_original_reward() if isinstance(self.env, VecNormalize) else np.array(step.rewards)
+        layer = unwrap_vec_normalize(self.env)
+        raw = np.array(step.rewards) if layer is None else layer.get_original_reward()
         rewards = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
         if of_team:  # the team's reward, in each of its rows
             rewards = np.repeat(rewards.reshape(-1, n_agents).sum(axis=1), n_agents)

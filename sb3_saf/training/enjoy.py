@@ -104,7 +104,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
                     with closing(trained.make_env(seed, n_envs=1)) as own_games:
                         policy = make_policy(trained, path, own_games)
             games.seed(evaluation_seed(seed, test=0))  # the best model is the best one on the games of evaluations
-            load_normalization(games, run.folder)
+            load_normalization(games, path)
             set_random_seed(seed)
             with open_screen(options, games) as show:
                 env = games if show is None else Film(games, show)

@@ -3,7 +3,7 @@ Folder of a run, of ``sb3_saf.train`` and of the cells of experiments: one write
 
     run.json         settings, seed, options, command, versions; written first
     monitor.csv      one line per team episode
-    NAME.zip         the model; best_model.zip, rl_model_STEPS_steps.zip, vecnormalize.npz, evaluations.npz beside it
+    NAME.zip         the model; best_model.zip, rl_model_STEPS_steps.zip, evaluations.npz beside it
     checkpoints/     until the run is finished
     curve.csv        learning curve: means over the training episodes
     finished.json    cost, and the digests of the files; written last
@@ -418,7 +418,7 @@ def load_team(env: str, method: str, folder: str | Path | None = None, *, device
     """
     Load a published team, without running code from its files.
 
-    The model has as many games as in its training, none of which it was trained on: ``evaluate_team(model,
+    The model has as many games as in its training, none of which it was trained or selected on: ``evaluate_team(model,
     model.get_env(), 100)``, ``model.predict(own_observation)``.
 
     :param env: task and level, such as ``"TeamSupport-c2-h1"``, or ``"smax/2s3z"``
@@ -433,6 +433,7 @@ def load_team(env: str, method: str, folder: str | Path | None = None, *, device
         games = run.settings.make_env(run.seed, evaluation=True)
         model = run.settings.make_model(games, run.seed, device=device)
         load_weights(model, run.folder / WEIGHTS)
+        games.seed(evaluation_seed(run.seed, test=0))  # an algorithm seeds its games for training
     return model
 
 

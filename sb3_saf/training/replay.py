@@ -24,6 +24,7 @@ from sb3_saf.training.commands import (
 from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run
 from sb3_saf.training.settings import ALGOS, Settings, load_settings, saved_settings
+from sb3_saf.training.wrappers import load_normalization
 
 PROGRAM: Final = "python -m sb3_saf.replay"
 
@@ -69,6 +70,9 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
                 name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
                 for name, path, own in zip(_names(options.model), paths, settings, strict=True)
             }
+            if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
+                raise ValueError("a model with normalize is shown alone: its games are normalised with its statistics")
+            load_normalization(games, paths[0])
             gamma = settings[0].hyperparams.get("gamma", 0.99)
             return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
 

@@ -228,8 +228,21 @@ class CheckpointInGameSteps(BaseCallback):
             path = self.folder / f"rl_model_{steps}_steps.zip"
             with atomic_file(path) as file:
                 self.model.save(file)
+            save_normalization(self.training_env, path)
             if self.verbose > 0:
                 print(f"Saved {path}")
+        return True
+
+
+class _SaveNormalization(BaseCallback):
+    """Save the statistics of VecNormalize for the best model, when it is saved."""
+
+    def __init__(self, model: Path) -> None:
+        super().__init__()
+        self.path = model
+
+    def _on_step(self) -> bool:
+        save_normalization(self.training_env, self.path)
         return True
 
 
@@ -344,7 +357,7 @@ class Training:
             )
             if (initial := self.options.initial_model) is not None:
                 load_parameters(self.model, initial)
-                load_normalization(self.games, initial.parent)
+                load_normalization(self.games, initial)
             self.clock = TrainingClock(settings.game_steps / (2 * CURVE_POINTS))
             self.evaluation: SeededEvalCallback | None = None
             self.callbacks = [self.clock, *callbacks, *self._make_callbacks()]
@@ -394,9 +407,10 @@ class Training:
 
     def _save(self) -> None:
         if self.folder is not None:
-            with atomic_file(self.folder / f"{self.options.model_name}.zip") as file:
+            path = self.folder / f"{self.options.model_name}.zip"
+            with atomic_file(path) as file:
                 self.model.save(file)
-            save_normalization(self.games, self.folder)
+            save_normalization(self.games, path)
 
     def _games(self, settings: Settings, **kwargs: Any) -> CentralizedValueWrapper:
         """Make games that are closed with the training."""
@@ -425,6 +439,9 @@ class Training:
                 self._games(of_evaluation, evaluation=True, n_envs=n_games),
                 seed=self.seed,
                 settings=of_evaluation,
+                callback_on_new_best=None
+                if self.folder is None
+                else _SaveNormalization(self.folder / "best_model.zip"),
                 callback_after_eval=options.after_evaluation,
                 best_model_save_path=folder,
                 log_path=folder,

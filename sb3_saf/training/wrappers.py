@@ -44,7 +44,7 @@ WRAPPER_KEYS: Final[dict[str, Any]] = {
     "stagger": bool,
     "algorithm": str,
 }
-NORMALIZATION_FILE: Final = "vecnormalize.npz"
+NORMALIZATION_SUFFIX: Final = ".vecnormalize.npz"
 
 
 def _named(wrapping: Mapping[str, Any], key: str) -> Iterator[tuple[Any, Callable[..., Any]]]:
@@ -108,6 +108,8 @@ def wrap_rows(
     for wrapper, wrap in _named(wrapping, "vec_env_wrapper"):
         if not isinstance(wrapper, type) or not issubclass(wrapper, VecEnvWrapper):
             raise ValueError(f"vec_env_wrapper must be a class of SB3's VecEnvWrapper, got {wrapper}")
+        if issubclass(wrapper, VecNormalize):
+            raise ValueError("vec_env_wrapper cannot be VecNormalize, whose statistics must be kept; use normalize")
         rows = wrap(rows)
     if normalize is not False:
         space = rows.observation_space
@@ -116,7 +118,7 @@ def wrap_rows(
         norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
         arguments = {"gamma": gamma, "norm_obs": norm_obs, **({} if normalize is True else normalize)}
         if own is not space and arguments["norm_obs"]:
-            arguments["norm_obs_keys"] = [OBS_KEY]
+            arguments.setdefault("norm_obs_keys", [OBS_KEY])
         if not is_training:
             arguments |= {"training": False, "norm_reward": False}
         rows = _called("normalize", VecNormalize, arguments, rows)
@@ -162,21 +164,21 @@ def make_callbacks(wrapping: Mapping[str, Any]) -> list[BaseCallback]:
 # --- statistics of VecNormalize as arrays instead of SB3's pickle -----------------------------------------------------
 
 
-def save_normalization(env: VecEnv, folder: Path) -> None:
-    """Write the statistics of a VecNormalize, if any, to ``vecnormalize.npz`` in a folder."""
+def save_normalization(env: VecEnv, model: Path) -> None:
+    """Write the statistics of a VecNormalize, if any, beside a model: ``NAME.vecnormalize.npz`` for ``NAME.zip``."""
     layer = unwrap_vec_normalize(env)
     if layer is not None:
         arrays: dict[str, Any] = normalization_statistics(layer)
-        with atomic_file(folder / NORMALIZATION_FILE) as file:
+        with atomic_file(model.with_suffix(NORMALIZATION_SUFFIX)) as file:
             np.savez(file, **arrays)
 
 
-def load_normalization(env: VecEnv, folder: Path) -> None:
-    """Read the statistics of a run's folder, if the environment has a VecNormalize."""
+def load_normalization(env: VecEnv, model: Path) -> None:
+    """Read the statistics beside a model, if the environment has a VecNormalize."""
     layer = unwrap_vec_normalize(env)
     if layer is None:
         return
-    path = folder / NORMALIZATION_FILE
+    path = model.with_suffix(NORMALIZATION_SUFFIX)
     try:
         with np.load(path, allow_pickle=False) as arrays:
             load_normalization_statistics(layer, dict(arrays))
