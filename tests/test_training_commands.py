@@ -269,6 +269,8 @@ def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest
     zoo_enjoy.enjoy([*watch, "--load-checkpoint", "200"])
     model = run / "rl_model_200_steps.zip"
     write_page(["--model", str(model), "-o", str(tmp_path / "page.html")])
+    other = [*given.split(), "-i", str(model)]
+    assert "was trained with normalize; give it the same setting" in failed(other, capsys)
     model.with_suffix(".vecnormalize.npz").unlink()
     words = "cannot read the statistics of normalize"
     assert words in failed([*watch, "--load-checkpoint", "200"], capsys, zoo_enjoy.main)

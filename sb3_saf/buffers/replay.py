@@ -381,7 +381,7 @@ class TeamReplayBuffer(ReplayBuffer):
         :param env: must be None
         """
         if env is not None:
-            raise ValueError("TeamReplayBuffer does not undo VecNormalize; normalise below CentralizedValueWrapper")
+            raise ValueError("TeamReplayBuffer does not undo VecNormalize; scale observations in the game")
         steps, games = np.divmod(batch_inds, self.n_games)
         slots = self._slots(steps)
         now = {key: array[slots, games] for key, array in self.seen.items()}

@@ -207,7 +207,9 @@ class QPLEX(OffPolicyAlgorithm):
                 "SB3's own buffers store single rows"
             )
         if self._vec_normalize_env is not None:
-            raise ValueError("QPLEX does not train on VecNormalize; normalise below CentralizedValueWrapper")
+            raise ValueError(
+                "QPLEX does not train on VecNormalize, whose statistics change while steps are stored; scale in games"
+            )
 
     def _convert_train_freq(self) -> None:
         """Set rollouts to one step of all games; :meth:`train` decides when updates are due."""

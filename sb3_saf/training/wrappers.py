@@ -174,11 +174,16 @@ def save_normalization(env: VecEnv, model: Path) -> None:
 
 
 def load_normalization(env: VecEnv, model: Path) -> None:
-    """Read the statistics beside a model, if the environment has a VecNormalize."""
-    layer = unwrap_vec_normalize(env)
+    """
+    Read the statistics beside a model, if the environment has a VecNormalize.
+
+    :raises ValueError: if they cannot be read, or if there are some and the environment has none
+    """
+    layer, path = unwrap_vec_normalize(env), model.with_suffix(NORMALIZATION_SUFFIX)
     if layer is None:
+        if path.is_file():
+            raise ValueError(f"{model} was trained with normalize; give it the same setting: -params normalize:True")
         return
-    path = model.with_suffix(NORMALIZATION_SUFFIX)
     try:
         with np.load(path, allow_pickle=False) as arrays:
             load_normalization_statistics(layer, dict(arrays))
