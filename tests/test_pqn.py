@@ -108,6 +108,12 @@ def test_each_rollout_is_learned_from_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert ends[0].tolist() == [[False] * 4, [True] * 4, [False] * 4, [False] * 4]
 
 
+def test_a_batch_is_at_most_the_rollout() -> None:
+    model = make_model(rollout_steps=5, batch_size=1000, n_epochs=2)
+    model.learn(5 * 4 * 3)
+    assert model._n_updates == 2
+
+
 def test_saved_and_exported_teams_act_alike(tmp_path: Path) -> None:
     model = make_model(telling_env(), rollout_steps=4)
     model.learn(40 * 3)
@@ -124,7 +130,6 @@ def test_saved_and_exported_teams_act_alike(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [
-        ({"batch_size": 21}, "at most a rollout, rollout_steps=5 times 4 games, got 21"),
         ({"td_lambda": 1.5}, "td_lambda must be from 0 to 1, got 1.5"),
         ({"rollout_steps": 0}, "rollout_steps must be an integer of at least 1"),
         ({"policy_kwargs": {"memory": "gru"}}, "PQN has neither memory nor a pool"),

@@ -38,7 +38,7 @@ def test_every_entry_builds_and_smoke_learns_one_rollout(algo: str, size: Size) 
     assert type(model.policy) is ALGOS[algo].policy_class
     if size == "smoke":
         before = [parameter.clone() for parameter in model.policy.parameters()]
-        model.learn(1)  # as many steps as a rollout
+        model.learn(getattr(model, "rollout_steps", 1) * env.num_envs)  # a rollout; off-policy one of one step
         assert any(not old.equal(new) for old, new in zip(before, model.policy.parameters(), strict=True))
     env.close()
 

@@ -106,7 +106,7 @@ class PQN(QPLEX):
     :param mixer: ``"vdn"``, ``"qmix"`` or ``"qplex"``; None uses ``policy_kwargs`` (VDN by default)
     :param learning_rate: learning rate, or a schedule of it
     :param rollout_steps: T, steps of each game in a rollout
-    :param batch_size: game steps of a minibatch; the last one of an epoch may be smaller
+    :param batch_size: game steps of a minibatch, at most all of the rollout; the last one of an epoch may be smaller
     :param n_epochs: passes over each rollout
     :param gamma: discount per game step
     :param td_lambda: weight of later values in returns: 0 for those of the next step, 1 for whole rollouts
@@ -178,14 +178,8 @@ class PQN(QPLEX):
             check_count(name, getattr(self, name))
         if not 0 <= self.td_lambda <= 1:
             raise ValueError(f"td_lambda must be from 0 to 1, got {self.td_lambda!r}")
-        n_games = self.n_envs // TeamSpaces.from_observation_space(self.observation_space).n_agents
-        self.buffer_size = self.rollout_steps * n_games  # one rollout
-        if self.batch_size > self.buffer_size:
-            raise ValueError(
-                f"batch_size must be at most a rollout, rollout_steps={self.rollout_steps} times {n_games} games, got "
-                f"{self.batch_size} game steps; lower it, or raise rollout_steps or the number of games"
-            )
-        super()._check_settings()
+        n_agents = TeamSpaces.from_observation_space(self.observation_space).n_agents
+        self.buffer_size = self.rollout_steps * (self.n_envs // n_agents)  # one rollout
 
     def _on_step(self) -> None:
         self._update_exploration_rate()

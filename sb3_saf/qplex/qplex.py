@@ -169,6 +169,10 @@ class QPLEX(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_settings()
+        if self._vec_normalize_env is not None:
+            raise ValueError(
+                "QPLEX does not train on VecNormalize, whose statistics change while steps are stored; scale in games"
+            )
         spaces_ = TeamSpaces.from_observation_space(self.observation_space)
         self.n_agents = spaces_.n_agents
         self.n_games = check_whole_teams(self.n_envs, self.n_agents, "give an environment of whole teams")
@@ -205,10 +209,6 @@ class QPLEX(OffPolicyAlgorithm):
             raise ValueError(
                 f"replay_buffer_class must be TeamReplayBuffer or a subclass of it, got {self.replay_buffer_class}; "
                 "SB3's own buffers store single rows"
-            )
-        if self._vec_normalize_env is not None:
-            raise ValueError(
-                "QPLEX does not train on VecNormalize, whose statistics change while steps are stored; scale in games"
             )
 
     def _convert_train_freq(self) -> None:
