@@ -67,7 +67,9 @@ def test_values_of_stored_steps_are_those_of_rows(mixer: Any) -> None:
     policy = model.policy
     obs: Any = telling_env().reset()
     rows: Any = policy.obs_to_tensor(obs)[0]
-    masks = rows["action_mask"].view(-1, 3, rows["action_mask"].shape[1]) != 0
+    n_actions = rows["action_mask"].shape[1]
+    rows["action_mask"] = th.eye(n_actions)[th.arange(len(rows["action_mask"])) % n_actions]  # one legal action each
+    masks = rows["action_mask"].view(-1, 3, n_actions) != 0
     with th.no_grad():
         expected = greedy_q_tot(policy, rows, policy.own_q_values(rows))[::3]
         values = joint_values(policy, policy.team_steps(rows)._replace(masks=masks))
