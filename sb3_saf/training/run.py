@@ -68,8 +68,12 @@ class SeededEvalCallback(TeamEvalCallback):
     def _evaluate(self) -> bool:
         self.n_evaluations += 1
         self._evaluated_at = team_steps(self.model)
+        best = self.best_mean_reward
         with own_randomness(self._seed + self.n_evaluations, self.model.device):
-            return super()._evaluate()
+            go_on = super()._evaluate()
+        if self.best_mean_reward > best and self.best_model_save_path is not None:
+            save_normalization(self.training_env, Path(self.best_model_save_path, "best_model.zip"))
+        return go_on
 
     def _log(self, result: EvaluationResult) -> None:
         settings = self._settings
@@ -231,18 +235,6 @@ class CheckpointInGameSteps(BaseCallback):
             save_normalization(self.training_env, path)
             if self.verbose > 0:
                 print(f"Saved {path}")
-        return True
-
-
-class _SaveNormalization(BaseCallback):
-    """Save the statistics of VecNormalize for the best model, when it is saved."""
-
-    def __init__(self, model: Path) -> None:
-        super().__init__()
-        self.path = model
-
-    def _on_step(self) -> bool:
-        save_normalization(self.training_env, self.path)
         return True
 
 
@@ -439,9 +431,6 @@ class Training:
                 self._games(of_evaluation, evaluation=True, n_envs=n_games),
                 seed=self.seed,
                 settings=of_evaluation,
-                callback_on_new_best=None
-                if self.folder is None
-                else _SaveNormalization(self.folder / "best_model.zip"),
                 callback_after_eval=options.after_evaluation,
                 best_model_save_path=folder,
                 log_path=folder,
