@@ -156,6 +156,14 @@ MODELS: dict[str, Callable[[], Any]] = {
 }
 
 
+def test_callbacks_of_an_evaluation_are_counted_once(tmp_path: Path) -> None:
+    def new_best() -> TeamEvalCallback:
+        return evaluation(callback_on_new_best=Lightning(-1))
+
+    struck(tmp_path, make(), 20, new_best())
+    assert go_on(tmp_path, make(), new_best()).num_timesteps == WHOLE
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: Path) -> None:
     whole = go_on(tmp_path / "whole", MODELS[name]())

@@ -439,9 +439,8 @@ def resumable_learn(
     :raises CheckpointError: see :func:`resume`; also if another run uses the folder
     :raises NonFiniteError: at NaN or infinity, naming the step, the tensor, and the last valid checkpoint
     """
-    others = list(all_callbacks(callback))
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
-    checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, others, exact, verbose=model.verbose)
+    checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, given, exact, verbose=model.verbose)
     # First, so that data are checked before they are written.
     before: list[BaseCallback] = [FiniteCallback(), GameStepsCallback()] if finite else [GameStepsCallback()]
     checkpoints.store.acquire()
