@@ -54,7 +54,7 @@ class PQNPolicy(QPLEXPolicy):
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden sizes of the Q heads
     :param activation_fn: activation of hidden layers
-    :param optimizer_class: optimizer; Adam is as good as the published RAdam here, and faster
+    :param optimizer_class: optimizer; published is RAdam, whose steps take longer than those of Adam
     :param optimizer_kwargs: its arguments without the learning rate; None for ``fused=True`` of Adam
     :param kwargs: other arguments of :class:`QPLEXPolicy`, and fields of :class:`PQNParts`
     """
@@ -95,8 +95,8 @@ class PQN(QPLEX):
     """
     PQN-VDN: agents' action values whose sum is trained on lambda returns of rollouts of many games.
 
-    It learns where rewards are rare and games are fast, on the environments of :class:`QPLEX`, and explores, predicts
-    and is saved in the same way.
+    It needs many games, and no stored steps of earlier policies. It trains on the environments of :class:`QPLEX`, and
+    explores, predicts and is saved in the same way.
 
     **Units**: ``batch_size`` counts *game steps*, ``rollout_steps`` those of each game. ``total_timesteps`` counts rows
     (game steps times N), as in SB3.
