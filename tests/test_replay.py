@@ -71,6 +71,16 @@ def test_numbers_are_those_of_the_recording(model: PPO, tmp_path: Path) -> None:
     assert sum(step >= 0 for step in run["collected"]) == pytest.approx(recording.episode_returns[0])
 
 
+def test_each_model_has_its_own_discount(model: PPO, tmp_path: Path) -> None:
+    discounts = {"short": 0.5, "long": 1.0}
+    page = replay(
+        dict.fromkeys(discounts, model.policy), make_env(), tmp_path / "page.html", seed=SEED, gamma=discounts
+    )
+    for run, discount in zip(data_of(page)["runs"], discounts.values(), strict=True):
+        recording = record_episodes(model.policy, make_env(), 2, SEED, gamma=discount)
+        np.testing.assert_allclose(unpacked(run["returns"]), recording.returns[:, :3], atol=1e-5)
+
+
 def of(array: Any) -> Any:
     assert array is not None
     return array

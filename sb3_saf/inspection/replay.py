@@ -60,7 +60,7 @@ def replay(
     episodes: int = 1,
     seed: int = 20_000,
     deterministic: bool = False,
-    gamma: float | None = None,
+    gamma: float | Mapping[str, float] | None = None,
 ) -> Path:
     """
     Play episodes and write a page that shows them agent by agent, offline and without a server.
@@ -77,7 +77,7 @@ def replay(
     :param episodes: games to show from their start; a page shows at most 2,000 game steps
     :param seed: seed of games and actions; all models play the same games
     :param deterministic: whether to take the most likely actions
-    :param gamma: discount factor of the returns; None for the model's
+    :param gamma: discount factor of the returns, for all models or by their names; None for the models' own
     :return: the path
     :raises ValueError: if a model was trained on other spaces, there are too few games, or they cannot be shown
     """
@@ -107,7 +107,8 @@ def replay(
             played = _play_actor(player, env, episodes, seed, deterministic)
         else:
             policy = player.policy if isinstance(player, BaseAlgorithm) else player
-            discount = float(getattr(player, "gamma", 1.0)) if gamma is None else gamma
+            given = gamma[name] if isinstance(gamma, Mapping) else gamma
+            discount = float(getattr(player, "gamma", 1.0)) if given is None else given
             recording = record_episodes(policy, env, env.num_envs // n_agents, seed, deterministic, gamma=discount)
             played = [_episode_of(recording, game) for game in range(episodes)]
         for game, episode in enumerate(played):

@@ -73,7 +73,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
             if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
                 raise ValueError("a model with normalize is shown alone: its games are normalised with its statistics")
             load_normalization(games, paths[0])
-            gamma = settings[0].hyperparams.get("gamma", 0.99)
+            gamma = {name: own.hyperparams.get("gamma", 0.99) for name, own in zip(players, settings, strict=True)}
             return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
 
 
