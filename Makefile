@@ -40,10 +40,9 @@ coverage: $(INSTALLED) ## run the tests and print their branch coverage
 bench: $(GRIDWORLDS) ## measure speed beside other gridworlds; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
 
-docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors, and check their links
+docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors
 	@echo "== documentation"
 	@$(RUN) sphinx -b html -W --keep-going -n -q docs build/docs/html
-	@$(RUN) docs.tools.check_links build/docs/html
 
 notebooks: $(INSTALLED) ## run the notebooks with small numbers; whole: .venv/bin/python -m notebooks.execute --full
 	@echo "== notebooks"

@@ -3,8 +3,8 @@ Run the tests with the oldest or the newest releases that setup.cfg allows.
 
 ``python .ci/versions.py oldest`` and ``python .ci/versions.py newest`` make a virtual environment of their own under
 ``build/`` (or ``--folder``) and install the package there with the libraries that it stands on (``LIBRARIES``) at one
-end of their ranges; everything else is as in constraints.txt. They print the versions and run the tests, with
-``--fast`` only those that touch the libraries most (``FAST``). Further arguments go to pytest::
+end of their ranges; everything else is as in constraints.txt. They print the versions and run the tests. Further
+arguments go to pytest::
 
     python .ci/versions.py oldest --python python3.10 -x -k policies
 """
@@ -28,26 +28,6 @@ LIBRARIES: Final = (
 FOLLOWING: Final = (
     *("huggingface-hub", "huggingface-sb3", "llvmlite", "ml-dtypes", "rl-zoo3", "scipy", "setuptools", "shimmy"),
     *("sympy", "triton"),
-)
-#: Tests of what is built on the libraries: kernels, vector environments, policies, buffers, checkpoints, old files.
-FAST: Final = tuple(
-    f"tests/test_{name}.py"
-    for name in (
-        *(
-            "active",
-            "advance",
-            "batch",
-            "centralized",
-            "checkpoints_files",
-            "compilation",
-            "contrib",
-            "evaluation",
-            "game_copies",
-            "import",
-        ),
-        *("make_team_env", "make_vec_env", "monitor", "export", "parallel_env", "policies", "qplex", "same_update"),
-        *("supersuit_vec_env", "team_buffer", "turns"),
-    )
 )
 EXTRAS: Final = "export,render,zoo,dev"
 
@@ -119,7 +99,6 @@ def main() -> None:
     parser.add_argument("end", choices=["oldest", "newest"])
     parser.add_argument("--python", default=sys.executable, help="interpreter, this one by default")
     parser.add_argument("--folder", type=Path, help="of the virtual environment")
-    parser.add_argument("--fast", action="store_true", help="only the tests that touch the libraries most")
     options, pytest_arguments = parser.parse_known_args()
     folder = options.folder or ROOT / "build" / f"venv-{options.end}"
     python = install(options.end, folder, options.python)
@@ -130,7 +109,7 @@ def main() -> None:
     print(*(line for line in listed.stdout.splitlines() if _normal(line) in names), sep="\n")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba")}
     tests: list[str | Path] = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadscope"]
-    tests += [*(FAST if options.fast else ()), *pytest_arguments]
+    tests += pytest_arguments
     sys.exit(subprocess.run(tests, cwd=ROOT, env=environment, check=False).returncode)
 
 

@@ -255,11 +255,6 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         """Treasures collected since the reset: the team's return so far."""
         return int(self._batch.collected[self._game])
 
-    @property
-    def acting_order(self) -> list[int]:
-        """Agent indices in the order in which they acted in the last step."""
-        return self._batch.order[self._game].tolist()
-
     def render(self) -> npt.NDArray[np.uint8] | str | None:
         """
         Show the game.

@@ -9,7 +9,6 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Iterator
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.hooks import RemovableHandle
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
@@ -29,7 +28,7 @@ from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import NonFiniteError, SettingsError
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import TEAM_KEY, TEAM_KEYS
-from sb3_saf.teams.vec_env import agent_names, check_other_games, find_n_agents, require_n_agents
+from sb3_saf.teams.vec_env import agent_names, check_other_games, find_n_agents, layers, require_n_agents
 
 GAME_STEPS_TAG = "time/game_steps"
 GAME_STEPS_PER_SECOND_TAG = "time/game_steps_per_second"
@@ -161,7 +160,7 @@ def copy_normalization(trained: VecEnv, played: VecEnv) -> None:
 
     :raises ValueError: if one is normalised more often than the other
     """
-    sources, targets = (list(_normalizations(env)) for env in (trained, played))
+    sources, targets = ([one for one in layers(env) if isinstance(one, VecNormalize)] for env in (trained, played))
     if not targets and not any(source.norm_obs for source in sources):  # of rewards only
         return
     if len(sources) != len(targets):
@@ -173,13 +172,6 @@ def copy_normalization(trained: VecEnv, played: VecEnv) -> None:
         target.ret_rms = deepcopy(source.ret_rms)
         if source.norm_obs:
             target.obs_rms = deepcopy(source.obs_rms)
-
-
-def _normalizations(env: VecEnv) -> Iterator[VecNormalize]:
-    while isinstance(env, VecEnvWrapper):
-        if isinstance(env, VecNormalize):
-            yield env
-        env = env.venv
 
 
 class TeamEvalCallback(EvalCallback):

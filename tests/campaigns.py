@@ -102,7 +102,7 @@ CAMPAIGNS: Final = (
         1_000,
         "CHECKPOINT_DAMAGES={n}",
     ),
-    _mutated("settings, levels and states, each", "mutated tests/test_mutations.py", 1_000),
+    _mutated("settings and states, each", "mutated tests/test_mutations.py", 1_000),
     Campaign(
         "odd configurations under NUMBA_BOUNDSCHECK",
         f"{PYTEST} tests/test_invariants.py",

@@ -17,7 +17,6 @@ from PIL import Image
 
 import hecogrid_envs
 import sb3_saf
-from docs.tools.check_links import check
 from docs.tools.figures import FIGURES, FOLDER
 from sb3_saf.registration import DECLARATIONS
 from tests.test_first_pages import PAGES as FIRST_PAGES
@@ -194,16 +193,6 @@ def test_parameter_table_is_the_programs() -> None:
     for row in parameter_table():
         paper = "" if row.paper is None else f"{row.paper:,}"
         assert re.search(rf"^\| {row.name} \| {row.counted:,} \| ?{paper} ?\|", page, re.MULTILINE), row.name
-
-
-def test_broken_links_of_a_site_are_found(tmp_path: Path) -> None:
-    (tmp_path / "index.html").write_text(
-        '<p id="here"></p><a href="#here">1</a><a href="#no">2</a><a href="b.html">3</a>'
-    )
-    (tmp_path / "other.html").write_text('<a href="index.html#here">4</a><a href="https://example.org/x">5</a>')
-    found = check(tmp_path)
-    assert found.broken == ["index.html: #no", "index.html: b.html"]
-    assert (found.n_pages, found.n_internal, found.external) == (2, 4, {"https://example.org/x"})
 
 
 def test_citation_is_of_this_version() -> None:

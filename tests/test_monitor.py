@@ -162,14 +162,6 @@ def test_team_size_can_be_told() -> None:
         TeamMonitor(venv)
 
 
-def test_sb3_alone_counts_every_agent_as_an_episode() -> None:
-    """Without our monitor, 5 team episodes are logged as 15."""
-    model = PPO("MlpPolicy", VecMonitor(TeamVenv(lengths=(3, 2))), n_steps=6, batch_size=36, n_epochs=1, device="cpu")
-    model.learn(36)
-    assert model.ep_info_buffer is not None
-    assert len(model.ep_info_buffer) == 15
-
-
 OURS = r"take each of these 6 rows .* team of 3: .* sb3_saf.evaluate_policy .*TeamEvalCallback, and sb3_saf.TeamMonitor"
 
 

@@ -78,18 +78,6 @@ def gather(x: th.Tensor, rows: Rows) -> th.Tensor:
     return x.index_select(0, rows.flatten()).view(*rows.shape, *x.shape[1:])
 
 
-def gather_agents(x: th.Tensor, teams: th.Tensor, agent: th.Tensor) -> th.Tensor:
-    """
-    Return ``x[teams, agent]``, see :func:`gather`.
-
-    :param x: (G, N, *shape)
-    :param teams: (B,) int64
-    :param agent: (B,) int64
-    :return: (B, *shape)
-    """
-    return gather(x.flatten(0, 1), teams * x.shape[1] + agent)
-
-
 class Linear(nn.Linear):
     """
     Linear layer with the gain of its orthogonal initialisation (see :func:`orthogonal_init`).

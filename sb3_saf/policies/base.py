@@ -29,7 +29,7 @@ from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
 from sb3_saf.networks.critic import StateCritic, TeamCritic, ValueNormalizer
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.encoders import ObservationEncoder
-from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather_agents, orthogonal_init
+from sb3_saf.networks.layers import HIDDEN_GAIN, NetworkSpec, gather, orthogonal_init
 from sb3_saf.networks.memory import Memory, MemoryName
 from sb3_saf.networks.row_encoder import Encoded, EncodedRows, joined
 from sb3_saf.policies.memory import Masks, RememberingPolicy, RunningMemory
@@ -391,7 +391,7 @@ class TeamPolicy(RememberingPolicy):
             games = entry_of(obs, STATE_KEY, "the critic").reshape(-1, *(space.shape or ()))
             unique = self.row_encoder.find(games)  # equal states are encoded once
             of_games = self._in_chunks(critic, games[unique.index], space)
-            values = gather_agents(of_games, unique.inverse, self._agent(obs))
+            values = gather(of_games.flatten(0, 1), unique.inverse * of_games.shape[1] + self._agent(obs))
         else:
             values = self.row_encoder.apply(critic, encoded.own, self._agent(obs) if critic.reads_agent else None)
         return self._raw_values(obs, values)

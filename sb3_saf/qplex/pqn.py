@@ -7,13 +7,13 @@ Letters: T steps, E games, N agents.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch import nn
 
 from sb3_saf.buffers.replay import TeamSteps
@@ -25,8 +25,6 @@ from sb3_saf.qplex.policies import QPLEXParts, QPLEXPolicy
 from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import TeamSpaces
-
-SelfPQN = TypeVar("SelfPQN", bound="PQN")
 
 
 @dataclass(frozen=True)
@@ -224,18 +222,6 @@ class PQN(QPLEX):
         self.logger.record("train/loss", every_error.square().mean().item())
         self.logger.record("train/td_error", every_error.abs().mean().item())
         self.logger.record("train/q_tot", (every_error.mean() + returns.mean()).item())
-
-    def learn(
-        self: SelfPQN,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 100,
-        tb_log_name: str = "PQN",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfPQN:
-        """Train as in SB3; ``total_timesteps`` counts rows (game steps times N), ``log_interval`` team episodes."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
 
 def lambda_returns(

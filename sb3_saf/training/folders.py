@@ -32,7 +32,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
@@ -81,8 +80,7 @@ _PACKAGES: Final = (
     *("sb3-saf", "stable-baselines3", "sb3-contrib", "rl_zoo3", "optuna", "torch"),
     *("numpy", "numba", "gymnasium", "pettingzoo", "supersuit"),
 )
-_UUID: Final = r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}"
-_NUMBERED: Final = re.compile(rf"(.+)_(\d+)(?:_{_UUID})?")
+_NUMBERED: Final = re.compile(r"(.+)_(\d+)")
 _SAVED_MODEL: Final = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
@@ -304,12 +302,11 @@ def runs_of(log_folder: Path, algo: str, name: str) -> list[tuple[int, Path]]:
     return sorted((int(match[2]), path) for match, path in numbered if match[1] == name)
 
 
-def make_run_folder(log_folder: Path, algo: str, name: str, *, unique: bool = False) -> Path:
-    """Create the folder of a new run atomically; ``unique`` adds a unique id to its name."""
-    ending = f"_{uuid.uuid4()}" if unique else ""
+def make_run_folder(log_folder: Path, algo: str, name: str) -> Path:
+    """Create the folder of a new run atomically."""
     while True:
         number = max((number for number, _ in runs_of(log_folder, algo, name)), default=0) + 1
-        folder = log_folder / algo / f"{name}_{number}{ending}"
+        folder = log_folder / algo / f"{name}_{number}"
         try:
             folder.mkdir(parents=True)
             return folder

@@ -91,7 +91,6 @@ def _add_what(group: argparse._ArgumentGroup) -> None:
 def _add_run(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--seed", type=int, default=-1, help="0 or larger; -1 draws one")
     group.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="runs are in FOLDER/ALGO/ENV_NUMBER")
-    group.add_argument("-uuid", "--uuid", action="store_true", help="add a unique id to the name of the run's folder")
     group.add_argument(
         "--checkpoint-freq", type=int, help="game steps between checkpoints for --resume, -1 for none; 10 a run"
     )
@@ -158,7 +157,7 @@ def _add_tuning(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--n-jobs", type=at_least(1, -1), default=1, help="trials at once in threads; processes scale better"
     )
-    group.add_argument("--sampler", choices=["random", "tpe", "auto"], default="tpe", help="Optuna's sampler")
+    group.add_argument("--sampler", choices=["random", "tpe"], default="tpe", help="Optuna's sampler")
     group.add_argument("--pruner", choices=["halving", "median", "none"], default="median", help="Optuna's pruner")
     group.add_argument(
         "--optimization-log-path", type=Path, help="folder for evaluations and best model of every trial"
@@ -280,9 +279,7 @@ def _train(options: argparse.Namespace, command: str) -> None:
     with ExitStack() as stack:
         with user_errors(ValueError, OSError):
             if folder is None:
-                folder = make_run_folder(
-                    options.log_folder, settings.algo, settings.environment.folder_name, unique=options.uuid
-                )
+                folder = make_run_folder(options.log_folder, settings.algo, settings.environment.folder_name)
                 stack.callback(_remove_unbegun, folder)
                 write_run(folder, settings.as_dict(), seed, command, deciding)
             if options.track:

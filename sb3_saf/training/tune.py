@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 import socket
@@ -234,13 +233,7 @@ def _make_sampler(tuning: Tuning) -> optuna.samplers.BaseSampler:
     seed = tuning.seed if tuning.storage is None else None
     if tuning.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
-    if tuning.sampler == "tpe":
-        return optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=seed, multivariate=True)
-    try:
-        optunahub = importlib.import_module("optunahub")
-    except ImportError:
-        raise ValueError("--sampler auto needs optunahub: pip install optunahub") from None
-    return optunahub.load_module("samplers/auto_sampler").AutoSampler(seed=seed)
+    return optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=seed, multivariate=True)
 
 
 # --- storages ---------------------------------------------------------------------------------------------------------
