@@ -268,10 +268,11 @@ def other_table(names: Iterable[str]) -> str:
     body = []
     for name in names:
         trained = read(name).tests.query("game_steps > 0")
-        for (task, level), here in trained.groupby(_COLUMNS, sort=False):
+        for (task, trained_at, level), here in trained.groupby(["task", "train_level", "level"], sort=False):
+            setting = f"{task}, {trained_at}" + ("" if level == trained_at else f", tested at {level}")
             returns = here.groupby("method", sort=False)["return_mean"]
             text = "; ".join(f"{WORDS.get(str(method), method)} {of.mean():.1f} ({len(of)})" for method, of in returns)
-            body.append([name, f"{task}, {level}", text])
+            body.append([name, setting, text])
     return table(["experiment", "setting", "returns of 100 (seeds)"], body)
 
 

@@ -36,14 +36,6 @@ def hanabi(**params: Any) -> ParallelEnv[Any, Any, Any]:
     return TurnsInParallel(hanabi_v5.env(**params))
 
 
-def padded(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
-    """Create an environment whose agents have different spaces, padded by SuperSuit."""
-    import supersuit
-
-    env = supersuit.pad_observations_v0(import_module(module).parallel_env(**params))
-    return supersuit.pad_action_space_v0(env)
-
-
 def module_env(module: str, **params: Any) -> ParallelEnv[Any, Any, Any]:
     """Create an environment from a module with ``parallel_env``."""
     return import_module(module).parallel_env(**params)
@@ -86,8 +78,8 @@ ENVIRONMENTS: dict[str, Example] = {
         n_steps=50,
         ppo={**SPREAD, "ent_coef": 0.0},
     ),
-    # A speaker that cannot move and a listener that cannot speak have different spaces, which are padded.
-    "speaker_listener": Example(partial(padded, "mpe2.simple_speaker_listener_v4"), n_steps=50),
+    # A speaker that cannot move and a listener that cannot speak have different spaces.
+    "speaker_listener": Example(partial(module_env, "mpe2.simple_speaker_listener_v4"), n_steps=50),
     "pursuit": Example(partial(module_env, "pettingzoo.sisl.pursuit_v5"), {"max_cycles": 200}, n_games=8),
     # Walkers that fall are removed, the others continue.
     "multiwalker": Example(
