@@ -118,7 +118,9 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--seeds", type=int, nargs="+", default=[], help=f"default: {' '.join(map(str, DEFAULT_SEEDS))}")
     group.add_argument("--methods", nargs="+", default=[], metavar="ALGO", help="default: the experiment's")
     group.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="default: the experiment's")
-    group.add_argument("--levels", nargs="+", default=[], help="on its axes, such as 1 3 5, of training and tests; default: all")
+    group.add_argument(
+        "--levels", nargs="+", default=[], help="on its axes, such as 1 3 5, of training and tests; default: all"
+    )
 
 
 def _add_config(parser: argparse.ArgumentParser) -> None:
