@@ -42,6 +42,9 @@ RAW: Final = ROOT / "results" / "paper"
 PAGES: Final = (ROOT / "results" / "README.md", RAW / "README.md", ROOT / "docs" / "algorithms" / "memory.md")
 #: Tests at other levels than that of the training.
 OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
+#: The same for SAF without its parts, and its methods.
+OTHER_LEVELS_PARTS: Final = "ood-ablation"
+PARTS: Final = ("saf", "saf-no-pool", "saf-paper-no-pool")
 #: The experiments of the grid; others have settings of their own.
 GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
 #: With a GRU, in settings of the grid.
@@ -249,14 +252,14 @@ def losses(tests: pd.DataFrame) -> str:
     return table(["task", *(WORDS[method] for method in MAIN)], body)
 
 
-def settings_table(tests: pd.DataFrame) -> str:
-    """Return the mean return at each level of training and test, with the smallest number of seeds."""
+def settings_table(tests: pd.DataFrame, of: Sequence[str] = MAIN) -> str:
+    """Return the methods' mean returns at each level of training and test, with the smallest number of seeds."""
     body = []
     columns = ["task", "train_coordination", "train_heterogeneity", "coordination", "heterogeneity"]
-    methods = [method for method in (RANDOM, *MAIN) if (tests["method"] == method).any()]
+    methods = [method for method in (RANDOM, *of) if (tests["method"] == method).any()]
     for (task, c, h, test_c, test_h), rows in tests.groupby(columns, sort=False):
         tested = "" if (c, h) == (test_c, test_h) else f", tested at c = {test_c}, h = {test_h}"
-        means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"].isin(MAIN)]
+        means, trained = rows.groupby("method")["return_mean"].mean(), rows[rows["method"].isin(of)]
         cells = [f"{means[method]:.1f}" if method in means else "" for method in methods]
         n_seeds = trained.groupby("method")["seed"].nunique().min()
         body.append([f"{task}, c = {c}, h = {h}{tested}", *cells, str(n_seeds)])
@@ -268,11 +271,10 @@ def other_table(names: Iterable[str]) -> str:
     body = []
     for name in names:
         trained = read(name).tests.query("game_steps > 0")
-        for (task, trained_at, level), here in trained.groupby(["task", "train_level", "level"], sort=False):
-            setting = f"{task}, {trained_at}" + ("" if level == trained_at else f", tested at {level}")
+        for (task, level), here in trained.groupby(_COLUMNS, sort=False):
             returns = here.groupby("method", sort=False)["return_mean"]
             text = "; ".join(f"{WORDS.get(str(method), method)} {of.mean():.1f} ({len(of)})" for method, of in returns)
-            body.append([name, setting, text])
+            body.append([name, f"{task}, {level}", text])
     return table(["experiment", "setting", "returns of 100 (seeds)"], body)
 
 
@@ -415,7 +417,7 @@ def pages() -> dict[Path, str]:
     everything = pd.concat([read(name).tests.assign(block=name) for name in names])
     everything = everything.drop_duplicates([*_RUN, "level"])
     factorial = [name for name in names if name.startswith(FACTORIAL)]
-    others = [name for name in names if name not in (*GRID, MEMORY, *factorial)]
+    others = [name for name in names if name not in (*GRID, MEMORY, OTHER_LEVELS_PARTS, *factorial)]
     frames = grid()
     tests = frames.tests
     unseen = other_levels()
@@ -428,6 +430,7 @@ def pages() -> dict[Path, str]:
         "losses": losses(tests),
         "settings": settings_table(tests),
         "unseen": settings_table(unseen),
+        "unseen_parts": settings_table(read(OTHER_LEVELS_PARTS).tests.query("game_steps > 0"), PARTS),
         "others": other_table(others),
         "factorial": factorial_table(factorial),
         "elsewhere": elsewhere(pd.read_csv(RAW / "other_processor.csv"), everything.query("level == train_level")),
