@@ -191,7 +191,8 @@ class TeamEvalCallback(EvalCallback):
         has one evaluation at most, since the model does not change in it
     :param log_path: folder for ``evaluations.npz``
     :param best_model_save_path: folder for ``best_model.zip``
-    :param deterministic: whether the model takes its most likely actions
+    :param deterministic: whether the model takes its most likely actions; drawn ones take from the random generators
+        of the training, as those of SB3's callback do
     :param render: whether to render the evaluation
     :param verbose: 0 for silence, 1 to print results
     :param warn: warn if ``eval_env`` has no TeamMonitor

@@ -98,6 +98,23 @@ def test_rows_tell_who_is_active_what_is_legal_and_the_state(masks: str, n_cpus:
     env.close()
 
 
+class SilentAtTheEnd(TellingEnv):
+    """Gives no masks after the last step."""
+
+    def _with_masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        return super()._with_masks(infos) if self.agents else infos
+
+
+def test_all_actions_are_legal_after_the_last_step_if_it_tells_nothing() -> None:
+    """The value that follows a time limit is that of the best of them, not of action 0."""
+    env = make_team_env(SilentAtTheEnd, seed=0, time_limit="bootstrap", masks="info", **LIVES)
+    obs: Any = env.reset()
+    for _ in range(5):
+        obs, _, _, infos = env.step(first_legal(obs))
+    last = [info["terminal_observation"]["action_mask"].tolist() for info in infos]
+    assert last == [[1, 0, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1]]
+
+
 def test_whoever_ends_with_the_last_step_is_not_active_after_it() -> None:
     env = telling_env(1, deaths={0: 5}, joins={}, time_limit="bootstrap")
     obs: Any = env.reset()

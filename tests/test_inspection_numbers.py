@@ -31,6 +31,7 @@ def recorded(**changes: Any) -> EpisodeRecording:
         actions=np.zeros((3, 2), dtype=np.int64),
         counted=np.ones((3, 2), dtype=bool),
         rewards=np.array([[1, 0], [2, 0], [4, 8]], dtype=np.float32),
+        team_rewards=np.array([[1.0], [2.0], [12.0]]),
         ends=np.array([[False] * 2, [False] * 2, [True] * 2]),
         last_values=np.zeros((3, 2), dtype=np.float32),
         values=np.zeros((3, 2), dtype=np.float32),

@@ -475,13 +475,13 @@ class Nim(AECEnv[str, Any, Any]):
     metadata: ClassVar[dict[str, Any]] = {"name": "nim_v0", "is_parallelizable": False, "render_modes": []}
     render_mode = None
 
-    def __init__(self, masks: bool = True, dtype: Any = np.int8):
+    def __init__(self, masks: bool = True, dtype: Any = np.int8, mask_name: str = "action_mask"):
         super().__init__()
-        self.masks, self.dtype = masks, dtype
+        self.masks, self.dtype, self.mask_name = masks, dtype, mask_name
         self.possible_agents = ["first", "second"]
         self.moves: list[int] = []
         own = spaces.Box(0, PILE, (2,), np.float32)
-        self._space = spaces.Dict({"observation": own, "action_mask": spaces.Box(0, 1, (3,), dtype)}) if masks else own
+        self._space = spaces.Dict({"observation": own, mask_name: spaces.Box(0, 1, (3,), dtype)}) if masks else own
         self._action_space = spaces.Discrete(3)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -506,7 +506,7 @@ class Nim(AECEnv[str, Any, Any]):
         mine = agent == self.agent_selection
         own = np.array([self.pile, mine], np.float32)
         mask = (np.arange(1, 4) <= self.pile if mine else np.zeros(3)).astype(self.dtype)
-        return {"observation": own, "action_mask": mask} if self.masks else own
+        return {"observation": own, self.mask_name: mask} if self.masks else own
 
     def step(self, action: int | None) -> None:
         if self.terminations[self.agent_selection]:
@@ -575,6 +575,24 @@ def test_who_waits_has_one_action_that_nobody_reads(kwargs: dict[str, Any]) -> N
 
 def test_it_is_a_proper_parallel_env() -> None:
     parallel_api_test(parallel(masks=False), 200)
+
+
+class Teller(Nim):
+    """Tells masks in infos by another of the names that games use."""
+
+    def __init__(self) -> None:
+        super().__init__(masks=False)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed, options)
+        self.infos = {agent: {"avail_actions": np.array([0, 1, 0], np.int8)} for agent in self.agents}
+
+
+def test_masks_have_any_of_their_names() -> None:
+    env = make_team_env(lambda: TurnsInParallel(Teller()), seed=0)
+    assert env.reset()["action_mask"].tolist() == [[0, 1, 0], [1, 0, 0]]
+    env = make_team_env(parallel, seed=0, mask_name="avail_actions")
+    assert env.reset()["action_mask"].tolist() == [[1, 1, 1], [1, 0, 0]]
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"masks": False}])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf import PQN, Actor, LightEncoder, evaluate_team, export_actors, make_team_env
 from sb3_saf.qplex.learning import greedy_q_tot, joint_values
@@ -90,14 +91,22 @@ def test_it_learns_team_support() -> None:
     assert evaluate_team(model, tests, 64).mean > 3.5
 
 
+class StopAtSecondStep(BaseCallback):
+    """Ends the training."""
+
+    def _on_step(self) -> bool:
+        return self.n_calls < 2
+
+
 def test_each_rollout_is_learned_from_once(monkeypatch: pytest.MonkeyPatch) -> None:
     model = make_model(rollout_steps=4, batch_size=8, n_epochs=2)
     model.learn(3 * 4 * 4 * 3)  # three rollouts of 4 steps in 4 games of 3 agents
     assert model._n_updates == 3 * 2 * 2
     assert model._buffer().size() == 0
     before = weights_of(model)
-    model.learn(2 * 4 * 3)  # half a rollout
+    model.learn(4 * 4 * 3, StopAtSecondStep())
     assert weights_of(model) == before
+    assert model._buffer().size() == 2  # the last step is stored, too
     ends: list[th.Tensor] = []
 
     def spy(*parts: Any) -> th.Tensor:
@@ -105,8 +114,8 @@ def test_each_rollout_is_learned_from_once(monkeypatch: pytest.MonkeyPatch) -> N
         return lambda_returns(*parts)
 
     monkeypatch.setattr("sb3_saf.qplex.pqn.lambda_returns", spy)
-    model.learn(2 * 4 * 3)  # games begin anew
-    assert weights_of(model) != before
+    model.learn(1)  # to the end of a rollout; games begin anew
+    assert weights_of(model) != before and model.num_timesteps == 4 * 4 * 3
     assert ends[0].tolist() == [[False] * 4, [True] * 4, [False] * 4, [False] * 4]
 
 

@@ -65,10 +65,25 @@ def test_numbers_are_those_of_the_recording(model: PPO, tmp_path: Path) -> None:
         ("values", recording.values[:, rows]),
         ("returns", recording.returns[:, rows]),
         ("message", (recording.values_without["zero"] - recording.values)[:, rows]),
-        ("rewards", recording.rewards[:, rows].sum(axis=1)),
+        ("rewards", recording.team_rewards[:, 0]),
     ):
         np.testing.assert_allclose(unpacked(run[name]), expected, atol=1e-5, err_msg=name)
     assert sum(step >= 0 for step in run["collected"]) == pytest.approx(recording.episode_returns[0])
+
+
+@pytest.mark.parametrize("team_reward", ["sum", "mean"])
+def test_shared_rewards_count_once(model: PPO, team_reward: Any, tmp_path: Path) -> None:
+    """The return of a team is what the game paid, whatever its agents learn from."""
+    env = make_env(team_reward=team_reward)
+    recording = record_episodes(model.policy, env, 2, SEED)
+    assert recording.episode_returns == pytest.approx(
+        record_episodes(model.policy, make_env(), 2, SEED).episode_returns
+    )
+    assert recording.episode_returns[0] > 0
+    sb3_saf.export_actors(model, tmp_path / "actor")
+    for player in (model, sb3_saf.Actor.load(tmp_path / "actor")):
+        (run,) = data_of(replay(player, env, tmp_path / "page.html", seed=SEED))["runs"]
+        assert unpacked(run["rewards"]).sum() == pytest.approx(sum(step >= 0 for step in run["collected"]))
 
 
 def test_each_model_has_its_own_discount(model: PPO, tmp_path: Path) -> None:

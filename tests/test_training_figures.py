@@ -198,6 +198,7 @@ def test_equivalence_needs_both_bounds_to_be_excluded(differences: list[float], 
     ]
     assert found.p_equivalent == pytest.approx(max(one_sided))
     assert mean_difference([0.0, 0.0, 0.0], margin=0.5).verdict == "equivalent"
+    assert [mean_difference([8.0] * 3, margin=margin).verdict for margin in (0.5, np.nan)] == ["higher", "higher"]
 
 
 def test_pooled_differences_are_over_settings_or_over_seeds() -> None:

@@ -147,9 +147,11 @@ class GameReader:
         if self.rows.n_masked_actions is not None:
             rows[ACTION_MASK_KEY] = np.zeros((len(self.agents), self.rows.n_masked_actions), np.int8)
             for row in np.flatnonzero(flags).tolist():
-                mask = self.mask(observations, infos, self.agents[row], place, is_needed=not over)
-                if mask is not None:
-                    rows[ACTION_MASK_KEY][row] = mask
+                agent = self.agents[row]
+                mask = self.mask(observations, infos, agent, place, is_needed=not over)
+                if over and (mask is None or not mask.any()):  # values of a time limit are those of all its actions
+                    mask = self.conversions[agent].mask(np.ones(sum(self.conversions[agent].action.choices), np.int8))
+                rows[ACTION_MASK_KEY][row] = mask
         if self._state is not None:
             leaf, space = self._state
             try:

@@ -267,7 +267,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return np.array(rows, dtype=raw.dtype, order="C")
 
     def _masks(self, masks: object, active: Array | None, are_last: bool) -> Array:
-        """Check and copy action masks. Inactive rows, and last observations without masks, get action 0."""
+        """Check and copy action masks. Inactive rows get action 0, last observations without masks all actions."""
         rows = np.array(masks, dtype=np.int8)
         idle = np.zeros(len(rows), dtype=bool) if active is None else active.reshape(-1) == 0
         stuck = ~idle & allows_nothing(rows, self.action_space)
@@ -278,7 +278,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"at step {self._n_steps} for agent {row % self.n_agents} of game {row // self.n_agents}; give agents "
                 "that have to wait for their turn one action that does nothing"
             )
-        rows[idle | stuck] = first_choices(self.action_space)
+        rows[stuck] = 1
+        rows[idle] = first_choices(self.action_space)
         return rows
 
     def _complete_infos(self, infos: list[dict[str, Any]], ended: npt.NDArray[np.bool_]) -> list[dict[str, Any]]:

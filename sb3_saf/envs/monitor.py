@@ -63,7 +63,7 @@ class TeamMonitor(TeamVecEnvWrapper):
     ) -> None:
         super().__init__(venv, n_agents)
         #: Factor of the sum of a team's rewards.
-        self._share = 1.0 if team_return == "sum" else 1.0 / self.n_agents
+        self.share_of_sum = 1.0 if team_return == "sum" else 1.0 / self.n_agents
         #: Whether every agent is given the whole reward of its team.
         self.shares_reward = team_return == "mean"
         columns = sorted(_COLUMNS.intersection(info_keywords))
@@ -136,7 +136,7 @@ class TeamMonitor(TeamVecEnvWrapper):
                 stacklevel=4,
             )
         episode: dict[str, Any] = {
-            "r": float(self._returns[game].sum() * self._share),
+            "r": float(self._returns[game].sum() * self.share_of_sum),
             "l": int(self._lengths[game]),
             "t": round(time.time() - self.t_start, 6),
             **{key: of_episode.get(key) for key in self.info_keywords},
@@ -263,6 +263,8 @@ class SharedReward(TeamVecEnvWrapper):
     def __init__(self, venv: VecEnv, team_reward: Literal["sum", "mean"]) -> None:
         super().__init__(venv)
         self.team_reward = team_reward
+        #: Factor of the sum of a team's rewards.
+        self.share_of_sum = 1.0 / self.n_agents if team_reward == "sum" else 1.0
 
     def step_wait(self) -> VecEnvStepReturn:
         """Wait for the step of all games; rewards (B,) are equal within a team."""

@@ -12,7 +12,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.conversions import turn_based_aec_to_parallel
 
-ACTION_MASK: Final = "action_mask"
+from sb3_saf.teams.conversion import ACTION_MASK, MASK_NAMES
 
 #: Upper limit for seeds of OpenSpiel's generators and NumPy's older one.
 _SEEDS: Final = 2**31
@@ -24,8 +24,8 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
 
     At each step one agent moves. All others have one legal action, 0, which is ignored; their mask allows nothing else,
     so that they learn nothing from it. The mask is where the game has it, in observations of the form {"observation",
-    "action_mask"}; a game without masks gets them in ``infos[agent]["action_mask"]``, with all actions legal for the
-    agent that moves.
+    "action_mask"} or in infos; a game without masks gets them in ``infos[agent]["action_mask"]``, with all actions
+    legal for the agent that moves.
 
     ::
 
@@ -74,11 +74,14 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
         """Return observations and infos with the mask of each agent; the game's own dicts are unchanged."""
         shown, told = dict(observations), {agent: dict(info) for agent, info in infos.items()}
         for agent, observation in observations.items():
-            if isinstance(observation, Mapping) and ACTION_MASK in observation:
-                shown[agent] = {**observation, ACTION_MASK: self._mask(agent, observation[ACTION_MASK])}
+            given = observation if isinstance(observation, Mapping) else {}
+            key = next((name for name in MASK_NAMES if name in given), None)
+            if key is not None:
+                shown[agent] = {**given, key: self._mask(agent, given[key])}
             else:
                 own = told.setdefault(agent, {})
-                own[ACTION_MASK] = self._mask(agent, own.get(ACTION_MASK))
+                key = next((name for name in MASK_NAMES if own.get(name) is not None), ACTION_MASK)
+                own[key] = self._mask(agent, own.get(key))
         return shown, told
 
     def _mask(self, agent: Any, mask: Any) -> npt.NDArray[Any]:

@@ -376,7 +376,8 @@ def mean_difference(differences: Sequence[float] | Floats, noise: float = 0.0, m
         return Difference(Estimate(mean, np.nan, np.nan), np.nan, np.nan, n)
     error = max(float(sample.std(ddof=1)), noise) / np.sqrt(n)
     if error == 0:
-        return Difference(Estimate(mean, mean, mean), float(mean == 0), float(abs(mean) >= margin), n)
+        p_equivalent = np.nan if np.isnan(margin) else float(abs(mean) >= margin)
+        return Difference(Estimate(mean, mean, mean), float(mean == 0), p_equivalent, n)
     half = float(stats.t.ppf(0.975, n - 1)) * error
     p = 2 * float(stats.t.sf(abs(mean) / error, n - 1))
     p_equivalent = float(stats.t.sf((margin - abs(mean)) / error, n - 1))

@@ -49,7 +49,7 @@ from sb3_saf.qplex.policies import QPLEXPolicy, State
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTIVE_KEY, EPISODE_START_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED, TerminalRow
-from sb3_saf.teams.vec_env import require_n_agents
+from sb3_saf.teams.vec_env import require_n_agents, share_of_sum
 
 Tensors = dict[str, th.Tensor]
 #: Policies of this package.
@@ -295,6 +295,7 @@ class EpisodeRecording(NamedTuple):
     :param action_probabilities: (T, B, A); None unless actions are Discrete
     :param counted: (T, B) whether the row counts
     :param rewards: (T, B) rewards from which the critic learns
+    :param team_rewards: (T, E) rewards of the teams, as in their returns
     :param ends: (T, B) whether the episode ended with this step, or the agent was bootstrapped before its team
     :param last_values: (T, B) value of the last observation at a time limit that is no true end, else 0
     :param values: (T, B)
@@ -318,6 +319,7 @@ class EpisodeRecording(NamedTuple):
     actions: npt.NDArray[Any]
     counted: Bools
     rewards: Floats
+    team_rewards: Doubles
     ends: Bools
     last_values: Floats
     values: Floats
@@ -396,7 +398,7 @@ class _Recorder:
         self, env: VecEnv, reader: PolicyReader | QReader, normalizer: VecNormalize | None, observations: bool
     ) -> None:
         self.env, self.reader, self.normalizer, self.keeps_observations = env, reader, normalizer, observations
-        self.n_agents = require_n_agents(env)
+        self.n_agents, self.share_of_sum = require_n_agents(env), share_of_sum(env)
         n_games = env.num_envs // self.n_agents
         self.returns_now, self.lengths_now = np.zeros(n_games), np.zeros(n_games, dtype=np.int64)
         self.returns: list[float] = []
@@ -439,6 +441,8 @@ class _Recorder:
         rewards = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
         if of_team:  # the team's reward, in each of its rows
             rewards = np.repeat(rewards.reshape(-1, n_agents).sum(axis=1), n_agents)
+        of_teams = raw.reshape(-1, n_agents).sum(axis=1, dtype=np.float64) * self.share_of_sum
+        columns["team_rewards"].append(of_teams)
         columns["counted"].append(counted)
         columns["rewards"].append(rewards)
         columns["ends"].append(step.dones)
@@ -446,7 +450,7 @@ class _Recorder:
         if self.keeps_observations:
             columns["observations"].append(np.array(step.observations[OBS_KEY]))
         finished = step.ended & counted.reshape(-1, n_agents).any(axis=1)
-        self.returns_now += raw.reshape(-1, n_agents).sum(axis=1, dtype=np.float64)
+        self.returns_now += of_teams
         self.lengths_now += 1
         self.returns += self.returns_now[finished].tolist()
         self.lengths += self.lengths_now[finished].tolist()

@@ -30,7 +30,7 @@ from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, rec
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.rows import ACTION_MASK_KEY, EPISODE_START_KEY, OBS_KEY, TeamSpaces
-from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents
+from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents, share_of_sum
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
 MAX_STEPS: Final = 2000
@@ -172,10 +172,10 @@ def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
 
     assert recording.observations is not None
     zero = recording.values_without.get("zero")
-    actions, rewards = recording.actions[steps, rows], recording.rewards[steps, rows]
+    actions = recording.actions[steps, rows]
     return _Episode(
         actions,
-        (rewards[:, 0] if recording.of_team else rewards.sum(axis=1)).astype(np.float64),
+        recording.team_rewards[steps, game],
         recording.observations[steps, rows],
         recording.pictures[steps] if game == 0 else [],
         {
@@ -222,7 +222,7 @@ def _play_actor(actor: Actor, env: VecEnv, episodes: int, seed: int, determinist
         length = next(number for number, step in enumerate(steps, 1) if step.ended[game])
         episode = steps[: min(length, MAX_STEPS)]
         actions = np.stack([step.actions[rows] for step in episode])
-        rewards = np.array([float(step.rewards[rows].sum()) for step in episode])
+        rewards = np.array([float(step.rewards[rows].sum()) for step in episode]) * share_of_sum(env)
         observations = np.stack([step.observations[OBS_KEY][rows] for step in episode])
         pictures = frames[: len(episode)] if game == 0 else []
         played.append(_Episode(actions, rewards, observations, pictures, {"actions": _packed(actions, "u1")}))

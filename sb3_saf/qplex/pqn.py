@@ -7,13 +7,13 @@ Letters: T steps, E games, N agents.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from torch import nn
 
 from sb3_saf.buffers.replay import TeamSteps
@@ -25,6 +25,8 @@ from sb3_saf.qplex.policies import QPLEXParts, QPLEXPolicy
 from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import TeamSpaces
+
+SelfPQN = TypeVar("SelfPQN", bound="PQN")
 
 
 @dataclass(frozen=True)
@@ -174,10 +176,25 @@ class PQN(QPLEX):
     def _check_settings(self) -> None:
         for name in ("rollout_steps", "n_epochs", "batch_size"):
             check_count(name, getattr(self, name))
+        self._check_ranges()
         if not 0 <= self.td_lambda <= 1:
             raise ValueError(f"td_lambda must be from 0 to 1, got {self.td_lambda!r}")
         n_agents = TeamSpaces.from_observation_space(self.observation_space).n_agents
         self.buffer_size = self.rollout_steps * (self.n_envs // n_agents)  # one rollout
+
+    def learn(
+        self: SelfPQN,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 100,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPQN:
+        """Train as :meth:`QPLEX.learn`, until the end of a rollout, as SB3's PPO does."""
+        begun, rows = 0 if reset_num_timesteps else self.num_timesteps, self.rollout_steps * self.n_envs
+        whole = -(-(begun + total_timesteps) // rows) * rows - begun
+        return super().learn(whole, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _on_step(self) -> None:
         self._update_exploration_rate()

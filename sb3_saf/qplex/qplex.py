@@ -200,6 +200,7 @@ class QPLEX(OffPolicyAlgorithm):
             if isinstance(value, tuple):
                 raise ValueError(f"{name} must be a number of game steps, got {value!r}")
             check_count(name, value)
+        self._check_ranges()
         if self.batch_size > self.buffer_size:
             raise ValueError(
                 f"batch_size must be at most buffer_size, got {self.batch_size} and {self.buffer_size} game steps; "
@@ -210,6 +211,20 @@ class QPLEX(OffPolicyAlgorithm):
                 f"replay_buffer_class must be TeamReplayBuffer or a subclass of it, got {self.replay_buffer_class}; "
                 "SB3's own buffers store single rows"
             )
+
+    def _check_ranges(self) -> None:
+        """Raise ValueError for numbers with which nothing is learned."""
+        shares = "gamma", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps"
+        ranges = {
+            **{name: (0 <= getattr(self, name) <= 1, "from 0 to 1") for name in shares},
+            "tau": (0 < self.tau <= 1, "above 0 and at most 1"),
+            "max_grad_norm": (self.max_grad_norm > 0, "above 0"),
+            "learning_starts": (self.learning_starts >= 0, "at least 0"),
+            "gradient_steps": (self.gradient_steps >= 1 or self.gradient_steps == -1, "at least 1, or -1"),
+        }
+        for name, (is_right, words) in ranges.items():
+            if not is_right:
+                raise ValueError(f"{name} must be {words}, got {getattr(self, name)!r}")
 
     def _convert_train_freq(self) -> None:
         """Set rollouts to one step of all games; :meth:`train` decides when updates are due."""
@@ -326,8 +341,7 @@ class QPLEX(OffPolicyAlgorithm):
         dones = team_dones(dones, self.n_agents, alone=True).repeat(self.n_agents)
         self.num_timesteps += env.num_envs
         callback.update_locals(locals())
-        if not callback.on_step():
-            return RolloutReturn(self.n_games, 0, continue_training=False)
+        goes_on = callback.on_step()
         self._update_info_buffer(infos, dones)
         keys = [key for key in _STORED_KEYS if key in new_obs]
         after = {key: new_obs[key] for key in keys}
@@ -340,6 +354,8 @@ class QPLEX(OffPolicyAlgorithm):
         starts = self._last_episode_starts
         replay_buffer.add(self._last_obs, after, actions, rewards, dones, infos, episode_starts=starts)
         self._last_obs, self._last_episode_starts = new_obs, dones
+        if not goes_on:  # stored all the same: training may go on from here
+            return RolloutReturn(self.n_games, 0, continue_training=False)
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._on_step()
         n_episodes = int(np.count_nonzero(dones)) // self.n_agents

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from numbers import Integral
@@ -196,6 +197,16 @@ def shares_reward(venv: VecEnv) -> bool:
     """
     found: list[Any] = [layer for layer in layers(venv) if _has_own(layer, "shares_reward")]
     return any(layer.shares_reward for layer in found)
+
+
+def share_of_sum(venv: VecEnv) -> float:
+    """
+    Return the factor that makes the sum of a team's rewards, which may repeat its reward for each agent, its return.
+
+    Layers with an attribute ``share_of_sum`` say so: ``TeamMonitor`` and ``SharedReward``.
+    """
+    found: list[Any] = [layer for layer in layers(venv) if _has_own(layer, "share_of_sum")]
+    return math.prod(layer.share_of_sum for layer in found)
 
 
 def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
