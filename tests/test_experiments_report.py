@@ -239,6 +239,25 @@ def test_published_results_of_other_games_are_left_out(folder: Path) -> None:
     assert set(beside(mine, theirs).tests["method"]) == {"mine", "saf", "ippo", "random"}
     others = Frames(theirs.tests.assign(max_return=100), theirs.curves)
     assert set(beside(mine, others).tests["method"]) == {"mine"}
+    others = Frames(theirs.tests.assign(game="larger grid"), theirs.curves)
+    assert set(beside(mine, others).tests["method"]) == {"mine"}
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_published_trainings_with_other_settings_have_names_of_their_own(folder: Path, told: bool) -> None:
+    published = read_results(folder, "coordination")
+    mine = Frames(published.tests[published.tests["seed"] == 0], published.curves[published.curves["seed"] == 0])
+    assert set(beside(mine, published).tests["method"]) == {"saf", "ippo", "random"}
+    tests = published.tests.drop(columns="training")
+    saf = tests["method"] == "saf"
+    theirs = Frames(
+        tests.assign(training=published.tests["training"].mask(saf, "other")) if told else tests, published.curves
+    )
+    both = beside(mine, theirs)
+    counts = both.tests.groupby("method")["seed"].nunique().to_dict()
+    names = {"saf": 1, "saf (published)": 2, "random": 2}
+    assert counts == names | ({"ippo": 2} if told else {"ippo": 1, "ippo (published)": 2})
+    assert set(both.curves["method"]) == set(counts) - {"random"}
 
 
 def test_aggregates_compare_like_with_like() -> None:

@@ -148,7 +148,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "MaskablePPO": masked,
     "QPLEX": qplex,
     "QPLEX with memory": lambda: qplex(memory="lstm", sequence_length=4, burn_in=2),
-    "PQN": lambda: make(algorithm=PQN, policy="PQNPolicy", rollout_steps=6, batch_size=8),
+    "PQN": lambda: make(algorithm=PQN, policy="PQNPolicy", rollout_steps=8, batch_size=8),
     "VecNormalize": normalised,
     "PPO with memory": lambda: make(
         rollout_buffer_class=sb3_saf.TeamRolloutBuffer, policy_kwargs=LIGHT | {"memory": "lstm", "memory_size": 8}

@@ -9,6 +9,8 @@ has one row per cell and test level:
 ``train_...``, one column each       parameters of these levels, such as ``train_coordination``, ``coordination``
 ``seed``                             of the run
 ``n_agents``, ``max_return``         N; the largest possible team return, if known
+``game``, ``training``               of parameters of the games beside the level, and of other settings: equal for equal
+                                     ones
 ``game_steps``, ``best_game_steps``  of the training, 0 for a random team; until the best policy of the evaluations
 ``episodes``, ``actions``            of the test, and whether they are drawn, as in training, or the most likely ones
 ``return_mean``, ``return_low``,     absolute metric: mean team return of the best policy, with its 95 % interval over
@@ -36,9 +38,11 @@ test with both bounds (TOST, 5 %) excludes 2 % of the largest return. Other diff
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -61,6 +65,8 @@ RUNS: Final = "runs.csv"
 CURVES: Final = "curves.csv"
 #: Largest page of an episode that is published with a team.
 _PAGE_BYTES: Final = 300_000
+#: Settings of a run that are not of its training, or have a column of their own.
+_OF_GAMES: Final = frozenset({"algo", "env", "env_kwargs", "n_agents", "size", "game_steps"})
 
 
 class Frames(NamedTuple):
@@ -85,7 +91,8 @@ def read_results(folder: str | Path, name: str) -> Frames:
             if not all(path.is_file() for path in paths):
                 continue
             try:
-                tests, curves = (pd.read_csv(path, float_precision="round_trip") for path in paths)
+                digests = {"game": str, "training": str}
+                tests, curves = (pd.read_csv(path, float_precision="round_trip", dtype=digests) for path in paths)
                 require_columns(tests, ("method", "task", "train_level", "level", "seed", "return_mean", "score"))
             except ValueError as error:
                 raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
@@ -105,19 +112,26 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
     Return results with published ones beside them.
 
     :param ours: results, whose cells take precedence
-    :param theirs: published results; only those on the same games (task, level, agents, largest return) and of
-        trainings of the same length are taken
+    :param theirs: published results; only those on the same games (task, level, agents, largest return, parameters) and
+        of trainings of the same length are taken. A method that was trained with other settings than ours of its name,
+        or does not tell them, is ``NAME (published)``
     """
-    rows, here = theirs.tests, ours.tests
-    games = "task", "level", "n_agents", "max_return"
-    same_games = keys_of(rows.fillna({"max_return": -1}), *games).isin(keys_of(here.fillna({"max_return": -1}), *games))
+    here, games = ours.tests, ["task", "level", "n_agents", "max_return"]
+    games += ["game"] if "game" in theirs.tests else []  # older ones do not tell
+    rows, known = (tests.fillna({"max_return": -1}) for tests in (theirs.tests, here))
+    same_games = keys_of(rows, *games).isin(keys_of(known, *games))
+    rows = theirs.tests[same_games & rows["game_steps"].isin({0, *here["game_steps"]})]
+    rows = rows.assign(training=rows.get("training", "not told"))
+    differs = rows["method"].isin(here["method"]) & (rows["method"] != RANDOM)
+    differs &= ~keys_of(rows, "method", "training").isin(keys_of(here, "method", "training"))
+    other = {method: f"{method} (published)" for method in rows["method"][differs]}
+    rows, their_curves = (table.assign(method=table["method"].replace(other)) for table in (rows, theirs.curves))
     names = "method", "task", "train_level", "level", "seed"
-    is_new = ~keys_of(rows, *names).isin(keys_of(here, *names))
-    tests = rows[same_games & is_new & rows["game_steps"].isin({0, *here["game_steps"]})]
+    tests = rows[~keys_of(rows, *names).isin(keys_of(here, *names))]
     if tests.empty:
         return ours
-    of_curves = keys_of(theirs.curves, "method", "task", "level", "seed")
-    curves = theirs.curves[of_curves.isin(keys_of(tests, "method", "task", "train_level", "seed"))]
+    of_curves = keys_of(their_curves, "method", "task", "level", "seed")
+    curves = their_curves[of_curves.isin(keys_of(tests, "method", "task", "train_level", "seed"))]
     together, all_curves = (pd.concat(pair, ignore_index=True) for pair in ((here, tests), (ours.curves, curves)))
     return Frames(_scored(together)[list(here)], all_curves)
 
@@ -162,15 +176,19 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
         evaluation, cost = test.evaluation, run.finished()
         low, high = evaluation.interval()
         means = {(play.policy, play.actions): play.evaluation.mean for play in test.plays}
-        actions, versions = test.plays[0].actions, run.description["versions"]
+        actions, versions, settings = test.plays[0].actions, run.description["versions"], run.description["settings"]
         yield {
             **{"method": cell.method, "task": cell.task, "train_level": cell.level.slug, "level": level.slug},
             **{f"train_{name}": value for name, value in cell.level.parameters},
             **level.env_kwargs,
             "n_agents": test.n_agents,
             "max_return": test.max_return,
+            "game": _digest(
+                {key: value for key, value in settings["env_kwargs"].items() if key not in level.env_kwargs}
+            ),
+            "training": _digest({key: value for key, value in settings.items() if key not in _OF_GAMES}),
             "seed": cell.seed,
-            "game_steps": int(run.description["settings"].get("game_steps", 0)),
+            "game_steps": int(settings.get("game_steps", 0)),
             "best_game_steps": best_game_steps(run.folder) if cell.is_trained else 0,
             "episodes": len(evaluation.returns),
             "actions": actions,
@@ -192,6 +210,11 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
             "processor": versions.get("processor", ""),
             "cell": cell.id,
         }
+
+
+def _digest(settings: Mapping[str, Any]) -> str:
+    """Return letters and digits that are equal for equal settings."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def best_game_steps(folder: Path) -> int:
