@@ -60,11 +60,12 @@ _KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_co
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000),
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
+    Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000),
     *(Task(f"overcooked/{layout}", 5_000_000, params=("reward_shaping_steps:2500000",)) for layout in _KITCHENS),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     *(
         Task(f"smax/{battle}", 10_000_000, settings=("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0"))
-        for battle in ("2s3z", "3s_vs_5z", "5m_vs_6m")
+        for battle in ("2s3z", "3s5z", "3s_vs_5z", "5m_vs_6m", "smacv2_5_units")
     ),
 )
 
