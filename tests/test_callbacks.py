@@ -61,6 +61,12 @@ def ppo(env: VecEnv | None = None, **settings: Any) -> PPO:
     return PPO("SAFPolicy", env or games(), rollout_buffer_class=buffer, **{**defaults, **settings})
 
 
+def undiscounted(model: QPLEX) -> QPLEX:
+    """Return the model with a discount that makes its targets NaN."""
+    model.gamma = float("nan")
+    return model
+
+
 CAUSES: dict[str, tuple[Any, str]] = {
     "loss": (lambda: ppo(ent_coef=float("nan")), r"the gradient of \S+ must be finite, got nan at game step 12, .*"),
     "reward": (
@@ -76,9 +82,7 @@ CAUSES: dict[str, tuple[Any, str]] = {
         "returns of the rollout must be finite, got inf at game step 12, after 0 steps of the optimizer.*",
     ),
     "values of QPLEX": (
-        lambda: QPLEX(
-            "QPLEXPolicy", games(), gamma=float("nan"), learning_starts=6, batch_size=4, train_freq=6, seed=0
-        ),
+        lambda: undiscounted(QPLEX("QPLEXPolicy", games(), learning_starts=6, batch_size=4, train_freq=6, seed=0)),
         r"the gradient of \S+ must be finite, got nan at game step 12.*",
     ),
 }
