@@ -120,7 +120,7 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
             if here.empty:
                 continue
             won = "" if here["success_rate"].isna().any() else f", {here['success_rate'].mean():.0%} won"
-            cells = [f"`{task.env_id}`", f"{here['game_steps'].max():,}", NAMED[method].words]
+            cells = [f"`{task.env_id}`", f"{here['game_steps'].max():,}", NAMED[method].words.partition(",")[0]]
             cells += [
                 f"**{_over_seeds(here['return_mean'])}**{won}",
                 "; ".join(others),
