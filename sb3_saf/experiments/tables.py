@@ -9,8 +9,7 @@ has one row per cell and test level:
 ``train_...``, one column each       parameters of these levels, such as ``train_coordination``, ``coordination``
 ``seed``                             of the run
 ``n_agents``, ``max_return``         N; the largest possible team return, if known
-``game``, ``training``               of parameters of the games beside the level, and of other settings: equal for equal
-                                     ones
+``game``, ``training``               digests: of the games' parameters that are not of the level, of all other settings
 ``game_steps``, ``best_game_steps``  of the training, 0 for a random team; until the best policy of the evaluations
 ``episodes``, ``actions``            of the test, and whether they are drawn, as in training, or the most likely ones
 ``return_mean``, ``return_low``,     absolute metric: mean team return of the best policy, with its 95 % interval over

@@ -7,13 +7,13 @@ Letters: T steps, E games, N agents.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch import nn
 
 from sb3_saf.buffers.replay import TeamSteps
@@ -25,8 +25,6 @@ from sb3_saf.qplex.policies import QPLEXParts, QPLEXPolicy
 from sb3_saf.qplex.qplex import QPLEX
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import TeamSpaces
-
-SelfPQN = TypeVar("SelfPQN", bound="PQN")
 
 
 @dataclass(frozen=True)
@@ -182,19 +180,10 @@ class PQN(QPLEX):
         n_agents = TeamSpaces.from_observation_space(self.observation_space).n_agents
         self.buffer_size = self.rollout_steps * (self.n_envs // n_agents)  # one rollout
 
-    def learn(
-        self: SelfPQN,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 100,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfPQN:
-        """Train as :meth:`QPLEX.learn`, until the end of a rollout, as SB3's PPO does."""
-        begun, rows = 0 if reset_num_timesteps else self.num_timesteps, self.rollout_steps * self.n_envs
-        whole = -(-(begun + total_timesteps) // rows) * rows - begun
-        return super().learn(whole, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+    def _rows_until(self, begun: int, total_timesteps: int) -> int:
+        """Return the rows to the end of a rollout, to which SB3's PPO trains, too."""
+        rows = self.rollout_steps * self.n_envs
+        return -(-(begun + total_timesteps) // rows) * rows - begun
 
     def _on_step(self) -> None:
         self._update_exploration_rate()

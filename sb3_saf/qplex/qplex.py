@@ -429,8 +429,13 @@ class QPLEX(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfQPLEX:
         """Train as in SB3; ``total_timesteps`` counts rows (game steps times N), ``log_interval`` team episodes."""
+        rows = self._rows_until(0 if reset_num_timesteps else self.num_timesteps, total_timesteps)
         name = tb_log_name or type(self).__name__
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+        return super().learn(rows, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
+    def _rows_until(self, begun: int, total_timesteps: int) -> int:
+        """Return the rows to train on, after ``begun`` of them."""
+        return total_timesteps
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
