@@ -318,7 +318,7 @@ def elsewhere(trainings: pd.DataFrame, here: pd.DataFrame) -> str:
         table(["experiment", "setting", "processor", "returns of 100"], body)
         + f"\n\n{len(both)} more ({blocks}) have the seeds of trainings in the tables: their returns are "
         f"{apart.mean():+.1f} on average from those, {apart.min():+.1f} to {apart.max():+.1f}. Two seeds of a setting "
-        f"are within {limit:.1f} in 95 of 100 cases ({len(variances)} settings and methods with five seeds, "
+        f"are within {limit:.1f} in 95 of 100 cases ({len(variances)} settings and methods with five seeds or more, "
         f"{', '.join(sorted(set(alike['task'])))}); {(apart.abs() <= limit).sum()} of the {len(both)} are."
     )
 
