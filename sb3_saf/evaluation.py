@@ -138,8 +138,10 @@ class RandomPolicy:
     def __init__(
         self, action_space: spaces.Space[Any] | VecEnv | ParallelEnv[Any, Any, Any], seed: int | None = None
     ) -> None:
+        joint: Any = None
         if not isinstance(action_space, spaces.Space):
             env: Any = action_space
+            joint = getattr(env, "observation_space", None)
             action_space = getattr(env, "action_space", None)
             if callable(action_space) and (agents := getattr(env, "possible_agents", None)):  # PettingZoo's
                 action_space = action_space(agents[0])
@@ -155,6 +157,13 @@ class RandomPolicy:
                 f"the action space must be Discrete, MultiDiscrete, MultiBinary or Box, got {action_space}"
             )
         self.action_space = action_space
+        #: (N, ...), bounds of the agents' own Box actions.
+        self._bounds: tuple[Array, Array] | None = None
+        agents = joint.spaces.get(AGENT_KEY) if isinstance(joint, spaces.Dict) else None
+        conversions = getattr(agents, "conversions", None)
+        if isinstance(action_space, spaces.Box) and conversions is not None:
+            low, high = zip(*(one.action_bounds for one in conversions), strict=True)
+            self._bounds = np.stack(low), np.stack(high)
         self._rng = np.random.default_rng(seed)
 
     def predict(
@@ -182,6 +191,8 @@ class RandomPolicy:
         if masks is not None:
             return self._draw_legal(np.asarray(masks)), state
         rows = observation[AGENT_KEY] if isinstance(observation, dict) else observation
+        if self._bounds is not None and isinstance(observation, dict):
+            return self._draw_box(*(bound[rows] for bound in self._bounds)), state
         return self._draw(len(rows)), state
 
     def _draw_legal(self, masks: Array) -> Array:
@@ -206,9 +217,14 @@ class RandomPolicy:
         if isinstance(space, spaces.MultiBinary):
             return rng.integers(0, 2, size=shape).astype(space.dtype)
         assert isinstance(space, spaces.Box)
-        if space.dtype is not None and space.dtype.kind in "iu":
-            return rng.integers(space.low, space.high, size=shape, endpoint=True, dtype=space.dtype)
-        return rng.uniform(space.low, space.high, size=shape).astype(space.dtype)
+        return self._draw_box(*(np.broadcast_to(bound, shape) for bound in (space.low, space.high)))
+
+    def _draw_box(self, low: Array, high: Array) -> Array:
+        """Draw actions between bounds (B, ...)."""
+        dtype = self.action_space.dtype
+        if dtype is not None and dtype.kind in "iu":
+            return self._rng.integers(low, high, endpoint=True, dtype=dtype)
+        return self._rng.uniform(low, high).astype(dtype)
 
 
 class PlayedStep(NamedTuple):

@@ -228,12 +228,12 @@ def test_pictures_of_every_form_are_scaled_alike(
 
 
 def test_wide_integers_are_scaled() -> None:
-    low, high = np.array([0, -500, 0, 0]), np.array([255, 1000, 16, 2**40])
+    low, high = np.array([0, -500, 0, 0]), np.array([255, 100_000, 16, 2**40])
     wide, vector = spaces.Box(low, high, dtype=np.int64), spaces.Box(-1, 1, (4,), np.float32)
     encoder, expected = ObservationEncoder(wide), ObservationEncoder(vector)
     encoder.load_state_dict(expected.state_dict())
-    x = np.array([[51, -250, 3, 7], [255, 1000, 16, 0]])
-    scaled = (x / [255, 1000, 1, 1]).astype(np.float32)
+    x = np.array([[51, -250, 3, 7], [255, 100_000, 16, 0]])
+    scaled = (x / [255, 100_000, 1, 1]).astype(np.float32)
     th.testing.assert_close(outputs(encoder, x, wide), expected(th.tensor(scaled)), rtol=0, atol=1e-6)
     narrow = ObservationEncoder(spaces.Box(0, 9, (4,), np.int64))
     narrow.load_state_dict(expected.state_dict())
@@ -242,7 +242,7 @@ def test_wide_integers_are_scaled() -> None:
 
 def test_bytes_beside_a_picture_are_scaled() -> None:
     bounds = np.zeros(50), np.array([255] * 48 + [255, 1])
-    space = PartsSpace(spaces.Box(*bounds, dtype=np.float64), (Part(0, 48, (4, 4, 3)), Part(48, 50, None)))
+    space = PartsSpace(spaces.Box(*bounds, dtype=np.float64), (Part(0, 48, spaces.Box(0, 255, (4, 4, 3), np.uint8)),))
     encoder: Any = ObservationEncoder(space)
     assert encoder.encoder.rest.divisor.tolist() == [255, 1]
 

@@ -306,7 +306,7 @@ def test_agents_of_any_name_keep_their_own_memory_while_they_play(names: Any, tm
         turned = {agent: observations[agent] for agent in reversed(game.agents)}
         expected, state = model.predict(turned, state, deterministic=True)
         acted = actor.act(turned, memory=memory)
-        assert acted == {agent: pytest.approx(action, abs=1e-5) for agent, action in expected.items()}
+        assert acted == {agent: pytest.approx(action, rel=1e-4, abs=1e-5) for agent, action in expected.items()}
         observations, *_ = game.step(expected)
         observations = {agent: game.see(agent) for agent in game.agents}
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import VecEnv
@@ -19,7 +20,7 @@ from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import evaluate_team
 from sb3_saf.training.settings import load_settings
 from tests.team_venv import TeamVenv
-from tests.toy_envs import CounterEnv, TellingEnv
+from tests.toy_envs import CounterEnv, Game, TellingEnv
 
 SMALL: dict[str, Any] = {"n_agents": 3, "grid_size": 10, "n_treasures": 12, "max_cycles": 6, "view_size": 5}
 
@@ -180,6 +181,11 @@ def test_a_mask_is_refused_by_a_model_without_masks() -> None:
         model.predict(given)
 
 
+class Bounded(Game):
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return spaces.Box(-1, 1, (1,)) if agent == "a" else spaces.Box(np.float32([0, 10]), np.float32([10, 20]))
+
+
 def test_a_random_policy_of_an_environment() -> None:
     env = make_team_env(CounterEnv, n_envs=2, seed=0)
     of_space, of_env, of_game = (RandomPolicy(source, seed=3) for source in (env.action_space, env, CounterEnv()))
@@ -189,6 +195,10 @@ def test_a_random_policy_of_an_environment() -> None:
     assert len({tuple(actions) for actions in drawn}) > 1
     assert [of_env.predict(rows)[0].tolist() for _ in range(20)] == drawn
     assert [of_game.predict(rows)[0].tolist() for _ in range(20)] == drawn
+    env = make_team_env(Bounded, n_envs=500, seed=0)
+    drawn = RandomPolicy(env, seed=0).predict(env.reset())[0].reshape(500, 2, 2)
+    assert drawn.mean(axis=0) == pytest.approx(np.array([[0, 0], [5, 15]]), abs=0.5), "each between its own bounds"
+    assert abs(drawn[:, 0, 0]).max() < 1 and drawn[:, 1].max() > 19
     for wrong in (None, 4, "Discrete(4)"):
         with pytest.raises(ValueError, match=r"expected one agent's action space, or an environment that has it, got"):
             RandomPolicy(cast(Any, wrong))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -15,11 +16,13 @@ from pettingzoo import AECEnv
 from pettingzoo.test import parallel_api_test
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf import (
     CentralizedValueWrapper,
     GymnasiumTeam,
+    ObservationEncoder,
     RandomPolicy,
     TeamRolloutBuffer,
     TurnsInParallel,
@@ -27,7 +30,7 @@ from sb3_saf import (
     evaluate_team,
     make_team_env,
 )
-from sb3_saf.training.wrappers import wrap_game
+from sb3_saf.training.wrappers import wrap_game, wrap_rows
 from tests.contrib_teams import MaskedGame
 from tests.toy_envs import BOX, ZEROS, CounterEnv, Game
 
@@ -409,6 +412,98 @@ def test_statistics_of_observations_leave_out_the_dead() -> None:
         assert (obs["obs"][obs["active"][:, 0] == 0][::2] == 0).all(), "policies see zeros"
     assert normal.obs_rms["obs"].mean == pytest.approx(10, abs=0.2)
     assert normal.obs_rms["obs"].var == pytest.approx(1, abs=0.2)
+
+
+class Showing(Game):
+    """Agents see samples of spaces of their own."""
+
+    def __init__(self, *shown: spaces.Space[Any]) -> None:
+        self.shown = {agent: deepcopy(shown[index % len(shown)]) for index, agent in enumerate("ab")}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        for space in self.shown.values() if seed is not None else ():
+            space.seed(seed)
+        return super().reset(seed, options)
+
+    def observation_space(self, agent: Any) -> spaces.Space[Any]:
+        return self.shown[agent]
+
+    def see(self, agent: Any) -> Any:
+        return self.shown[agent].sample()
+
+
+def read_by(env: Any, n_steps: int = 50) -> tuple[bool, float]:
+    """Return whether the default encoder has convolutions, and the largest number that its first layers read."""
+    encoder = ObservationEncoder(env.team_spaces.own)
+    largest = [0.0]
+    for net in encoder.modules():
+        if isinstance(net, th.nn.Sequential) and not isinstance(net[-1], th.nn.ReLU):  # which joins features
+            net[0].register_forward_pre_hook(lambda _, inputs: largest.append(float(inputs[0].abs().max())))
+    env.reset()
+    for _ in range(n_steps):
+        obs: Any = env.step(np.zeros(env.num_envs, int))[0]
+        encoder(preprocess_obs(th.as_tensor(obs["obs"]), env.team_spaces.own))
+    return any(isinstance(layer, th.nn.Conv2d) for layer in encoder.modules()), max(largest)
+
+
+COUNTS, SHARES = spaces.Box(0, 1000, (3,), np.int64), spaces.Box(-1, 1, (2,), np.float32)
+PICTURE = spaces.Box(0, 255, (20, 20, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("shown", "convolves"),
+    [
+        ([spaces.Dict(a=COUNTS, b=SHARES)], False),
+        ([spaces.Tuple([COUNTS, SHARES])], False),
+        ([COUNTS, SHARES], False),
+        ([spaces.Dict(a=PICTURE, b=COUNTS)], True),
+        ([spaces.Dict(a=PICTURE, b=SHARES), spaces.Dict(a=PICTURE, b=COUNTS)], True),
+        ([spaces.Dict(a=spaces.Box(0, 1, (20, 20, 3), np.float32), b=SHARES)], True),
+        ([spaces.Dict(a=spaces.Box(0, 255, (20, 20), np.uint8), b=SHARES)], True),
+    ],
+)
+def test_parts_of_observations_are_scaled_and_pictures_convolved(shown: Any, convolves: bool) -> None:
+    has_convolutions, largest = read_by(make_team_env(Showing(*shown), 2, seed=0))
+    assert has_convolutions == convolves and 0.8 < largest <= 1
+
+
+def test_pictures_that_cannot_be_told_apart_are_warned_of() -> None:
+    with pytest.warns(UserWarning, match="read as plain numbers, without convolutions"):
+        env = make_team_env(Showing(spaces.Dict(a=PICTURE, b=SHARES), SHARES), 2, seed=0)
+    assert not read_by(env)[0]
+    with pytest.raises(ValueError, match="frame_stack would mix pictures"):
+        wrap_game(Showing(spaces.Dict(a=PICTURE, b=SHARES)), {"frame_stack": 2})
+
+
+@pytest.mark.parametrize("space", [spaces.Box(0, 255, (3,), np.float32), COUNTS, spaces.Dict(a=COUNTS, b=SHARES)])
+def test_normalised_observations_are_not_scaled_again(space: Any) -> None:
+    normal = VecNormalize(make_team_env(Showing(space), 2, seed=0).venv, norm_obs_keys=["obs"], norm_reward=False)
+    assert 1.5 < read_by(CentralizedValueWrapper(normal))[1] < 3
+
+
+def test_pictures_are_not_normalised() -> None:
+    for space in (spaces.Dict(a=PICTURE, b=SHARES), spaces.Box(0, 1, (20, 20, 3), np.float32)):
+        env = make_team_env(Showing(space), 2, seed=0)
+        normal = VecNormalize(env.venv, norm_obs_keys=["obs"], norm_reward=False)
+        with pytest.raises(ValueError, match="expected VecNormalize over vectors, got it over the pictures"):
+            CentralizedValueWrapper(normal)
+        assert read_by(wrap_rows(env, {"normalize": True}, 0.9, is_training=True))[1] <= 1
+
+
+def test_success_of_a_step_is_that_of_all_agents_in_any_order() -> None:
+    class Leaving(Game):
+        possible_agents = ("a", "b", "c")
+        lost = ""
+
+        def change(self, out: list[Any]) -> None:
+            if self.t == 2:
+                for agent in "ab":
+                    out[2][agent], out[4][agent] = True, {"is_success": agent != self.lost}
+                    self.agents.remove(agent)
+
+    for lost, rate in (("a", 0), ("b", 0), ("", 1)):
+        env = make_team_env(type("Lost", (Leaving,), {"lost": lost}), 2, seed=0)
+        assert evaluate_team(RandomPolicy(env, seed=0), env, 2).success_rate == rate
 
 
 AGENTS: list[Any] = [np.array(["a", "b"]), {"a": 1, "b": 2}.keys(), ("a", "b"), ["agent", "b"], [0, 1]]

@@ -355,7 +355,8 @@ def test_pictures_beside_numbers_are_encoded_each_in_their_way(tmp_path: Path) -
     rows = env.reset()["obs"]
     assert rows.shape == (4, 12 * 14 * 3 + 1 + 4) and rows.dtype == np.float32
     own = env.team_spaces.own
-    assert isinstance(own, PartsSpace) and [part.picture for part in own.parts] == [(12, 14, 3), None, None]
+    assert isinstance(own, PartsSpace) and [part[:2] for part in own.pictures] == [(0, 504)]
+    assert own.pictures[0].space.shape == (12, 14, 3)
     assert rows[1, 504:].tolist() == [0, 0, 0, 0, 1]
     assert (rows[:, :504] == np.array([0, 10, 0, 10])[:, np.newaxis]).all()
     model = PPO("SAFPolicy", env, n_steps=8, batch_size=32, n_epochs=1, seed=0)

@@ -299,8 +299,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         the team's reward (``make_team_env(..., team_reward="sum")``), also where a rollout ends before the episode
     :param normalize_advantage: ``"agent"`` gives the advantages of each agent mean 0 and standard deviation 1 over the
         rollout, for agents whose own rewards differ in scale: PPO normalises over the rows of all agents, where the one
-        that is paid more drowns the others. A rollout in which agents of a team were paid alike stays as it is, and so
-        does every one with None
+        that is paid more drowns the others. A rollout in which agents of a team were paid alike stays as it is (not if
+        SB3 has added their different values at time limits), and so does every one with None
     :param sequence_length: L, steps of a sequence for policies with memory, a divisor of ``buffer_size``; None for
         whole rollouts
     :raises ValueError: if the space is not that of teams, the rows are not whole teams, ``ends`` is invalid, or

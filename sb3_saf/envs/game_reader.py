@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
-from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
-from sb3_saf.networks.encoders import Part, PartsSpace
+from sb3_saf.networks.encoders import Part, PartsSpace, has_pictures, picture_of, wide_integers
 from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion, Leaf, innermost, padded
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
@@ -60,6 +59,12 @@ class GameReader:
         observed, acted, keys = trial.observed.values(), trial.actions, trial.mask_keys
         own_spaces = [without_mask(*entry) for entry in zip(observed, keys.values(), strict=True)]
         own = own_space(own_spaces, float64)
+        if not has_pictures(own) and any(_is_picture(leaf) for space in own_spaces for _, leaf in innermost(space)):
+            self.notes.append(
+                "the pictures in the agents' observations are read as plain numbers, without convolutions, because "
+                f"they are of different kinds or places: {', '.join(map(str, own_spaces))}; give all agents the same "
+                "picture, as the first part of their Dicts"
+            )
         #: Action space of a row.
         self.action_space = common_actions(acted)
         has_masks, needs_mask = self._find_masks(trial, action_masks)
@@ -266,10 +271,10 @@ def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Sp
         all(isinstance(space, spaces.Box) for space in observed)
         and len({len(space.shape or ()) for space in observed}) == 1
     ):
-        own = _common_box(observed)
+        own = _common_vector(observed) if len(first.shape or ()) == 1 else _common_box(observed)
     else:
         vectors = [_flat_space(space) for space in observed]
-        own = vectors[0] if are_equal else _common_box(vectors)
+        own = vectors[0] if are_equal else _common_vector(vectors)
     if isinstance(own, spaces.Box) and own.dtype == np.float64 and not float64:
         with np.errstate(over="ignore"):
             return spaces.Box(own.low.astype(np.float32), own.high.astype(np.float32), dtype=np.float32)
@@ -289,10 +294,13 @@ def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
     flat = spaces.flatten_space(space)
     assert isinstance(flat, spaces.Box)
     leaves = [leaf for _, leaf in innermost(space)]
-    pictures = [leaf.shape if isinstance(leaf, spaces.Box) and is_image_space(leaf) else None for leaf in leaves]
-    if any(pictures):
-        ends = list(accumulate(map(spaces.flatdim, leaves)))
-        return PartsSpace(flat, tuple(map(Part, [0, *ends], ends, pictures)))
+    slices = pairwise(accumulate(map(spaces.flatdim, leaves), initial=0))
+    boxes = [Part(*ends, leaf) for ends, leaf in zip(slices, leaves, strict=True) if isinstance(leaf, spaces.Box)]
+    pictures = tuple(part for part in boxes if _is_picture(part.space))
+    whole = np.zeros(flat.shape, dtype=np.bool_)
+    for part in boxes:
+        whole[part.start : part.stop] = wide_integers(part.space).reshape(-1)
+    flat = _with_parts(flat, pictures, whole)
     if flat.dtype == np.float64 and not any(leaf.dtype == np.float64 for leaf in leaves):
         # Mixed integers and float32 would give float64, which takes twice the memory.
         return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
@@ -305,6 +313,26 @@ def _common_box(boxes: Sequence[Any]) -> spaces.Box:
     low = np.min([padded(box.low, shape, dtype) for box in boxes], axis=0)
     high = np.max([padded(box.high, shape, dtype) for box in boxes], axis=0)
     return spaces.Box(low, high, dtype=dtype.type)
+
+
+def _common_vector(vectors: Sequence[Any]) -> spaces.Box:
+    """Return the space of vectors of different agents; what they have in common of parts stays known to encoders."""
+    common = _common_box(vectors)
+    whole = np.any([padded(wide_integers(one), common.shape, np.bool_) for one in vectors], axis=0)
+    pictures = getattr(vectors[0], "pictures", ())
+    if any(getattr(one, "pictures", ()) != pictures for one in vectors):
+        pictures = ()
+    return _with_parts(common, pictures, whole)
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    return picture_of(space) is not None and not hasattr(space, "atlas")
+
+
+def _with_parts(vector: spaces.Box, pictures: tuple[Part, ...], whole: Array) -> spaces.Box:
+    """Return the space of a vector that has pictures, or integers among floats, which encoders must tell apart."""
+    is_needed = pictures or (whole.any() and not np.issubdtype(vector.dtype, np.integer))
+    return PartsSpace(vector, pictures, whole) if is_needed else vector
 
 
 def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:

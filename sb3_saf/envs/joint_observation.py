@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -14,6 +15,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_saf.networks.encoders import has_pictures
 from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import (
@@ -88,6 +90,9 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         names = getattr(venv, "possible_agents", None)
         names = tuple(names) if names is not None and len(names) == n_agents else None
         raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
+        self._normalization = unwrap_vec_normalize(venv)
+        raw_state = None if raw.state is None else self._normalized(raw.state, STATE_KEY)
+        raw = replace(raw, own=self._normalized(raw.own, OBS_KEY), state=raw_state)
         state = None if raw.state is None else channels_first(raw.state)
         own = channels_first(raw.own)
         conversions: tuple[AgentConversion, ...] | None = getattr(venv, "conversions", None)
@@ -103,12 +108,24 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self.team_spaces = team
         self._raw = raw
         self._agents = np.tile(np.arange(team.n_agents, dtype=np.int64), self.n_games)
-        self._normalization = unwrap_vec_normalize(venv)
         #: (E, N), the agents that took part in the last step of episodes that go on.
         self._playing = np.zeros((self.n_games, team.n_agents), dtype=np.int8)
         self._n_steps = 0
         self._masks_shown: Array | None = None
         self._has_asked_for_masks = False
+
+    def _normalized(self, space: spaces.Space[Any], key: str) -> spaces.Space[Any]:
+        """Return the space of a part of the rows behind VecNormalize, which keeps the space of what it normalises."""
+        layer = self._normalization
+        keys = None if layer is None else layer.norm_obs_keys
+        if layer is None or not layer.norm_obs or (keys is not None and key not in keys):
+            return space
+        if has_pictures(space):
+            raise ValueError(
+                f"expected VecNormalize over vectors, got it over the pictures of {space} in {key!r}, which encoders "
+                "scale: pass VecNormalize(..., norm_obs=False), or name other norm_obs_keys"
+            )
+        return spaces.Box(-layer.clip_obs, layer.clip_obs, space.shape, np.float32)
 
     def has_attr(self, attr_name: str) -> bool:
         """Return whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""

@@ -36,8 +36,9 @@ class TeamMonitor(TeamVecEnvWrapper):
     these entries, so ``rollout/ep_rew_mean`` and ``rollout/ep_len_mean`` count each team episode once.
 
     What is of the episode is taken from whichever agent's info the game puts it in, agents that are out included, and
-    then is in that of agent 0 only: ``"is_success"`` (if agents report differently: whether all succeeded) and
-    ``info_keywords``. Infos of the last step count, or, if none has the entry, the latest of the episode.
+    then is in that of agent 0 only: ``"is_success"`` (if agents report differently in a step: whether all succeeded)
+    and ``info_keywords``. Infos of the last step count, or, if none has the entry, the latest step with one. So an
+    episode that agents may leave as losers is to tell at its end whether the team has succeeded.
 
     It is not a subclass of VecMonitor, because SB3's ``evaluate_policy`` would wait for an ``"episode"`` entry in every
     row and never return. With a TeamMonitor it counts every agent as an episode and warns; use
@@ -110,21 +111,25 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._returns += rewards.reshape(self.n_games, self.n_agents)
         self._lengths += 1
         if any(infos):  # most steps have none, and a loop over all rows takes as long as the games
-            for row, info in enumerate(infos):
-                if info and not ended[row // self.n_agents]:
-                    noted = {key: info[key] for key in self._of_episode if key in info}
-                    self._notes[row // self.n_agents].update(noted)
+            rows = [row for row, info in enumerate(infos) if info and any(key in info for key in self._of_episode)]
+            for game in {row // self.n_agents for row in rows} - set(np.flatnonzero(ended).tolist()):
+                self._notes[game].update(self._noted(infos[self._rows_of(game)]))
         if ended.any():
             infos = list(infos)
             for game in np.flatnonzero(ended).tolist():
-                rows = slice(game * self.n_agents, (game + 1) * self.n_agents)
-                infos[rows] = self._finish_episode(game, infos[rows])
+                infos[self._rows_of(game)] = self._finish_episode(game, infos[self._rows_of(game)])
         return obs, rewards, dones, infos
+
+    def _rows_of(self, game: int) -> slice:
+        return slice(game * self.n_agents, (game + 1) * self.n_agents)
+
+    def _noted(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """Return what the infos of a game's agents say of the episode."""
+        return {key: value for key in self._of_episode if (value := episode_value(infos, key)) is not None}
 
     def _finish_episode(self, game: int, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the last infos of a game's agents, with the episode in that of agent 0."""
-        last = {key: value for key in self._of_episode if (value := episode_value(infos, key)) is not None}
-        of_episode = {**self._notes[game], **last}
+        of_episode = {**self._notes[game], **self._noted(infos)}
         missing = [key for key in self.info_keywords if key not in of_episode]
         if missing and not self._has_warned:
             self._has_warned = True

@@ -43,9 +43,9 @@ _PAPERS_PIXELS: Final = 64 * 64
 #: Numbers of pixels and weights above which a warning about slow training is issued.
 _MANY_PIXELS: Final = 128 * 128
 _MANY_WEIGHTS: Final = 10_000_000
-#: MLPs scale integers whose largest value is above the first limit; above the second, bounds say nothing.
+#: MLPs scale integers whose largest value is above the first limit; from the second on, bounds say nothing.
 _WIDE: Final = 16
-_UNBOUNDED: Final = 1 << 16
+_UNBOUNDED: Final = 2**31 - 1
 #: Value of one-hot codes, so that their norm is close to that of a tile's pixels.
 _ONE_HOT_SCALE: Final = 2.0
 
@@ -113,33 +113,46 @@ def checked_atlas(space: Any) -> npt.NDArray[np.uint8]:
 
 class Part(NamedTuple):
     """
-    Slice of a vector that holds one part of an observation.
+    Picture in a vector.
 
-    :param picture: shape of the picture, None for scalars and vectors
+    :param start: index of its first entry
+    :param stop: index after its last entry
+    :param space: its space in the game
     """
 
     start: int
     stop: int
-    picture: tuple[int, ...] | None
+    space: spaces.Box
 
 
 class PartsSpace(spaces.Box):
     """
-    Pictures, scalars and vectors concatenated to one float32 vector. Encoders split it by ``parts``; pixels are 0 to
-    255.
+    Pictures, scalars and vectors concatenated to one float32 vector, which encoders take apart and scale.
 
     :param flat: the vector, from ``gymnasium.spaces.flatten_space``
+    :param pictures: in the order of the vector
+    :param whole: (n,), whether entries are integers in the game; None if none is
     """
 
-    def __init__(self, flat: spaces.Box, parts: tuple[Part, ...]) -> None:
+    def __init__(
+        self, flat: spaces.Box, pictures: tuple[Part, ...] = (), whole: npt.NDArray[np.bool_] | None = None
+    ) -> None:
         super().__init__(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-        self.parts = parts
+        self.pictures = pictures
+        self.whole = np.zeros(self.shape, dtype=np.bool_) if whole is None else whole
 
     def __eq__(self, other: object) -> bool:
-        """Return whether bounds and parts are equal."""
-        return isinstance(other, PartsSpace) and super().__eq__(other) and self.parts == other.parts
+        """Return whether bounds, pictures and integers are equal."""
+        if not isinstance(other, PartsSpace) or not super().__eq__(other):
+            return False
+        return self.pictures == other.pictures and np.array_equal(self.whole, other.whole)
 
     __hash__ = None  # type: ignore[assignment]  # as in every space with arrays
+
+
+def has_pictures(space: spaces.Space[Any]) -> bool:
+    """Return whether observations of a space are, or contain, pictures or tile codes."""
+    return picture_of(space) is not None or (isinstance(space, PartsSpace) and len(space.pictures) > 0)
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -382,7 +395,7 @@ class LightEncoder(Encoder):
 class MLPEncoder(Encoder):
     """
     Encoder for vectors: linear 128, tanh, linear ``features_dim``. Integer spaces are read as one-hot vectors; Boxes of
-    integers beyond 16, such as bytes or distances, are divided by their largest value.
+    integers beyond 16, such as bytes or distances, are divided by their largest value (below 2**31 - 1).
 
     :param observation_space: Box (flattened), Discrete, MultiDiscrete or MultiBinary
     :param features_dim: size of the features
@@ -409,14 +422,23 @@ class MLPEncoder(Encoder):
         return self.net((observations / self.divisor if self.is_scaled else observations).flatten(1))
 
 
+def wide_integers(space: spaces.Box) -> npt.NDArray[np.bool_]:
+    """Return which entries of a Box are integers so large that MLPs scale them."""
+    whole = getattr(space, "whole", np.issubdtype(space.dtype, np.integer))
+    largest = _largest(space)
+    return whole & (largest > _WIDE) & (largest < _UNBOUNDED)
+
+
+def _largest(space: spaces.Box) -> npt.NDArray[np.float64]:
+    return np.maximum(np.abs(space.low.astype(np.float64)), np.abs(space.high.astype(np.float64)))
+
+
 def _divisor_of(space: spaces.Space[Any]) -> npt.NDArray[np.float32] | None:
     """Return what scales a Box of wide integers or bytes to [-1, 1], in its shape; None for other spaces."""
     if not isinstance(space, spaces.Box) or hasattr(space, "atlas") or is_image_space(space):
         return None
-    largest = np.maximum(np.abs(space.low.astype(np.float64)), np.abs(space.high.astype(np.float64)))
-    of_bytes = (space.low == 0) & (space.high == 255)
-    is_wide = (largest > _WIDE) & (largest <= _UNBOUNDED) & (np.issubdtype(space.dtype, np.integer) | of_bytes)
-    return np.where(is_wide, largest, 1).astype(np.float32) if is_wide.any() else None
+    is_scaled = wide_integers(space) | ((space.low == 0) & (space.high == 255))
+    return np.where(is_scaled, _largest(space), 1).astype(np.float32) if is_scaled.any() else None
 
 
 class PartsEncoder(Encoder):
@@ -424,41 +446,41 @@ class PartsEncoder(Encoder):
     Encoder for pictures together with scalars and vectors: one encoder per picture (an MLP below 8 pixels), one
     :class:`MLPEncoder` for the rest, then linear ``features_dim`` and ReLU.
 
-    :param observation_space: a :class:`PartsSpace`, which ``make_team_env`` makes of Dicts
+    :param observation_space: a :class:`PartsSpace` with pictures, which ``make_team_env`` makes of Dicts
     :param features_dim: size of the features, of each encoder and of the output
     :raises ValueError: for any other space
     """
 
+    rest_indices: th.Tensor
+
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
-        if not isinstance(observation_space, PartsSpace):
+        if not isinstance(observation_space, PartsSpace) or not has_pictures(observation_space):
             raise ValueError(f"expected pictures beside vectors in one PartsSpace, got {observation_space}")
         super().__init__(observation_space, features_dim)
-        self.parts = observation_space.parts
+        self.parts = observation_space.pictures
         encoders: list[Encoder] = []
+        is_rest = np.ones(observation_space.shape, dtype=np.bool_)
         for part in self.parts:
-            if part.picture is not None:
-                space = spaces.Box(0, 255, part.picture, np.uint8)
-                is_tiny = sorted(part.picture)[1] < PAPER_PIXELS  # the smallest axis are channels
-                encoders.append((MLPEncoder if is_tiny else _encoder_class(space))(space, features_dim))
+            is_rest[part.start : part.stop] = False
+            is_tiny = sorted(part.space.shape)[-2] < PAPER_PIXELS  # the smallest of three axes are channels
+            encoders.append((MLPEncoder if is_tiny else _encoder_class(part.space))(part.space, features_dim))
         self.pictures = nn.ModuleList(encoders)
-        rest = [i for part in self.parts if part.picture is None for i in range(part.start, part.stop)]
+        rest = np.flatnonzero(is_rest)
         bounds = observation_space.low[rest], observation_space.high[rest]
-        self.rest = MLPEncoder(spaces.Box(*bounds, dtype=np.float32), features_dim) if rest else None
-        n_encoders = len(encoders) + bool(rest)
-        self.join = nn.Sequential(nn.Linear(n_encoders * features_dim, features_dim), nn.ReLU())
+        vector = PartsSpace(spaces.Box(*bounds, dtype=np.float32), whole=observation_space.whole[rest])
+        self.rest = MLPEncoder(vector, features_dim) if len(rest) else None
+        # Not part of the state dict: it follows from the space.
+        self.register_buffer("rest_indices", th.from_numpy(rest), persistent=False)
+        self.join = nn.Sequential(nn.Linear((len(encoders) + bool(len(rest))) * features_dim, features_dim), nn.ReLU())
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, n) as (K, features_dim)."""
-        slices = [observations[:, part.start : part.stop] for part in self.parts]
-        pictures = [
-            slice_.reshape(-1, *part.picture) / 255.0
-            for slice_, part in zip(slices, self.parts, strict=True)
-            if part.picture is not None
-        ]
-        features = [encoder(pixels) for encoder, pixels in zip(self.pictures, pictures, strict=True)]
+        features = []
+        for encoder, part in zip(self.pictures, self.parts, strict=True):
+            picture = observations[:, part.start : part.stop].reshape(-1, *part.space.shape)
+            features.append(encoder(preprocess_obs(picture, part.space)))
         if self.rest is not None:
-            vectors = [slice_ for slice_, part in zip(slices, self.parts, strict=True) if part.picture is None]
-            features.append(self.rest(th.cat(vectors, dim=1)))
+            features.append(self.rest(observations[:, self.rest_indices]))
         return self.join(th.cat(features, dim=1))
 
 
@@ -500,7 +522,7 @@ class ObservationEncoder(Encoder):
 
 
 def _encoder_class(space: spaces.Space[Any]) -> type[Encoder]:
-    if isinstance(space, PartsSpace):
+    if isinstance(space, PartsSpace) and has_pictures(space):
         return PartsEncoder
     picture = picture_of(space)
     if picture is None:

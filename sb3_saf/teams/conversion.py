@@ -334,6 +334,14 @@ class AgentConversion:
         array = array.reshape(leaf.shape) if leaf.start is None else array.reshape(leaf.shape) + leaf.start
         return array.astype(leaf.dtype)[()]
 
+    @property
+    def action_bounds(self) -> tuple[Array, Array]:
+        """Return the lowest and highest values of the agent's Box actions, as in rows; 0 for entries that it lacks."""
+        size, shape = prod(self.action.shape), self.row_action.shape
+        own = (np.resize(bound, size) for bound in (self.action.low, self.action.high))
+        low, high = (padded(bound, (prod(shape),), self.row_action.dtype).reshape(shape) for bound in own)
+        return low, high
+
     def fits(self, observation: Any) -> bool:
         """Return whether an observation has the form of the agent's in the game, with or without mask."""
         try:

@@ -18,7 +18,6 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
 from sb3_saf.checkpoints.states import load_normalization_statistics, normalization_statistics
@@ -26,6 +25,7 @@ from sb3_saf.envs.curriculum import Stage
 from sb3_saf.envs.game_reader import EqualSpaces
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import SharedReward, TeamMonitor, TeamReward
+from sb3_saf.networks.encoders import PartsSpace, has_pictures
 from sb3_saf.teams.checks import import_by_name
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import OBS_KEY
@@ -84,6 +84,12 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
 
         if not all(isinstance(game.observation_space(agent), spaces.Box) for agent in game.possible_agents):
             game = EqualSpaces(game)  # gives masks in infos, beside vectors that can be stacked
+            space = game.observation_space(game.possible_agents[0])
+            if isinstance(space, PartsSpace):
+                raise ValueError(
+                    "frame_stack would mix pictures, or wide integers, with the other parts of these observations: "
+                    "stack them in an env_wrapper of your own, or use policy_kwargs {memory: gru} instead"
+                )
         game = supersuit.frame_stack_v1(game, wrapping["frame_stack"])
     return game
 
@@ -115,7 +121,7 @@ def wrap_rows(
         space = rows.observation_space
         own = space.spaces[OBS_KEY] if isinstance(space, spaces.Dict) and OBS_KEY in space.spaces else space
         # Pictures and tile codes are not normalised, since encoders scale them.
-        norm_obs = isinstance(own, spaces.Box) and not hasattr(own, "atlas") and not is_image_space(own)
+        norm_obs = isinstance(own, spaces.Box) and not has_pictures(own)
         arguments = {"gamma": gamma, "norm_obs": norm_obs, **({} if normalize is True else normalize)}
         if own is not space and arguments["norm_obs"]:
             arguments.setdefault("norm_obs_keys", [OBS_KEY])
