@@ -18,6 +18,9 @@ from sb3_saf import QPLEX, make_team_env, ppo_settings
 from sb3_saf.teams.rows import n_mask_entries
 from tests.contrib_teams import random_masks
 
+# One of the agents of "pictures" has none.
+pytestmark = pytest.mark.filterwarnings("ignore:the pictures in the agents' observations are read as plain numbers")
+
 VECTOR: Final = spaces.Box(-1, 1, (5,), np.float64)
 SHORT: Final = spaces.Box(-1, 1, (3,), np.float32)
 PICTURE: Final = spaces.Box(0, 255, (12, 12, 3), np.uint8)

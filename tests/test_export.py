@@ -335,6 +335,7 @@ def test_wrong_memories(exports: Callable[[str], Exported]) -> None:
 # --- what the game gives ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:the pictures in the agents' observations are read as plain numbers")
 @pytest.mark.parametrize(("kind", "masks"), [("nested", "info"), ("pictures", "observation"), ("boxes", None)])
 def test_acts_on_what_the_game_gives(kind: str, masks: str | None, tmp_path: Path) -> None:
     env = make_team_env(partial(Kinds, kind, masks), seed=0)

@@ -183,7 +183,11 @@ def test_a_mask_is_refused_by_a_model_without_masks() -> None:
 
 class Bounded(Game):
     def action_space(self, agent: Any) -> spaces.Space[Any]:
-        return spaces.Box(-1, 1, (1,)) if agent == "a" else spaces.Box(np.float32([0, 10]), np.float32([10, 20]))
+        return (
+            spaces.Box(-1, 1, (1,))
+            if agent == "a"
+            else spaces.Box(np.array([0, 10]), np.array([10, 20]), dtype=np.float32)
+        )
 
 
 def test_a_random_policy_of_an_environment() -> None:
@@ -196,9 +200,9 @@ def test_a_random_policy_of_an_environment() -> None:
     assert [of_env.predict(rows)[0].tolist() for _ in range(20)] == drawn
     assert [of_game.predict(rows)[0].tolist() for _ in range(20)] == drawn
     env = make_team_env(Bounded, n_envs=500, seed=0)
-    drawn = RandomPolicy(env, seed=0).predict(env.reset())[0].reshape(500, 2, 2)
-    assert drawn.mean(axis=0) == pytest.approx(np.array([[0, 0], [5, 15]]), abs=0.5), "each between its own bounds"
-    assert abs(drawn[:, 0, 0]).max() < 1 and drawn[:, 1].max() > 19
+    acted = RandomPolicy(env, seed=0).predict(env.reset())[0].reshape(500, 2, 2)
+    assert acted.mean(axis=0) == pytest.approx(np.array([[0, 0], [5, 15]]), abs=0.5), "each between its own bounds"
+    assert abs(acted[:, 0, 0]).max() < 1 and acted[:, 1].max() > 19
     for wrong in (None, 4, "Discrete(4)"):
         with pytest.raises(ValueError, match=r"expected one agent's action space, or an environment that has it, got"):
             RandomPolicy(cast(Any, wrong))

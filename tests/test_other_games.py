@@ -446,7 +446,8 @@ def read_by(env: Any, n_steps: int = 50) -> tuple[bool, float]:
     return any(isinstance(layer, th.nn.Conv2d) for layer in encoder.modules()), max(largest)
 
 
-COUNTS, SHARES = spaces.Box(0, 1000, (3,), np.int64), spaces.Box(-1, 1, (2,), np.float32)
+COUNTS: Any = spaces.Box(0, 1000, (3,), np.int64)
+SHARES: Any = spaces.Box(-1, 1, (2,), np.float32)
 PICTURE = spaces.Box(0, 255, (20, 20, 3), np.uint8)
 
 
