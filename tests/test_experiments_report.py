@@ -114,7 +114,8 @@ def test_losses_are_shares_of_the_first_level(page: str) -> None:
 
 def test_results_as_tables(folder: Path) -> None:
     tests, curves = read_results(folder, "coordination")
-    stored = pd.read_csv(folder / "coordination" / "runs.csv", float_precision="round_trip")
+    texts = {"game": str, "training": str, "commit": str}
+    stored = pd.read_csv(folder / "coordination" / "runs.csv", float_precision="round_trip", dtype=texts)
     pd.testing.assert_frame_equal(tests, stored, check_exact=True, check_dtype=False)
     kept = pd.read_csv(folder / "coordination" / "curves.csv", float_precision="round_trip")
     pd.testing.assert_frame_equal(curves, kept, check_exact=True)

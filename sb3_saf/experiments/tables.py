@@ -90,8 +90,9 @@ def read_results(folder: str | Path, name: str) -> Frames:
             if not all(path.is_file() for path in paths):
                 continue
             try:
-                digests = {"game": str, "training": str}
-                tests, curves = (pd.read_csv(path, float_precision="round_trip", dtype=digests) for path in paths)
+                # Hashes of digits alone, or with one "e", look like numbers.
+                texts = dict.fromkeys(("game", "training", "commit"), str)
+                tests, curves = (pd.read_csv(path, float_precision="round_trip", dtype=texts) for path in paths)
                 require_columns(tests, ("method", "task", "train_level", "level", "seed", "return_mean", "score"))
             except ValueError as error:
                 raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
