@@ -75,7 +75,7 @@ def _drop_markdown_docstrings(
 ) -> None:
     """In the reference, the tasks' long Markdown docstrings are one line and a link to their page."""
     if what == "class" and "## Actions" in lines:
-        lines[:] = [lines[0], "", "Its page is under *Environments*.", ""]
+        lines[:] = [lines[0], "", "Its page is under *Games*.", ""]
 
 
 def _copy_pages() -> None:

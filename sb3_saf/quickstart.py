@@ -1,6 +1,5 @@
 """
-``make train``: SAF on a HECOGrid task, from nothing to a model, a learning curve, a GIF and a replay in minutes on a
-laptop.
+Train SAF on a HECOGrid task in minutes on a laptop (``make train``): a model, a learning curve, a GIF and a replay.
 
 The settings are those of ``python -m sb3_saf.train --size small``; ``sb3_saf.training.run.train`` does the work.
 """
