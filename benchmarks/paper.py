@@ -53,6 +53,8 @@ MEMORY: Final = "memory"
 LENGTH: Final = "length10"
 #: Every actor with every critic: names begin so.
 FACTORIAL: Final = "factorial"
+#: Teams of ``benchmarks.scripted``, in words.
+SCRIPTED: Final = {"7 x 7 views": "script, 7 x 7 views", "full sight": "script, sees all"}
 #: Methods of the grid; SAF is compared with the others.
 MAIN: Final = ("saf", "mappo", "ippo-separate", "ippo")
 WORDS: Final = {
@@ -112,7 +114,7 @@ def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> l
     """Return the claims that these data can test."""
     general = 'SAF is better than {} "across different tasks and different heterogeneity and coordination levels"'
     everywhere = "all games"
-    hidden = "TeamSupport, h = 5, zones as pixels"
+    hidden, pixels = "TeamSupport, h = 5, zones as pixels", pixels[pixels["level"] == "c1-h5"]
     coordinated, zones = tests[tests["coordination"] > 1], tests[tests["heterogeneity"] > 1]
     return [
         Claim(general.format("MAPPO"), ("saf", "mappo"), everywhere, tests),
@@ -242,14 +244,16 @@ def claims_table(found: Sequence[Claim]) -> str:
     return table(["the paper's claim", "test, % of the treasures", "effect", "p (Holm)", ""], body)
 
 
-def losses(tests: pd.DataFrame) -> str:
-    """Return the share of the treasures of each method at c = 1, 2, 3 (h = 1), by task."""
-    share = (100 * tests["return_mean"] / tests["max_return"]).groupby([tests["task"], tests["level"], tests["method"]])
+def losses(tests: pd.DataFrame, scripted: pd.DataFrame) -> str:
+    """Return the share of the treasures of each method and script at c = 1, 2, 3 (h = 1), by task."""
+    words, columns = {**{method: WORDS[method] for method in MAIN}, **SCRIPTED}, ["task", "level", "method"]
+    played = pd.concat([tests, scripted.rename(columns={"team": "method"}).assign(max_return=100)])
+    share = (100 * played["return_mean"] / played["max_return"]).groupby([played[name] for name in columns])
     levels, means, body = [f"c{c}-h1" for c in (1, 2, 3)], share.mean(), []
     for task in dict.fromkeys(tests["task"]):
-        rows = [[means.get((task, level, method)) for level in levels] for method in MAIN]
+        rows = [[means.get((task, level, method)) for level in levels] for method in words]
         body.append([task, *(", ".join("–" if mean is None else f"{mean:.0f}" for mean in row) for row in rows)])
-    return table(["task", *(WORDS[method] for method in MAIN)], body)
+    return table(["task", *words.values()], body)
 
 
 def settings_table(tests: pd.DataFrame, of: Sequence[str] = MAIN) -> str:
@@ -267,27 +271,30 @@ def settings_table(tests: pd.DataFrame, of: Sequence[str] = MAIN) -> str:
 
 
 def other_table(names: Iterable[str]) -> str:
-    """Return the mean return of each method in experiments with settings of their own."""
+    """Return what each method collects in experiments with settings of their own."""
     body = []
     for name in names:
         trained = read(name).tests.query("game_steps > 0")
         for (task, level), here in trained.groupby(_COLUMNS, sort=False):
-            returns = here.groupby("method", sort=False)["return_mean"]
-            text = "; ".join(f"{WORDS.get(str(method), method)} {of.mean():.1f} ({len(of)})" for method, of in returns)
+            scores = here.groupby("method", sort=False)["score"]
+            text = "; ".join(f"{WORDS.get(str(name), name)} {100 * of.mean():.1f} ({len(of)})" for name, of in scores)
             body.append([name, f"{task}, {level}", text])
-    return table(["experiment", "setting", "returns of 100 (seeds)"], body)
+    return table(["experiment", "setting", "% of the treasures (seeds)"], body)
 
 
 def factorial_table(names: Iterable[str]) -> str:
-    """Return the mean return of each actor with each critic."""
+    """Return the mean return of each actor with each critic, and what the critics explain of their targets."""
     actors, critics = ("own", "shared", "pool"), ("own", "team", "mean", "source")
     body = []
     for name in names:
         means = read(name).tests.groupby("method")["return_mean"].mean()
+        looks = pd.read_csv(RAW / name / "diagnosis.csv")
+        explained = looks["critic/explained_variance_of_target"].groupby(looks["method"].str.rsplit("-").str[-1]).mean()
         for actor in actors:
             methods = [f"actor-{actor}-critic-{critic}" for critic in critics]
             cells = [f"{means[method]:.1f}" if method in means else "" for method in methods]
             body.append([name, WORDS[methods[0]].split(", ")[0], *cells])
+        body.append([name, "explained variance", *(f"{explained[critic]:.2f}" for critic in critics)])
     heads = [WORDS[f"actor-own-critic-{critic}"].split(", ")[1] for critic in critics]
     return table(["experiment", "actor", *(f"critic: {head}" for head in heads)], body)
 
@@ -427,7 +434,7 @@ def pages() -> dict[Path, str]:
         "methods": methods_table(tests),
         "claims": claims_table(claims(tests, unseen, pixels)),
         "memory": memory_table(frames, read(MEMORY)),
-        "losses": losses(tests),
+        "losses": losses(tests, pd.read_csv(RAW / "scripted.csv")),
         "settings": settings_table(tests),
         "unseen": settings_table(unseen),
         "unseen_parts": settings_table(read(OTHER_LEVELS_PARTS).tests.query("game_steps > 0"), PARTS),

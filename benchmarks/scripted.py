@@ -11,9 +11,9 @@ Besides a random team there are two scripted ones, which know the rules, includi
   reaches soonest, by shortest path, and waits there for the rest. In KeyForTreasure one agent of each group fetches a
   key.
 
-Games: the zoo's size ``small``, twice as many agents at the same density, and the paper's.
-Means and 95 % intervals (Student's t) over games. The scripts know the actions of each zone, so heterogeneity affects
-only the random team.
+They play the paper's games, the first of those on which ``experiments run`` tests a team of the same seed. Means and
+95 % intervals (Student's t) over games. The scripts know the actions of each zone, so heterogeneity affects only the
+random team.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import csv
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,28 +32,28 @@ from hecogrid_envs import TASK_NAMES
 from hecogrid_envs.batch import GameBatch
 from hecogrid_envs.params import HECOGridParams
 from sb3_saf.evaluation import confidence_interval
-
-#: Size ``small``, and twice as many agents at the same density.
-SIZES: Final[tuple[dict[str, int], ...]] = (
-    {"n_agents": 5, "grid_size": 15, "n_treasures": 25, "n_keys": 8},
-    {"n_agents": 10, "grid_size": 22, "n_treasures": 50, "n_keys": 16},
-    {},  # the paper's: the games' own defaults
-)
+from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.randomness import game_seeds
+from sb3_saf.training.folders import TEST_GAMES
 
 
 class Row(NamedTuple):
-    """A line of the table: level, team, team return and the ends of its interval."""
+    """A line of the table: game, team, team return and the ends of its interval."""
 
     task: str
-    coordination: int
-    heterogeneity: int
-    n_agents: int
-    grid_size: int
-    n_treasures: int
-    name: str
-    mean: float
-    low: float
-    high: float
+    level: str
+    team: str
+    seed: int
+    episodes: int
+    return_mean: float
+    return_low: float
+    return_high: float
+
+
+def test_games(seed: int, n_games: int) -> Iterator[int]:
+    """Yield the seeds of the first test games of a run (``sb3_saf.training.folders.play_test``)."""
+    for batch, first in enumerate(range(0, n_games, TEST_GAMES)):
+        yield from game_seeds(evaluation_seed(seed, test=batch), min(TEST_GAMES, n_games - first))
 
 
 def play(name: str, batch: GameBatch, seed: int) -> int:
@@ -66,45 +66,35 @@ def play(name: str, batch: GameBatch, seed: int) -> int:
     return int(batch.collected[0])
 
 
-def measure(name: str, task: str, level: dict[str, Any], n_games: int) -> Row:
+def measure(name: str, task: str, params: HECOGridParams, seed: int, n_games: int) -> Row:
     """Play a number of games, the same for all teams."""
-    params = HECOGridParams(observation="tiles", **level)
     batch = GameBatch(task, params)
-    returns = []
-    for seed in range(n_games):
-        batch.reset(seeds=[seed])
-        returns.append(play(name, batch, seed))
-    numbers = [float(np.mean(returns)), *confidence_interval(returns)]
-    cell = (params.coordination, params.heterogeneity, params.n_agents, params.grid_size, params.n_treasures)
-    return Row(task, *cell, name, *(round(number, 2) for number in numbers))
-
-
-def table(rows: list[Row]) -> Iterator[str]:
-    """Format rows as a Markdown table, line by line."""
-    yield "| task | c | agents | team | return | 95 % interval |"
-    yield "| --- | --- | --- | --- | --- | --- |"
-    for row in rows:
-        returns = f"{row.mean:.1f} of {row.n_treasures} | [{row.low:.1f}, {row.high:.1f}]"
-        yield f"| {row.task} | {row.coordination} | {row.n_agents} | {row.name} | {returns} |"
+    returns: list[int] = []
+    for game in test_games(seed, n_games):
+        batch.reset(seeds=[game])
+        returns.append(play(name, batch, seed=len(returns)))
+    numbers = float(np.mean(returns)), *confidence_interval(returns)
+    level = f"c{params.coordination}-h{params.heterogeneity}"
+    return Row(task, level, name, seed, n_games, *(round(number, 2) for number in numbers))
 
 
 def main() -> None:
-    """Print the table, and write it to a file if given."""
+    """Print a table in Markdown, and write it to a file if given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=TASK_NAMES, default=list(TASK_NAMES))
     parser.add_argument("--coordination", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--games", type=int, default=32, help="games of each row")
-    parser.add_argument("--csv", type=Path, help="file to write the rows to, such as results/scale.csv")
+    parser.add_argument("--seed", type=int, default=0, help="of the teams whose test games are played")
+    parser.add_argument("--games", type=int, default=128, help="of each row")
+    parser.add_argument("--csv", type=Path, help="file to write the rows to, such as results/paper/scripted.csv")
     options = parser.parse_args()
-    levels = [
-        (task, {**size, "coordination": c}) for size, task, c in product(SIZES, options.tasks, options.coordination)
-    ]
-    rows = [measure(name, task, level, options.games) for task, level in levels for name in TEAMS]
-    print("\n".join(table(rows)))
+    print(f"| {' | '.join(Row._fields)} |\n|{' --- |' * len(Row._fields)}")
+    rows = []
+    for task, coordination, name in product(options.tasks, options.coordination, TEAMS):
+        rows.append(measure(name, task, HECOGridParams(coordination=coordination), options.seed, options.games))
+        print(f"| {' | '.join(map(str, rows[-1]))} |", flush=True)
     if options.csv is not None:
         with options.csv.open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerows([Row._fields, *rows])
+            csv.writer(file, lineterminator="\n").writerows([Row._fields, *rows])
 
 
 if __name__ == "__main__":

@@ -496,13 +496,16 @@ class EntropySchedule(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         model: Any = self.model
-        self.logger.record("train/ent_coef", model.ent_coef)  # SB3 writes it beside the losses of the last update
+        self.logger.record("train/ent_coef", self._now())  # SB3 writes it beside the losses of the last update
         model.ent_coef = self._start
 
     def _on_rollout_end(self) -> None:
         model: Any = self.model
-        done = self.num_timesteps / self.locals["total_timesteps"]
-        model.ent_coef = self._start + min(done, 1.0) * (self.end - self._start)
+        model.ent_coef = self._now()
+
+    def _now(self) -> float:
+        done = self.model.num_timesteps / self.locals["total_timesteps"]
+        return self._start + min(done, 1.0) * (self.end - self._start)
 
     def _on_training_end(self) -> None:
         model: Any = self.model

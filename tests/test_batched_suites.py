@@ -153,6 +153,33 @@ def test_an_end_is_no_time_limit() -> None:
         if dones[0]:
             break
     assert dones[0] and infos[0]["TimeLimit.truncated"] is False and infos[0]["terminal_observation"]["active"] == 0
+    venv.reset()
+    for day in range(1, 7):  # told on the last of six days
+        _, rewards, dones, infos = venv.step(tell if day == 6 else np.zeros(6, dtype=np.int64))
+    assert dones.all() and rewards.all() and infos[0]["TimeLimit.truncated"] is False
+
+
+@needs_jaxmarl
+def test_moves_of_hanabi_are_masked() -> None:
+    """Its method is called otherwise than those of other games."""
+    venv = rows_of("jaxmarl/hanabi", 4, seed=0)
+    rows, rng = venv.reset(), np.random.default_rng(0)
+    for _ in range(30):
+        masks = rows["action_mask"]
+        assert 0 < masks.sum() < masks.size and (masks.sum(axis=1).reshape(-1, 2).min(axis=1) == 1).all()  # one waits
+        rows, *_ = venv.step(np.array([rng.choice(np.flatnonzero(mask)) for mask in masks]))
+
+
+@needs_jaxmarl
+def test_shaped_rewards_have_their_first_weight_after_new_seeds() -> None:
+    venv = rows_of("overcooked/cramped_room", 4, seed=0, max_steps=10, reward_shaping=1.0, reward_shaping_steps=40)
+    venv.reset()
+    for _ in range(10):
+        venv.step(np.zeros(8, dtype=np.int64))
+    assert venv.checkpoint_state()["games"]["n_steps"] == 40
+    venv.seed(1)
+    venv.reset()
+    assert venv.checkpoint_state()["games"]["n_steps"] == 0
 
 
 @needs_jaxmarl

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
+import sb3_saf
 from benchmarks import diagnosis, scripted
 from benchmarks.scripted_teams import TEAMS
 from hecogrid_envs.batch import GameBatch
-from hecogrid_envs.constants import Command, Direction
+from hecogrid_envs.constants import Direction
 from hecogrid_envs.params import HECOGridParams
 from sb3_saf.experiments.definitions import Cell, Level, RunConfig
 from sb3_saf.experiments.results import Results
-from sb3_saf.training.folders import write_run
-from sb3_saf.training.settings import load_settings
+from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.training.folders import TEST_GAMES, write_run
 from tests.levels import State, level
 
 WEST = int(Direction.WEST)
@@ -99,19 +99,30 @@ def test_a_key_comes_first(name: str) -> None:
 def test_the_command_writes_its_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Rows for every level and team, printed and in a file; teams with full sight collect more."""
-    path = tmp_path / "scale.csv"
-    line = f"scripted --tasks TeamSupport --coordination 1 --games 4 --csv {path}"
-    monkeypatch.setattr(sys, "argv", line.split())
+    """Rows for every level and team, printed and in a file; teams that see more collect more."""
+    path = tmp_path / "scripted.csv"
+    monkeypatch.setattr(sys, "argv", f"scripted --tasks TeamSupport --coordination 1 --games 4 --csv {path}".split())
     scripted.main()
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(scripted.SIZES) * len(TEAMS)
+    rows = pd.read_csv(path)
+    assert rows["team"].tolist() == list(TEAMS)
     assert len(capsys.readouterr().out.splitlines()) == 2 + len(rows)
-    for grid_size in ("15", "22", "30"):
-        means = [float(row["mean"]) for row in rows if row["grid_size"] == grid_size]
-        assert means == sorted(means)
-        assert means[0] < means[1] / 2
+    returns = rows["return_mean"].tolist()
+    assert returns == sorted(returns)
+    assert returns[0] < returns[1] / 2
+
+
+def test_scripts_play_the_test_games_of_trained_teams() -> None:
+    """The 33rd game is the first of the second batch of :func:`sb3_saf.training.folders.play_test`."""
+    env = sb3_saf.make_team_env("TeamSupport-v0", n_envs=TEST_GAMES)
+    batch = GameBatch("TeamSupport", HECOGridParams())
+    games = list(scripted.test_games(7, TEST_GAMES + 2))
+    for test, rows in ((0, games[:TEST_GAMES]), (1, games[TEST_GAMES:])):
+        env.seed(evaluation_seed(7, test=test))
+        env.reset()
+        for number, game in enumerate(rows):
+            batch.reset(seeds=[game])
+            walls = env.env_method("get_state", indices=[number * batch.params.n_agents])[0]["walls"]
+            np.testing.assert_array_equal(walls, batch.get_state()["walls"])
 
 
 # --- diagnosis --------------------------------------------------------------------------------------------------------
@@ -122,50 +133,39 @@ OVERRIDES = {"policy_kwargs": {"features_extractor_class": "LightEncoder", "net_
 
 
 def save_team(folder: Path, method: str, seed: int) -> None:
-    level = {"coordination": 2, "heterogeneity": 3}
-    settings = load_settings(method, "TeamSupport-v0", "small", overrides={**OVERRIDES, "env_kwargs": level})
+    config, at = RunConfig("small", OVERRIDES), Level.of(coordination=2, heterogeneity=3)
+    of = Cell(method, "TeamSupport-v0", at, seed)
+    settings = config.settings(of)
     model = settings.make_model(settings.make_env(seed), seed, device="cpu")
     cell = folder / "cells" / "TeamSupport-c2-h3" / method / f"seed-{seed}"
     cell.mkdir(parents=True)
     model.save(cell / "model.zip")
-    description = RunConfig("small", OVERRIDES).describe(Cell(method, "TeamSupport-v0", Level.of(**level), seed))
-    write_run(cell, **description, command="")
+    write_run(cell, **config.describe(of), command="")
 
 
 def test_it_looks_into_every_trained_team(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for method, seed in (("saf", 0), ("saf", 1), ("ippo", 0)):
+    for method, seed in (("saf", 0), ("saf-paper-no-pool", 1), ("ippo", 0)):
         save_team(tmp_path, method, seed)
     results = Results(tmp_path)
     results.save_config(RunConfig("small", OVERRIDES))
     assert [str(cell) for cell in diagnosis.cells(results)] == [
         "ippo TeamSupport c=2, h=3 seed 0",
         "saf TeamSupport c=2, h=3 seed 0",
-        "saf TeamSupport c=2, h=3 seed 1",
+        "saf-paper-no-pool TeamSupport c=2, h=3 seed 1",
     ]
     assert not list(diagnosis.cells(results, "TeamTogether-*"))
-    kept = tmp_path / "numbers.json"
-    monkeypatch.setattr(sys, "argv", ["diagnosis", str(tmp_path), "--episodes", "2", "--json", str(kept)])
+    kept = tmp_path / "numbers.csv"
+    monkeypatch.setattr(sys, "argv", ["diagnosis", str(tmp_path), "--episodes", "2", "--csv", str(kept)])
     diagnosis.main()
-    numbers = json.loads(kept.read_text())
-    ippo, saf = numbers["TeamSupport c2-h3 ippo"], numbers["TeamSupport c2-h3 saf"]
+    teams = pd.read_csv(kept).set_index("method")
+    ippo, saf = teams.loc["ippo"], teams.loc["saf"]
     assert saf["knowledge_source/read_entropy"] > 0.9  # untrained: attention is nearly uniform
     assert 0 <= saf["pool/zone_dependence"] < 0.1
-    assert not any(name.startswith(("pool", "message")) for name in ippo)
+    assert ippo.filter(regex="pool|message").isna().all()
     assert 0 <= ippo["greedy"] <= 25
-    for zone in range(3):  # untrained: three of seven commands do nothing
-        assert 0.3 < ippo[f"useless/zone_{zone}"] < 0.55
-    header, _, first, second = capsys.readouterr().out.strip().splitlines()
+    header, _, first, second, _ = capsys.readouterr().out.strip().splitlines()
     assert header.startswith("| task | level | method | critic/bias |")
     assert first.startswith("| TeamSupport | c2-h3 | ippo |")
     assert second.count("|") == header.count("|")
-
-
-def test_useless_commands_are_counted_by_zone() -> None:
-    commands = np.array([Command.FORWARD, Command.TOGGLE, Command.DONE, Command.DROP, Command.PICKUP], dtype=np.uint8)
-    zones = np.array([0, 0, 2, 2, 2])
-    counted = diagnosis.useless_commands("TeamSupport", commands, zones)
-    assert counted == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(2 / 3)}
-    with_keys = diagnosis.useless_commands("KeyForTreasure", commands, zones)
-    assert with_keys == {"useless/zone_0": 0.5, "useless/zone_2": pytest.approx(1 / 3)}

@@ -65,6 +65,22 @@ def test_the_end_of_a_stage_truncates_what_is_not_over() -> None:
     env.close()
 
 
+def test_new_seeds_begin_with_the_first_stage() -> None:
+    """A model that is made on used games trains on all stages."""
+    env = _staged()
+    env.reset()
+    assert _play(env, 20)[-1].coordination == 3
+    env.seed(1)
+    env.reset()
+    assert [played.coordination for played in _play(env, 10)] == [1] * 9 + [2]
+
+
+def test_evaluations_do_not_count_what_the_end_of_a_stage_cuts() -> None:
+    env = _staged()
+    result = sb3_saf.evaluate_team(sb3_saf.RandomPolicy(env, seed=0), env, 8)
+    assert result.lengths == [5] * 8
+
+
 def test_the_last_stage_plays_the_games_of_an_environment_of_that_level() -> None:
     stages = [Stage(2, {"coordination": 1})]
     staged = make_team_env("TeamSupport", 2, seed=0, coordination=3, curriculum=stages, **SMALL)

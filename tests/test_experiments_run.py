@@ -18,13 +18,14 @@ import numpy as np
 import psutil
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_saf import EvaluationResult, TeamMonitor
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.cell import Job, run_job
-from sb3_saf.experiments.definitions import Cell, Level, RunConfig, Selection, Shard, find_experiment
+from sb3_saf.experiments.cell import Job, play, run_job
+from sb3_saf.experiments.definitions import RANDOM, Cell, Level, RunConfig, Selection, Shard, find_experiment
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
 from sb3_saf.teams.files import differences, read_json, write_json
@@ -32,6 +33,7 @@ from sb3_saf.teams.vec_env import game_seeds_of
 from sb3_saf.training.folders import finish_run
 from sb3_saf.training.train import main as train_main
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
+from tests.toy_envs import Game
 
 SMOKE = RunConfig("smoke", episodes=32, eval_freq=200, eval_episodes=2)
 #: Two methods that train fast, and a random team, at two levels of ``joint``.
@@ -574,3 +576,19 @@ def test_a_check_sees_edited_numbers(undisturbed: Path, tmp_path: Path, capsys: 
     printed = capsys.readouterr().out
     assert "equal, bit for bit: learning curve, evaluations, best weights, weights\n" in printed
     assert "c2-h2.json has changed" in printed and "return_mean was 99.0, now None" in printed
+
+
+class BoundedEnv(Game):
+    """Agents are paid their actions: up to 1, and up to 10."""
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return spaces.Box(0, 1 if agent == "a" else 10, (1,), np.float32)
+
+    def change(self, out: list[Any]) -> None:
+        out[1] = {agent: float(action[0]) for agent, action in self.actions.items()}
+
+
+def test_random_teams_draw_within_the_bounds_of_each_agent(tmp_path: Path) -> None:
+    cell = Cell(RANDOM, "tests.test_experiments_run:BoundedEnv", Level.of(), 0, (Level.of(),))
+    (played,) = play(Job(cell, RunConfig("smoke", episodes=128)), Level.of(), None, tmp_path).plays
+    np.testing.assert_allclose(played.agent_means, [4 * 0.5, 4 * 5], rtol=0.1)

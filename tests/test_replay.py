@@ -20,6 +20,7 @@ from sb3_saf.inspection import replay as replay_module
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.inspection.replay import replay
 from sb3_saf.training import replay as command
+from sb3_saf.training.train import train
 from tests.test_training_commands import failed
 from tests.toy_envs import CounterEnv
 
@@ -227,6 +228,21 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
     browser.find_element("id", "play").click()
     assert browser.find_element("id", "play").text == "Pause"
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_returns_have_the_scale_of_values_that_were_learned_with_normalize(tmp_path: Path) -> None:
+    words = "--algo mappo --env TeamSupport-v0 --size smoke --seed 0 --eval-freq -1 --verbose 0 -params normalize:true"
+    train(["-f", str(tmp_path), *words.split()])
+    model = tmp_path / "mappo" / "TeamSupport-v0_1" / "TeamSupport-v0.zip"
+    command.main(["--model", str(model), "-o", str(tmp_path / "page.html")])
+    data, expected = data_of(tmp_path / "page.html"), 0.0
+    (run,) = data["runs"]
+    for reward in unpacked(run["rewards"])[::-1] / data["n_agents"]:  # an agent's share
+        expected = reward + 0.99 * expected
+    assert expected > 0
+    with np.load(model.with_suffix(".vecnormalize.npz")) as statistics:
+        expected /= float(statistics["returns var"]) ** 0.5
+    assert unpacked(run["returns"])[0, 0] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -21,6 +22,7 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_saf import EvaluationResult, evaluate_team
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training import enjoy as zoo_enjoy
+from sb3_saf.training import figures
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run, training_curve, write_run
@@ -242,10 +244,44 @@ def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
         *["saf, variant 1"] * 2,
         "saf, variant 2",
     ]
-    assert table["changes"][2] == "ent_coef=0.02 gamma=0.912 n_policies=2 n_slots=3"
+    assert table["changes"][2] == "ent_coef=0.02 gamma=0.9123456 n_policies=2 n_slots=3"
     for number in (1, 2):
         fake_run(tmp_path / "shared", number, seed=number, game_steps=80)
     assert list(describe(find_runs(tmp_path / "shared"))["method"]) == ["saf", "saf"]  # what all share is not named
+
+
+def test_games_that_state_a_parameter_and_games_that_do_not_are_apart(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, stated in ((1, {}), (2, {"max_cycles": 7})):
+        settings = load_settings("saf", "tests.toy_envs:CounterEnv", "smoke", stated)
+        write_run(tmp_path / "saf" / f"Counter_{number}", settings.as_dict(), 0, "")
+    table = describe(find_runs(tmp_path))
+    assert table["max_cycles"].tolist() == ["default", 7]
+    assert [name.partition(", ")[2] for name in setting_names(table)] == ["max_cycles default", "max_cycles 7"]
+    first, *others = describe(find_runs(logs)).to_dict("records")
+    table = pd.DataFrame([{**first, "coordination": "default"}, *others])
+    monkeypatch.setattr(zoo_plot, "describe", lambda _: table)
+    zoo_plot.main(["levels", "-f", str(logs), "-o", str(tmp_path / "levels.png")])
+    assert capsys.readouterr().err == f"left out: {first['run'].folder} states no coordination\n"
+
+
+def test_returns_of_games_without_a_largest_one_are_shares_of_their_range(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Returns of different games cannot be averaged; those of treasures are shares of all treasures."""
+    drawn: list[dict[str, Any]] = []
+
+    def draw(scores: dict[str, Any], *_: Any) -> Any:
+        drawn.append(scores)
+        return plt.figure()
+
+    monkeypatch.setattr(figures, "draw_aggregates", draw)
+    table = describe(find_runs(logs, ["saf"])).drop(columns="n_treasures")
+    monkeypatch.setattr(zoo_plot, "describe", lambda _: table)
+    zoo_plot.main(["aggregate", "-f", str(logs), "--algos", "saf", "-o", str(tmp_path / "a.png")])
+    (scores,) = drawn[0].values()
+    assert scores.min(axis=0).tolist() == [0, 0] and set(scores.max(axis=0)) <= {0, 1}
 
 
 def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: Path) -> None:

@@ -90,7 +90,9 @@ def test_a_failed_trial_is_never_complete(
         return True  # and last_mean_reward stays -inf
 
     monkeypatch.setattr(SeededEvalCallback, "_evaluate", evaluate)
-    assert failed(given(tmp_path), capsys)
+    line = failed(given(tmp_path), capsys)
+    why = "; the last error: NaN in the logits" if failure == "diverged" else ""
+    assert f"none of 1 trials was completed{why}" in line
     (trial,) = load_study(str(tmp_path / "study.log")).trials
     assert (trial.state, trial.value) == (TrialState.PRUNED, None)
 
@@ -120,6 +122,9 @@ def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for other, words in (
         (("--algo", "mappo"), "algo was 'saf', now 'mappo'"),
         (("--env-kwargs", "coordination:2"), "coordination was 1, now 2"),
+        (("--eval-env-kwargs", "coordination:2"), "eval_env_kwargs"),
+        (("--eval-episodes", "2"), "eval_episodes was 4, now 2"),
+        (("-params", "gamma:0.5"), "gamma"),
     ):
         line = failed(given(tmp_path, *other), capsys)
         assert "the trials of the study 's' cannot be compared with these" in line and words in line
@@ -152,6 +157,15 @@ def test_what_is_sampled_joins_the_other_settings(algo: str) -> None:
     assert policy_kwargs["features_extractor_class"] is LightEncoder
     assert policy_kwargs.items() >= dict(ALGOS[algo].policy_kwargs).items()
     assert settings.hyperparams["learning_rate"] != 7e-4
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_sizes_of_parts_that_a_method_lacks_are_not_searched(algo: str) -> None:
+    """A pool would make VDN another method, and PQN refuses one."""
+    sampled = _sampled(algo).get("policy_kwargs", {})
+    is_saf = algo.startswith("saf")
+    assert ("n_policies" in sampled) == ((is_saf or "pool" in algo) and "no-pool" not in algo)
+    assert ("n_slots" in sampled) == (is_saf and "no-ks" not in algo)
 
 
 def test_what_is_given_is_not_searched() -> None:

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.rows import STAGGERED, TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 
 
@@ -31,8 +32,9 @@ class Curriculum(TeamVecEnvWrapper):
     Vector environment that plays the games of several stages in turn; the last stage has no end.
 
     At the end of a stage, running episodes are truncated as by a time limit, with ``TimeLimit.truncated`` and
-    ``terminal_observation`` in their infos; a rollout may therefore span two stages. Attributes, methods and seeds are
-    those of the games of the present stage.
+    ``terminal_observation`` in their infos; a rollout may therefore span two stages. Evaluations do not count these
+    episodes (``"staggered"`` in their infos). Attributes, methods and seeds are those of the games of the present
+    stage. Every step counts, also of games for evaluation; :meth:`seed`, which a new model calls, begins anew.
 
     :param stages: vector environments with equal spaces and rows; closed with this one
     :param game_steps: of every stage but the last, in game steps summed over all parallel games
@@ -64,16 +66,19 @@ class Curriculum(TeamVecEnvWrapper):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
-        Set the seeds of the games of all stages; each stage has different seeds, the first one those of ``seed``.
+        Set the seeds of the games of all stages, and begin with the first one; each stage has different seeds, the
+        first one those of ``seed``.
 
-        :return: (B,) the seed of each row's game in the present stage
+        :return: (B,) the seed of each row's game in the first stage
         """
+        self.game_steps = 0
+        self._enter(0)
         seeds = [seed] * len(self.stages)
         for number in range(1, len(seeds)):  # stages differ, so that they do not repeat each other's levels
             if seed is not None:
                 seeds[number] = int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0])
         chosen = [stage.seed(own) for stage, own in zip(self.stages, seeds, strict=True)]
-        return chosen[self.stage]
+        return chosen[0]
 
     def step_wait(self) -> VecEnvStepReturn:
         """Play one game step; if the stage ends with it, begin the next one."""
@@ -88,7 +93,7 @@ class Curriculum(TeamVecEnvWrapper):
                     {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
                 )
                 is_cut = bool(info.get("active", True))
-                info = {**info, "terminal_observation": last, "TimeLimit.truncated": is_cut}
+                info = {**info, TERMINAL_OBSERVATION: last, TRUNCATED: is_cut, STAGGERED: True}
             shown.append(info)
         self._enter(self._present_stage())
         return self.venv.reset(), rewards, np.ones_like(dones), shown

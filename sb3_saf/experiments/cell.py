@@ -161,7 +161,7 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
     cell, config, settings = job.cell, job.config, job.config.settings(job.cell, level)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=min(TEST_GAMES, config.episodes))
     plays = []
-    player = RandomPolicy(env.action_space, seed=cell.seed) if model is None else model
+    player = RandomPolicy(env, seed=cell.seed) if model is None else model
     draws = (DRAWN, MOST_LIKELY) if settings.spec.draws_actions else (MOST_LIKELY,)
     for policy, actions in product((BEST, LAST), draws) if cell.is_trained else [(BEST, DRAWN)]:
         if model is not None:

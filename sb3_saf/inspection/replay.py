@@ -21,7 +21,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.evaluation import check_trained_on, play
 from sb3_saf.export.act import Actor
@@ -61,6 +61,7 @@ def replay(
     seed: int = 20_000,
     deterministic: bool = False,
     gamma: float | Mapping[str, float] | None = None,
+    normalizer: VecNormalize | None = None,
 ) -> Path:
     """
     Play episodes and write a page that shows them agent by agent, offline and without a server.
@@ -78,6 +79,7 @@ def replay(
     :param seed: seed of games and actions; all models play the same games
     :param deterministic: whether to take the most likely actions
     :param gamma: discount factor of the returns, for all models or by their names; None for the models' own
+    :param normalizer: normaliser of the returns beside the values of policies; models have their own
     :return: the path
     :raises ValueError: if a model was trained on other spaces, there are too few games, or they cannot be shown
     """
@@ -109,7 +111,11 @@ def replay(
             policy = player.policy if isinstance(player, BaseAlgorithm) else player
             given = gamma[name] if isinstance(gamma, Mapping) else gamma
             discount = float(getattr(player, "gamma", 1.0)) if given is None else given
-            recording = record_episodes(policy, env, env.num_envs // n_agents, seed, deterministic, gamma=discount)
+            recording = record_episodes(
+                *(policy, env, env.num_envs // n_agents, seed, deterministic),
+                gamma=discount,
+                normalizer=player.get_vec_normalize_env() if isinstance(player, BaseAlgorithm) else normalizer,
+            )
             played = [_episode_of(recording, game) for game in range(episodes)]
         for game, episode in enumerate(played):
             pictures = [base64.b64encode(png(frame)).decode() for frame in episode.frames]

@@ -81,7 +81,7 @@ _PACKAGES: Final = (
     *("numpy", "numba", "gymnasium", "pettingzoo", "supersuit"),
 )
 _NUMBERED: Final = re.compile(r"(.+)_(\d+)")
-_SAVED_MODEL: Final = re.compile(r"rl_model_(\d+)_steps\.zip")
+SAVED_MODEL: Final = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -380,7 +380,7 @@ def find_model(
         raise ValueError(f"there is no run {number} of {environment.id} in {log_folder / algo}; there are {[*runs]}")
     folder = runs[number or max(runs)]
     if which == "last":
-        saved = [(int(match[1]), path) for path in folder.iterdir() if (match := _SAVED_MODEL.fullmatch(path.name))]
+        saved = [(int(match[1]), path) for path in folder.iterdir() if (match := SAVED_MODEL.fullmatch(path.name))]
         path = max(saved)[1] if saved else None
     elif which == "best":
         path = folder / "best_model.zip"

@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 PROGRAM: Final = "python -m sb3_saf.plot"
 #: Maximum number of changed settings in a method's name.
 _MOST_NAMED: Final = 2
+#: Value of a parameter that a run leaves to the game.
+_DEFAULT: Final = "default"
 #: Columns of :func:`describe` that are not parameters of the game.
 _NO_LEVELS: Final = ("env", "size", "seed", "run", "changes", "method")
 
@@ -86,8 +88,12 @@ def _draw(options: argparse.Namespace) -> Figure:
     table = describe(runs)
     if options.kind == "levels" and options.level not in table:
         raise unknown_name("parameter", options.level, (column for column in table if column not in _NO_LEVELS))
-    without = [options.level] if options.kind == "levels" else []
-    table["setting"] = setting_names(table, without)
+    if options.kind == "levels":
+        without = table[options.level].isna() | (table[options.level] == _DEFAULT)
+        for run in table["run"][without]:
+            print(f"left out: {run.folder} states no {options.level}", file=sys.stderr)
+        table = table[~without].reset_index(drop=True)
+    table["setting"] = setting_names(table, [options.level] if options.kind == "levels" else [])
     for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
         if changes not in method:
             print(f"{method}: {changes}")
@@ -104,6 +110,13 @@ def _draw(options: argparse.Namespace) -> Figure:
         return draw_levels(table, options.level, options.title, panel="setting", y_label=y_label)
     if are_treasures:
         table["score"], y_label = table["score"] / table["n_treasures"], "treasures collected / on the map"
+    else:
+        of_setting = table.groupby("setting")["score"]
+        low, span = of_setting.transform("min"), of_setting.transform("max") - of_setting.transform("min")
+        table["score"], y_label = (
+            (table["score"] - low) / span.where(span > 0, 1.0),
+            "return / range of the setting's runs",
+        )
     return draw_aggregates(score_matrices(table, "setting"), options.title, y_label)
 
 
@@ -136,12 +149,16 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
     """
     Describe runs in a table.
 
-    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game. A
-        method's name contains its differences from the zoo's settings and from other runs, or a number if these are too
-        many; ``changes`` lists them. Of runs that differ only in their number, the table has the latest
+    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game;
+        ``default`` stands for those that only other runs of the game state. A method's name contains its differences
+        from the zoo's settings and from other runs, or a number if these are too many; ``changes`` lists them. Of runs
+        that differ only in their number, the table has the latest
     """
     import pandas as pd
 
+    stated: dict[str, dict[str, str]] = {}
+    for run in runs:
+        stated.setdefault(run.settings.env_id, {}).update(dict.fromkeys(run.settings.env_kwargs, _DEFAULT))
     from_zoo = [_different_from_the_zoo(run.settings) | _measured_otherwise(run) for run in runs]
     kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
     variants: dict[str, dict[str, int]] = {}
@@ -156,7 +173,8 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
             numbers = variants.setdefault(kind[0], {})
             method = f"{kind[0]}, variant {numbers.setdefault(changes, len(numbers) + 1)}"
         identity = {"env": run.settings.env_id, "size": run.settings.size, "seed": run.seed}
-        rows.append({**identity, **run.settings.env_kwargs, "run": run, "changes": changes, "method": method})
+        level = {**stated[run.settings.env_id], **run.settings.env_kwargs}
+        rows.append({**identity, **level, "run": run, "changes": changes, "method": method})
     table = pd.DataFrame(rows)
     repeated = [column for column in table.columns if column != "run"]
     return table.drop_duplicates(repeated, keep="last", ignore_index=True)
@@ -175,7 +193,7 @@ def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
         for key in {**theirs, **ours}
         if repr(ours.get(key)) != repr(theirs.get(key)) and key != "policy_kwargs"
     }
-    return {key: f"{value:.3g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+    return {key: str(value) for key, value in values.items()}  # unrounded: what differs is another method
 
 
 def _measured_otherwise(run: Run) -> dict[str, str]:
@@ -189,14 +207,16 @@ def _measured_otherwise(run: Run) -> dict[str, str]:
 
 
 def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
-    """Name the games of each row of :func:`describe`: the environment, and the parameters in which the rows differ."""
+    """Name the games of each row of :func:`describe`: the environment, and the parameters in which its rows differ."""
     named = {"method", "changes", "seed", "env", "run", *without}
-    varying = [column for column in table.columns if column not in named and table[column].nunique() > 1]
-    names = []
-    for _, row in table.iterrows():
-        parameters = row[varying].dropna()
-        names.append(", ".join([row["env"].removesuffix("-v0"), *(f"{c} {v}" for c, v in parameters.items())]))
-    return names
+    columns = [column for column in table.columns if column not in named]
+    names: dict[Any, str] = {}
+    for env, rows in table.groupby("env", sort=False):
+        varying = [column for column in columns if rows[column].astype(str).nunique() > 1]
+        for index, row in rows[varying].iterrows():
+            parameters = [f"{name} {value}" for name, value in row.items()]
+            names[index] = ", ".join([str(env).removesuffix("-v0"), *parameters])
+    return [names[index] for index in table.index]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
+
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_saf.export.act import Actor
 from sb3_saf.inspection.replay import replay
@@ -73,8 +75,13 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
             if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
                 raise ValueError("a model with normalize is shown alone: its games are normalised with its statistics")
             load_normalization(games, paths[0])
+            normalizer, given = unwrap_vec_normalize(games), settings[0].wrapping.get("normalize")
+            if normalizer is not None:  # values are of normalised rewards, as in training
+                normalizer.norm_reward = not isinstance(given, Mapping) or given.get("norm_reward", True)
             gamma = {name: own.hyperparams.get("gamma", 0.99) for name, own in zip(players, settings, strict=True)}
-            return replay(players, games, options.output, options.episodes, seed, options.deterministic, gamma)
+            return replay(
+                players, games, options.output, options.episodes, seed, options.deterministic, gamma, normalizer
+            )
 
 
 def _settings_of(path: Path, options: argparse.Namespace) -> Settings:

@@ -155,7 +155,10 @@ def _add_tuning(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--n-evaluations", type=at_least(1), default=5, help="evaluations of a trial")
     group.add_argument(
-        "--n-jobs", type=at_least(1, -1), default=1, help="trials at once in threads; processes scale better"
+        "--n-jobs",
+        type=at_least(1, -1),
+        default=1,
+        help="trials at once in threads, which share random numbers; better: processes",
     )
     group.add_argument("--sampler", choices=["random", "tpe"], default="tpe", help="Optuna's sampler")
     group.add_argument("--pruner", choices=["halving", "median", "none"], default="median", help="Optuna's pruner")
@@ -353,9 +356,9 @@ def _tune(options: argparse.Namespace, command: str) -> None:
         n_evaluations=options.n_evaluations,
         **{key: getattr(options, key) for key in keys},
     )
-    steps = settings.game_steps
-    goal = plain({"algo": settings.algo, "env": settings.env_id, "game_steps": steps, **settings.env_kwargs})
-    print(f"Tuning {settings.algo} on {settings.env_id}: {steps:,} game steps a trial")
+    evaluated = {name: getattr(options, name) for name in ("eval_env_kwargs", "eval_episodes", "deterministic_eval")}
+    goal = plain({**settings.as_dict(), **evaluated})
+    print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
     with user_errors():
         study = optimize(
             lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options)))[0],

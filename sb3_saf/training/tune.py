@@ -8,7 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.teams.checks import MAX_SEED
 from sb3_saf.teams.files import differences
 from sb3_saf.training.run import RunOptions, SeededEvalCallback, Training
-from sb3_saf.training.settings import Settings, algorithm_arguments, policy_arguments
+from sb3_saf.training.settings import Settings, algorithm_arguments
 
 #: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.
 _COUNTED: Final = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
@@ -33,6 +33,8 @@ _JOURNAL: Final = ".log"
 _ATTEMPTS: Final = 10
 #: Attribute of a trial: host and number of its process.
 _PROCESS: Final = "process"
+#: Attribute of a trial: what ended it.
+_ERROR: Final = "error"
 
 # --- search spaces ----------------------------------------------------------------------------------------------------
 
@@ -84,11 +86,11 @@ def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[st
     if "learning_rate" in trial.params:
         trial.suggest_categorical(_LR_SCHEDULE, ("constant", _LINEAR))
     settled = {**spec.policy_kwargs, **fixed.get("policy_kwargs", {})}
-    if settled.get("knowledge_source") is False:
-        settled["n_slots"] = None  # no slots without a knowledge source
-    arguments = policy_arguments(spec.policy_class)
+    parts = getattr(spec.policy_class, "parts_class", None)
+    method = {**({field.name: field.default for field in fields(parts)} if is_dataclass(parts) else {}), **settled}
+    searched = {"n_policies": method.get("n_policies", 1) > 1, "n_slots": method.get("knowledge_source", False)}
     for name, suggest in _POLICY_SEARCH.items():
-        if name in arguments and name not in settled:
+        if searched[name] and name not in settled:  # of the parts that the method has
             suggest(trial, name)
     return to_overrides(trial.params)
 
@@ -156,7 +158,7 @@ def optimize(
     Run trials and return the study.
 
     :param goal: what is tuned on what, for how long; the trials of one study are of one goal
-    :raises ValueError: if the study's trials are of another goal
+    :raises ValueError: if the study's trials are of another goal, or none of them was completed
     """
     pruner: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
     if tuning.pruner == "halving":
@@ -197,6 +199,10 @@ def optimize(
         callbacks=callbacks,
         gc_after_trial=True,
     )
+    trials = study.get_trials(deepcopy=False)
+    if all(trial.state is not TrialState.COMPLETE for trial in trials):
+        why = [trial.user_attrs[_ERROR] for trial in trials if _ERROR in trial.user_attrs]
+        raise ValueError(f"none of {len(trials)} trials was completed{f'; the last error: {why[-1]}' if why else ''}")
     return study
 
 
@@ -220,6 +226,7 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
         with closing(Training(settings, seed, folder, options)) as training:
             training.learn()
     except (AssertionError, ValueError) as error:  # sampled settings may lead to NaN
+        trial.set_user_attr(_ERROR, str(error))
         raise optuna.TrialPruned(str(error)) from error
     assert training.evaluation is not None
     value = float(training.evaluation.last_mean_reward)

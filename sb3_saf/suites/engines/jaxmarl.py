@@ -108,7 +108,7 @@ class JaxPrograms:
         self._action_spaces = [env.action_space(agent) for agent in self.agents]
         width = max(_size(one) for one in self._observations.values())
         counts = self._n_actions
-        has_masks = bool(counts) and (self.gives_masks or len(set(counts)) > 1)
+        has_masks = bool(counts) and (self.legal_actions is not None or len(set(counts)) > 1)
         self.rows = TeamSpaces(
             # Also flags and counts in bytes: as a Box of bytes they would be scaled as pictures are.
             spaces.Box(-np.inf, np.inf, (width,), np.float32),
@@ -126,13 +126,15 @@ class JaxPrograms:
     # ---- spaces
 
     @cached_property
-    def gives_masks(self) -> bool:
-        """Whether the environment provides action masks."""
-        try:
-            jax.eval_shape(self.env.get_avail_actions, self._state_form)
-        except (NotImplementedError, AttributeError):
-            return False
-        return True
+    def legal_actions(self) -> Callable[[Any], Mapping[str, Any]] | None:
+        """The environment's method that gives action masks of a state by agent, None if it has none."""
+        for name in ("get_avail_actions", "get_legal_moves"):
+            method: Callable[[Any], Mapping[str, Any]] | None = getattr(self.env, name, None)
+            with contextlib.suppress(NotImplementedError, AttributeError):
+                if method is not None:
+                    jax.eval_shape(method, self._state_form)
+                    return method
+        return None
 
     @cached_property
     def _n_actions(self) -> list[int]:
@@ -226,7 +228,7 @@ class JaxPrograms:
                 agent: actions[index, : shape[0]]
                 for index, (agent, shape) in enumerate(zip(self.agents, shapes, strict=True))
             }
-        legal = self.env.get_avail_actions(game.state) if self.gives_masks else None
+        legal = None if self.legal_actions is None else self.legal_actions(game.state)
         chosen = {}
         for index, (agent, count) in enumerate(zip(self.agents, self._n_actions, strict=True)):
             chosen[agent] = actions[index]
@@ -262,7 +264,7 @@ class JaxPrograms:
 
     def _masks(self, state: Any) -> Any:
         """Return legal actions (N, A); actions that an agent lacks are illegal."""
-        legal: Any = self.env.get_avail_actions(state) if self.gives_masks else {}
+        legal: Mapping[str, Any] = {} if self.legal_actions is None else self.legal_actions(state)
         width = max(self._n_actions)
         own = [legal.get(agent, np.ones(n)) for agent, n in zip(self.agents, self._n_actions, strict=True)]
         return jnp.stack([_padded(one, width, np.int8) for one in own])
@@ -307,7 +309,8 @@ class JaxGames(ResumableBatch):
         return self._programs.packing.unpack([np.asarray(buffer) for buffer in self._buffers])
 
     def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
-        """Begin an episode in every game (see the base class)."""
+        """Begin an episode in every game (see the base class); with seeds, extra rewards have their first weight."""
+        self._n_steps = self._n_steps if seeds is None else 0
         keys = self.games.key if seeds is None else np.array([divmod(s, 2**32) for s in seeds], dtype=np.uint32)
         self._buffers, rows = self._programs.begin(keys)
         return self._on_host(rows)
@@ -380,6 +383,10 @@ def _battle(state: Any) -> Any:
     return getattr(state, "state", state)
 
 
+def _never(_env: Any, _state: Any) -> Any:
+    return False
+
+
 def _both_alive(env: Any, state: Any) -> Any:
     allies, enemies = _sides(env, state)
     return allies & enemies
@@ -438,6 +445,7 @@ _SMAX: Final = Rules(is_undecided=_both_alive, is_won=_enemies_dead, pays_the_de
 _RULES: Final[dict[str, Rules]] = {
     "SMAX": _SMAX._replace(is_won=None),  # both sides are trained, one wins
     "HeuristicEnemySMAX": _SMAX,
+    "switch_riddle": Rules(is_undecided=_never),  # its number of days is a rule of the riddle
     "overcooked": Rules(extra_reward=_shaped, draw=_draw_overcooked),
     "overcooked_v2": Rules(extra_reward=_shaped, draw=_draw_overcooked_v2),
 }
