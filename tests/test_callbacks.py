@@ -271,6 +271,17 @@ def test_the_bonus_is_gone_at_the_end_also_of_a_training_that_goes_on() -> None:
     assert seen.coefficients[2:] == pytest.approx([0.005, 0.0])
 
 
+def test_the_coefficient_that_is_logged_first_is_that_of_the_steps_before(tmp_path: Path) -> None:
+    """As after a resume, where the model has its first coefficient again."""
+    model = learner(PPO, ent_coef=0.09, batch_size=ROLLOUT, n_epochs=1)
+    model.learn(2 * ROLLOUT)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(ROLLOUT, EntropySchedule(), log_interval=1, reset_num_timesteps=False)
+    model.logger.close()
+    with (tmp_path / "progress.csv").open() as file:
+        assert [float(row["train/ent_coef"]) for row in csv.DictReader(file)] == pytest.approx([0.03])
+
+
 def test_what_has_no_entropy_coefficient_is_refused() -> None:
     env = CentralizedValueWrapper(TeamVenv(lengths=(3, 2)))
     model = QPLEX("QPLEXPolicy", env, replay_buffer_class=TeamReplayBuffer, buffer_size=100, device="cpu")
