@@ -26,6 +26,7 @@ from sb3_saf.experiments.tables import (
     RUNS,
     Difference,
     Frames,
+    complete,
     holm,
     keys_of,
     marl_eval,
@@ -35,7 +36,15 @@ from sb3_saf.experiments.tables import (
 )
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.figures import draw_curves, draw_differences
-from sb3_saf.training.statistics import FEWEST_SEEDS, Estimate, mean_over_seeds
+from sb3_saf.training.statistics import (
+    FEWEST_SEEDS,
+    Estimate,
+    Floats,
+    interquartile_means,
+    mean_over_seeds,
+    probability_of_improvement,
+    score_matrices,
+)
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 RAW: Final = ROOT / "results" / "paper"
@@ -62,8 +71,6 @@ WORDS: Final = {
     **{f"{name}-gru": f"{METHODS[name].words}, GRU" for name in ("saf", "mappo", "ippo")},
 }
 _COLUMNS: Final = ["task", "level"]
-#: What a setting varies, and its letter.
-_GROUPS: Final = {"coordination": "c", "heterogeneity": "h", "joint": "c and h"}
 #: Share of the treasures below which a setting says nothing about methods.
 _FLOOR: Final = 0.01
 #: Columns that tell trainings apart.
@@ -191,40 +198,29 @@ def answer(frames: Frames) -> str:
     return "\n".join(lines)
 
 
-def methods_table(tests: pd.DataFrame) -> str:
-    """Return a row for each method: mean share of the treasures by task and group, and its cost."""
-    trained_methods = tests[tests["method"].isin(MAIN)].groupby(_COLUMNS)["method"].transform("nunique")
-    common = tests.loc[trained_methods.index[trained_methods == len(MAIN)], _COLUMNS].drop_duplicates()
-    tests = tests.merge(common, on=_COLUMNS)
+def methods_table(tests: pd.DataFrame, unseen: pd.DataFrame) -> str:
+    """Return a row for each method: interquartile means of the treasures' share by task and group, and its cost."""
+
+    def scores(rows: pd.DataFrame) -> dict[str, Floats]:
+        rows = rows[rows["method"].isin(MAIN)]
+        return score_matrices(complete(rows.assign(stratum=keys_of(rows, "task", "train_level", "level"))), "stratum")
+
     columns = {
-        "all": tests["seed"] >= 0,
-        **{task: tests["task"] == task for task in dict.fromkeys(tests["task"])},
-        **{words: tests["group"] == group for group, words in _GROUPS.items()},
+        "all": tests,
+        **{task: tests[tests["task"] == task] for task in dict.fromkeys(tests["task"])},
+        "h > 1": tests[tests["heterogeneity"] > 1],
+        "other levels": unseen,
     }
+    everywhere = scores(tests)
+    means = {words: interquartile_means(scores(rows)) for words, rows in columns.items()}
+    seconds = tests.groupby("method")["processor_seconds"].mean()
     body = []
     for method in MAIN:
-        here = tests["method"] == method
-        cells = [_mean_share(tests[here & chosen]) for chosen in columns.values()]
-        seconds = f"{tests.loc[here, 'processor_seconds'].mean():.0f}"
-        probability = "" if method == "saf" else _probability(tests, method)
-        body.append([WORDS[method], cells[0], probability, seconds, *cells[1:]])
-    return table(["method", "all", "SAF is better", "seconds", *list(columns)[1:]], body)
-
-
-def _mean_share(rows: pd.DataFrame) -> str:
-    """Return the mean over settings of the mean over seeds, in percent of the treasures."""
-    by_setting = (100 * rows["return_mean"] / rows["max_return"]).groupby([rows["task"], rows["level"]]).mean()
-    return "" if by_setting.empty else f"{by_setting.mean():.1f}"
-
-
-def _probability(tests: pd.DataFrame, other: str) -> str:
-    """Return the probability that a run of SAF is better, ties half, the mean over settings."""
-    chances = []
-    for _, rows in tests.groupby(_COLUMNS):
-        ours, theirs = (rows.loc[rows["method"] == name, "return_mean"].to_numpy() for name in ("saf", other))
-        if len(ours) and len(theirs):
-            chances.append((np.sign(ours[:, None] - theirs).mean() + 1) / 2)
-    return f"{np.mean(chances):.2f}"
+        cells = ["{:.1f} [{:.1f}, {:.1f}]".format(*(100 * part for part in found[method])) for found in means.values()]
+        better = probability_of_improvement(everywhere["saf"], everywhere[method])
+        probability = "" if method == "saf" else "{:.2f} [{:.2f}, {:.2f}]".format(*better)
+        body.append([WORDS[method], *cells, probability, f"{seconds[method]:.0f}"])
+    return table(["method", *columns, "SAF is better", "seconds"], body)
 
 
 def claims_table(found: Sequence[Claim]) -> str:
@@ -431,7 +427,7 @@ def pages() -> dict[Path, str]:
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
         "answer": answer(frames),
-        "methods": methods_table(tests),
+        "methods": methods_table(tests, unseen),
         "claims": claims_table(claims(tests, unseen, pixels)),
         "memory": memory_table(frames, read(MEMORY)),
         "losses": losses(tests, pd.read_csv(RAW / "scripted.csv")),
