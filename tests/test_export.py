@@ -362,6 +362,43 @@ def test_acts_on_what_the_game_gives(kind: str, masks: str | None, tmp_path: Pat
         observations = {agent: observations[agent] for agent in game.agents}
 
 
+def test_likelihoods_of_actions_as_the_game_counts_them(tmp_path: Path) -> None:
+    class Started(Named):
+        def action_space(self, agent: Any) -> spaces.Space[Any]:
+            return spaces.Discrete(4, start=1)
+
+    env = make_team_env(Started, 1, seed=0, names="ab")
+    model: Any = PPO("MAPPOPolicy", env, seed=0, device="cpu")
+    with th.no_grad():
+        for parameter in model.policy.actor.parameters():
+            parameter.add_(0.5 * th.randn_like(parameter))
+    actor = Actor.load(export_actors(model, tmp_path))
+    observations, _ = Started("ab").reset()
+    rows, _ = model.policy.obs_to_tensor(env.reset())
+    with th.no_grad():
+        probabilities = model.policy.get_distribution(rows).distribution.probs.numpy()
+    for action in range(1, 5):
+        found = actor.log_prob(observations, {"a": action, "b": action})
+        np.testing.assert_allclose(np.exp(found), probabilities[:, action - 1], atol=1e-5)
+        np.testing.assert_allclose(actor.log_prob(observations["a"], action), found[0], atol=1e-6)
+    with pytest.raises(ValueError, match=r"expected \{agent: action\} of \['a', 'b'\]"):
+        actor.log_prob(observations, [1, 1])
+
+
+def test_confident_choices_of_flags_are_exported(tmp_path: Path) -> None:
+    policy = make_policy(MAPPOPolicy, VECTOR, spaces.MultiBinary(4))
+    with th.no_grad():
+        for parameter in policy.actor.parameters():
+            parameter.mul_(20)
+    actor = Actor.load(export_actors(policy, tmp_path), agent=0)
+    rows, actions = rows_of(policy, 40), samples(policy.action_space, 40)
+    with th.no_grad():
+        distribution = policy.get_distribution({key: th.as_tensor(value) for key, value in rows.items()})
+        expected = distribution.log_prob(th.as_tensor(actions).float())
+    assert expected.min() < -20
+    np.testing.assert_allclose(actor.log_prob(rows["obs"], actions), expected, rtol=1e-5, atol=1e-5)
+
+
 # --- programs with nothing but the files ------------------------------------------------------------------------------
 
 

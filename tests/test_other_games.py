@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -15,8 +17,9 @@ from gymnasium import spaces
 from pettingzoo import AECEnv
 from pettingzoo.test import parallel_api_test
 from sb3_contrib import MaskablePPO
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_saf import (
@@ -212,6 +215,19 @@ def test_an_agent_learns_from_all_that_the_game_pays_it(
     assert returns_of_a(game, gae_lambda) == expected
     env = make_team_env(game)
     assert evaluate_team(RandomPolicy(env, seed=0), env, 2).returns == [sum(paid)] * 2
+
+
+@pytest.mark.parametrize("algorithm", [partial(PPO, batch_size=32), A2C])
+def test_explained_variance_is_that_of_the_rows_of_agents_that_act(algorithm: Any) -> None:
+    game = Leaving((1, 2, 3), (5, 0, 0, 8), dies=True)  # a critic without gradients explains nothing of its one return
+    settings = {"rollout_buffer_class": TeamRolloutBuffer, "gamma": 0.5, "learning_rate": 0.0, "device": "cpu"}
+    model = algorithm("MAPPOPolicy", make_team_env(game, 2, seed=0), n_steps=8, seed=0, **settings).learn(32)
+    buffer = model.rollout_buffer
+    assert isinstance(buffer, TeamRolloutBuffer) and buffer.active is not None
+    active = buffer.active.reshape(8, 4) != 0
+    assert active.sum() == 20
+    expected = explained_variance(buffer.values[active], buffer.returns[active])
+    assert model.logger.name_to_value["train/explained_variance"] == pytest.approx(expected, abs=1e-4)
 
 
 class Alone(Game):
@@ -507,6 +523,28 @@ def test_success_of_a_step_is_that_of_all_agents_in_any_order() -> None:
         assert evaluate_team(RandomPolicy(env, seed=0), env, 2).success_rate == rate
 
 
+@pytest.mark.parametrize(("told", "rate"), [([False, False], 0), (np.array([True, False]), 0), ([True, True], 1)])
+def test_success_of_a_gymnasium_team_may_be_a_list(told: Any, rate: float) -> None:
+    class Telling(GymTeam):
+        def step(self, actions: Any) -> Any:
+            return *super().step(actions)[:4], {"is_success": told}
+
+    env = make_team_env(Telling(lambda t: (t >= 3, False)), seed=0)
+    assert evaluate_team(RandomPolicy(env, seed=0), env, 2).success_rate == rate
+
+
+def test_agents_in_another_order_are_refused() -> None:
+    class Turned(CounterEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            self.possible_agents = self.possible_agents[::-1]
+
+    model = ppo(make_team_env(CounterEnv))
+    model.set_env(make_team_env(CounterEnv, seed=1))
+    with pytest.raises(ValueError, match=r"Observation spaces do not match: .*names="):
+        model.set_env(make_team_env(Turned))
+
+
 AGENTS: list[Any] = [np.array(["a", "b"]), {"a": 1, "b": 2}.keys(), ("a", "b"), ["agent", "b"], [0, 1]]
 
 
@@ -545,6 +583,20 @@ def test_the_audit_accepts_a_good_game_and_raises_the_errors_of_the_game() -> No
 
     with pytest.raises(ArithmeticError):
         check_team_env(Broken())
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "is_reached"), [(500, 1000, False), (-3, -2, False), (0, 2, True), (-1, 1, True)]
+)
+def test_actions_that_a_policy_does_not_reach_are_named(low: float, high: float, is_reached: bool) -> None:
+    class Far(Game):
+        def action_space(self, agent: Any) -> spaces.Space[Any]:
+            return spaces.Box(low, high, (2,), np.float32)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_team_env(Far())
+    assert bool([one for one in caught if "scale the actions" in str(one.message)]) != is_reached
 
 
 def test_frames_are_stacked_beside_masks_in_observations() -> None:

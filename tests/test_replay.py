@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import PPO
 
 import sb3_saf
@@ -152,6 +153,18 @@ def test_other_games_are_shown_by_their_pictures_and_names(tmp_path: Path) -> No
     (run,) = data["runs"]
     assert data["agents"] == CounterEnv().possible_agents
     assert len(run["frames"]) == run["steps"] and run["frames"][0].startswith("data:image/png;base64,")
+
+
+def test_all_of_many_actions_are_shown(tmp_path: Path) -> None:
+    class Many(CounterEnv):
+        def action_space(self, agent: str) -> Any:
+            return spaces.Discrete(400)
+
+    env = sb3_saf.make_team_env(Many, n_envs=1, seed=0, render_mode="rgb_array")
+    other = PPO("MAPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
+    (run,) = data_of(replay(other, env, tmp_path / "page.html", deterministic=False, seed=1))["runs"]
+    expected = record_episodes(other.policy, env, 1, deterministic=False, seed=1).actions
+    assert unpacked(run["actions"]).tolist() == expected[: run["steps"]].tolist() and expected.max() > 255
 
 
 def test_long_episodes_are_cut(model: PPO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -503,6 +503,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 advantages = self.advantages[rows].astype(np.float64)
                 if len(advantages):
                     self.advantages[rows] = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        for array in (self.values, self.returns) if counted.any() else ():
+            # SB3 logs ``train/explained_variance`` of all rows: constants in the others leave that of the counted ones.
+            array[~counted] = array[counted].mean()
 
     def _with_values_of_teams(self, values: Array, active: npt.NDArray[np.bool_]) -> Array:
         """Return values (..., B) in which those of inactive agents are the mean over their team's active agents."""

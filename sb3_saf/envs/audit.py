@@ -83,6 +83,12 @@ class Trial:
         self._leaves = {agent: leaves_of(space) for agent, space in self.observed.items()}
         for space in self.actions.values():
             space.seed(0)
+            if isinstance(space, spaces.Box) and ((space.low >= 1) | (space.high <= -1)).any():
+                self._note(
+                    f"expected Box actions around 0, got {space}: Gaussian policies begin with mean 0 and deviation 1, "
+                    "which is clipped to the bounds, so that all first actions are equal and nothing may be learned; "
+                    "scale the actions in your environment, best from -1 to 1"
+                )
 
     def _mask_key(self, agent: Any) -> Any:
         """Find the masks among the entries of observations; note what looks like masks and is none."""

@@ -213,7 +213,7 @@ class Actor:
 
         Arguments as in :meth:`act`; the memory is not updated.
         """
-        inputs, is_batch = self._checked(observation, action_mask, memory)
+        inputs, is_batch, _ = self._checked(observation, action_mask, memory)
         self._check_is_drawn()
         if "log_probs" not in {output.name for output in self.session.get_outputs()}:
             raise ValueError("only Discrete actions have a list of probabilities: use log_prob")
@@ -224,11 +224,12 @@ class Actor:
         """
         Return the log-likelihood of actions under the mixture of the pool's policies, () or (K,) for a batch.
 
-        Arguments as in :meth:`act`; the memory is not updated.
+        Arguments as in :meth:`act`, and actions as it returns them; the memory is not updated.
         """
-        inputs, is_batch = self._checked(observation, action_mask, memory)
+        inputs, is_batch, given = self._checked(observation, action_mask, memory)
         self._check_is_drawn()
-        actions, choices = np.asarray(action), np.asarray(self.description["choices"])
+        choices = np.asarray(self.description["choices"])
+        actions = np.asarray(action) if given is None else given.row_actions(action)
         actions = actions.reshape(len(inputs["observation"]), -1)
         if choices.size and ((actions < 0) | (actions >= choices)).any():
             raise ValueError(f"expected action of at least 0 and below {choices.tolist()}, got {actions.tolist()}")
@@ -263,11 +264,13 @@ class Actor:
         outputs: list[Array] = self.session.run(names, feeds)
         return outputs
 
-    def _checked(self, observation: Any, action_mask: Any, memory: Memory | None) -> tuple[dict[str, Array], bool]:
-        """Return the inputs of the graph for an observation of any form, and whether they are a batch."""
+    def _checked(
+        self, observation: Any, action_mask: Any, memory: Memory | None
+    ) -> tuple[dict[str, Array], bool, Given | None]:
+        """Return the graph's inputs for an observation of any form, whether they are a batch, and what was given."""
         rows, given = self._rows(observation, action_mask)
         inputs, is_batch = self._inputs(rows, self._states(memory))
-        return inputs, is_batch and (given is None or given.agents is not None)
+        return inputs, is_batch and (given is None or given.agents is not None), given
 
     def _inputs(self, rows: Mapping[str, Any], states: Any) -> tuple[dict[str, Array], bool]:
         """Return the checked inputs of the graph by name, and whether they are a batch."""

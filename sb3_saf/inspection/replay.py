@@ -185,7 +185,7 @@ def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
         recording.observations[steps, rows],
         recording.pictures[steps] if game == 0 else [],
         {
-            "actions": _packed(actions, "u1") if recording.actions.ndim == 2 else None,
+            "actions": _packed(actions, "u2") if recording.actions.ndim == 2 else None,
             "probabilities": share(recording.action_probabilities, rows),
             "weights": share(recording.pool_weights, rows),
             "read": share(recording.read_attention, game),

@@ -25,7 +25,7 @@ from stable_baselines3.common.distributions import (
     make_proba_distribution,
 )
 from torch import nn
-from torch.distributions import Bernoulli, Categorical, Normal, register_kl
+from torch.distributions import Categorical, Normal, register_kl
 from torch.distributions import Distribution as TorchDistribution
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
@@ -244,7 +244,7 @@ def mixture_log_prob(
         mean, log_std = parameters.chunk(2, dim=-1)
         of_dimensions = Normal(mean, log_std.exp(), validate_args=False).log_prob(actions)
     elif isinstance(action_space, spaces.MultiBinary):
-        of_dimensions = Bernoulli(logits=parameters, validate_args=False).log_prob(actions)
+        of_dimensions = -F.softplus(parameters * (1 - 2 * actions))  # precise for large logits in exported graphs, too
     else:
         logits = split_by_dimension(action_space, parameters)
         of_actions = [
@@ -317,7 +317,7 @@ def _over_joint_actions(
 def _joint_log_probs(action_space: spaces.Space[Any], parameters: th.Tensor) -> th.Tensor:
     """Return log-probabilities (B, U, J) of every joint action under every policy, last action dimension fastest."""
     if isinstance(action_space, spaces.MultiBinary):
-        factors = list(th.stack([F.logsigmoid(-parameters), F.logsigmoid(parameters)], dim=3).unbind(dim=2))
+        factors = list(th.stack([-F.softplus(parameters), -F.softplus(-parameters)], dim=3).unbind(dim=2))
     else:
         factors = [logits.log_softmax(dim=2) for logits in split_by_dimension(action_space, parameters)]
     joint = factors[0]

@@ -334,6 +334,12 @@ class AgentConversion:
         array = array.reshape(leaf.shape) if leaf.start is None else array.reshape(leaf.shape) + leaf.start
         return array.astype(leaf.dtype)[()]
 
+    def row_action_of(self, action: Any) -> Array:
+        """Convert an action of the game to that of a row; the inverse of :meth:`game_action`."""
+        leaf, shape = self.action, self.row_action.shape
+        array = np.asarray(action).reshape(leaf.shape) - (0 if leaf.start is None else np.asarray(leaf.start))
+        return padded(array.reshape(-1), (prod(shape),)).reshape(shape)
+
     @property
     def action_bounds(self) -> tuple[Array, Array]:
         """Return the lowest and highest values of the agent's Box actions, as in rows; 0 for entries that it lacks."""
@@ -398,6 +404,19 @@ class Given(NamedTuple):
     action_masks: Array | None
     conversions: Sequence[AgentConversion] | None
     agents: list[Any] | None
+
+    def row_actions(self, action: Any) -> Array:
+        """Convert an action of the game, by agent if the observations are, to those of rows."""
+        actions = [action]
+        if self.agents is not None:
+            if not isinstance(action, Mapping) or set(action) != set(self.agents):
+                raise ValueError(
+                    f"expected {{agent: action}} of {self.agents}, the observed agents, got {action!r:.90}"
+                )
+            actions = [action[agent] for agent in self.agents]
+        if self.conversions is not None:
+            actions = [one.row_action_of(own) for one, own in zip(self.conversions, actions, strict=True)]
+        return np.stack([np.asarray(own) for own in actions])
 
     def act(
         self, predict: Callable[..., tuple[Any, Any]], state: Any, episode_start: Any, deterministic: bool

@@ -71,6 +71,16 @@ class AgentSpace(spaces.Discrete):
         self.names = None if names is None else tuple(names)
         self.conversions = None if conversions is None else tuple(conversions)
 
+    def __eq__(self, other: object) -> bool:
+        """Compare sizes, and the order of equal names: critics, and actors that read the index, depend on it."""
+        names, others = self.names, getattr(other, "names", None)
+        is_reordered = names is not None and others is not None and names != others and set(names) == set(others)
+        return super().__eq__(other) and not is_reordered
+
+    def __repr__(self) -> str:
+        """Return the size, and the names if they are known."""
+        return super().__repr__() if self.names is None else f"Discrete({self.n}, names={self.names})"
+
 
 class TerminalRow(dict[str, Any]):
     """

@@ -273,7 +273,7 @@ def episode_value(infos: Iterable[Mapping[str, Any]], key: str) -> Any:
     """
     values = [info[key] for info in infos if info.get(key) is not None]
     if key == IS_SUCCESS and values:
-        return all(bool(value) for value in values)
+        return all(bool(np.all(value)) for value in values)  # also a list of one for each agent
     return values[0] if values else None
 
 
