@@ -152,8 +152,8 @@ def make_vec_env(
     :param backend: see :func:`make_team_env`
     :param n_cpus: number of processes for the games of ``"supersuit"``
     :param stagger: see :func:`make_team_env`
-    :param params: parameters of the game; for HECOGrid the fields of :class:`~hecogrid_envs.HECOGridParams`,
-        ``render_mode`` as in :func:`hecogrid_envs.parallel_env`, and ``n_threads``, threads of ``"native"``
+    :param params: parameters of the game; for HECOGrid the fields of :class:`~hecogrid_envs.HECOGridParams`, and
+        ``render_mode`` as in :func:`hecogrid_envs.parallel_env`
     :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
     :raises ValueError: for an unknown name, backend or parameter, or a value out of range
     """
