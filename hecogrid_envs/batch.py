@@ -30,7 +30,7 @@ from hecogrid_envs.constants import STEP as STEP_AHEAD
 from hecogrid_envs.core.occupancy import arrive, plane_offset
 from hecogrid_envs.core.rng import fresh_seed, generator_word
 from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers, Games, World
-from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, whole_number
 from hecogrid_envs.state import StateMapping, check_state, state_of
 from hecogrid_envs.task import DECLARED, TaskName, check_task
 from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
@@ -222,7 +222,7 @@ class GameBatch:
         self.task: TaskName = check_task(task)
         params.check_fits(self.task)
         self.params = params
-        self.n_games = _positive("n_games", n_games)
+        self.n_games = whole_number("n_games", n_games, 1, 2**31 - 1)
         self._world = world_of(self.task, params)
         self._games = empty_games(self._world, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
@@ -383,21 +383,13 @@ class GameBatch:
 
         :return: as :meth:`observe` without its first axis
         """
-        return self._views_of_game(self._checked(game), self._view_task, self._view_shape)
+        return self._views_of_game(game, self._view_task, self._view_shape)
 
     def _views_of_game(self, game: int, task: int, shape: tuple[int, ...]) -> U8:
+        game = whole_number("game", game, 0, self.n_games - 1)
         out = np.empty(shape, dtype=np.uint8)
         self._play(task, out, first=game, end=game + 1)
         return out
-
-    def _checked(self, game: int) -> int:
-        if (
-            isinstance(game, (bool, np.bool_))
-            or not isinstance(game, (int, np.integer))
-            or not 0 <= game < self.n_games
-        ):
-            raise ValueError(f"game must be an integer from 0 to {self.n_games - 1}, got {game!r}")
-        return int(game)
 
     @property
     def rewards(self) -> npt.NDArray[np.float64]:
@@ -431,7 +423,7 @@ class GameBatch:
 
     def get_state(self, game: int = 0) -> StateMapping:
         """Copy the state of one game (see :class:`~hecogrid_envs.state.StateMapping`)."""
-        game = self._checked(game)
+        game = whole_number("game", game, 0, self.n_games - 1)
         games = self._games
         return state_of(*(each[game] for each in (games.terrain, games.x, games.y, games.direction, games.has_key)))
 
@@ -442,7 +434,7 @@ class GameBatch:
         :param mapping: see :class:`~hecogrid_envs.state.StateMapping`
         :raises ValueError: naming the first fault of an inconsistent mapping
         """
-        game = self._checked(game)
+        game = whole_number("game", game, 0, self.n_games - 1)
         state = check_state(mapping, self.params)
         games, width = self._games, self.params.grid_size
         self._seed(game, None)
@@ -487,7 +479,7 @@ class GameBatch:
         """
         state, side, width = self.get_state(game), self.params.view_size, self.params.grid_size
         n_agents, offset = self.params.n_agents, self.params.view_offset
-        codes = self._views_of_game(self._checked(game), TILES, (n_agents, side, side))
+        codes = self._views_of_game(game, TILES, (n_agents, side, side))
         agent, row, column = np.nonzero(codes != INVISIBLE)
         ahead, aside = (side - 1 - offset - row)[:, np.newaxis], (column - side // 2)[:, np.newaxis]
         facing = state["agent_dir"][agent]
@@ -496,9 +488,3 @@ class GameBatch:
         seen = np.zeros((n_agents, width, width), dtype=np.bool_)
         seen[agent[on_map], cells[on_map, 0], cells[on_map, 1]] = True
         return seen
-
-
-def _positive(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-    return int(value)
