@@ -76,8 +76,8 @@ def make_team_env(
         :mod:`sb3_saf.suites`), a module with ``parallel_env`` ("mpe2.simple_spread_v3"), a function
         ("my_package.my_module:make_env") or an id registered with PettingZoo. Or a PettingZoo ParallelEnv, a Gymnasium
         environment of several agents (:class:`GymnasiumTeam`), or a factory that returns one
-        (``simple_spread_v3.parallel_env``). An environment is copied. Agents with different spaces get equal ones
-        (:class:`EqualSpaces`)
+        (``simple_spread_v3.parallel_env``). An environment is copied. Agents with different spaces get equal ones:
+        observations are padded with zeros, and actions that an agent lacks are masked
     :param n_envs: E, parallel games
     :param seed: the run's seed, which determines the games' seeds; None for random ones. An algorithm's ``seed``
         overrides it

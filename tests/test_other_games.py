@@ -472,8 +472,6 @@ def test_pictures_that_cannot_be_told_apart_are_warned_of() -> None:
     with pytest.warns(UserWarning, match="read as plain numbers, without convolutions"):
         env = make_team_env(Showing(spaces.Dict(a=PICTURE, b=SHARES), SHARES), 2, seed=0)
     assert not read_by(env)[0]
-    with pytest.raises(ValueError, match="frame_stack would mix pictures"):
-        wrap_game(Showing(spaces.Dict(a=PICTURE, b=SHARES)), {"frame_stack": 2})
 
 
 @pytest.mark.parametrize("space", [spaces.Box(0, 255, (3,), np.float32), COUNTS, spaces.Dict(a=COUNTS, b=SHARES)])
@@ -547,11 +545,13 @@ def test_the_audit_accepts_a_good_game_and_raises_the_errors_of_the_game() -> No
         check_team_env(Broken())
 
 
-def test_frames_are_stacked_beside_masks_in_observations() -> None:
-    game = wrap_game(MaskedGame("action_mask"), {"frame_stack": 3})
-    env = make_team_env(game, seed=0)
+def test_frames_are_stacked_beside_masks_in_infos_and_not_in_observations() -> None:
+    env = make_team_env(wrap_game(MaskedGame("info:action_mask"), {"frame_stack": 3}), seed=0)
     assert env.team_spaces.own_shape == (6,) and env.team_spaces.n_masked_actions == 3
     assert evaluate_team(RandomPolicy(env, seed=0), env, 3).mean == 8
+    message = r"frame_stack expects observations that are Boxes, a has Dict\(.*\); use policy_kwargs {memory: gru}"
+    with pytest.raises(ValueError, match=message):
+        wrap_game(MaskedGame("action_mask"), {"frame_stack": 3})
 
 
 # --- turns ------------------------------------------------------------------------------------------------------------

@@ -10,9 +10,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from pettingzoo.utils import BaseParallelWrapper
 
-from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
+from sb3_saf.envs.audit import Trial, mask_error, observation_of, without_mask
 from sb3_saf.networks.encoders import Part, PartsSpace, has_pictures, picture_of, wide_integers
 from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion, Leaf, innermost, padded
 from sb3_saf.teams.rows import (
@@ -180,7 +179,7 @@ class GameReader:
             raise ValueError(f"observation of {agent} {place}: {error}") from None
 
     def mask(
-        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], agent: Any, place: str, is_needed: bool = True
+        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], agent: Any, place: str, is_needed: bool
     ) -> Array | None:
         """Return an agent's action mask, as in rows; None if it lacks one that is not needed."""
         conversion = self.conversions[agent]
@@ -195,59 +194,6 @@ class GameReader:
             return conversion.mask(given.get(key))
         except ValueError as error:
             raise mask_error(error, key, f"the {where} of {agent} {place}") from None
-
-
-class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
-    """
-    Wrapper that gives agents with different spaces equal ones, as ``make_team_env`` does for rows.
-
-    Observations: Boxes with equal numbers of axes are padded with zeros at the end of each axis; other spaces are
-    flattened to vectors by ``gymnasium.spaces.flatten`` and then padded.
-
-    Actions: Discrete spaces are extended to the largest one; MultiDiscrete spaces, also beside Discrete ones, to the
-    largest number of choices of each dimension. What an agent lacks is masked (``infos[agent]["action_mask"]``,
-    combined with the game's own masks) and refused. Boxes are padded; only the agent's own entries reach the game,
-    clipped to its bounds.
-
-    :param env: the game
-    :raises ValueError: if actions are neither all discrete nor all vectors
-    """
-
-    def __init__(self, env: AnyParallelEnv) -> None:
-        super().__init__(env)
-        self._reader = GameReader(Trial(env), float64=True)
-        self.possible_agents = list(self._reader.agents)
-
-    def observation_space(self, agent: Any) -> spaces.Space[Any]:
-        """Return the space of all agents' observations."""
-        return self._reader.rows.own
-
-    def action_space(self, agent: Any) -> spaces.Space[Any]:
-        """Return the space of all agents' actions."""
-        return self._reader.action_space
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Begin an episode (see PettingZoo)."""
-        return self._converted(*reset(self.env, seed, options))
-
-    def step(self, actions: Mapping[Any, Any]) -> tuple[Any, Any, Any, Any, Any]:
-        """Play one step (see PettingZoo)."""
-        conversions = self._reader.conversions
-        own = {agent: conversions[agent].game_action(action) for agent, action in actions.items()}
-        observations, rewards, terminations, truncations, infos = step_results(self.env, self.env.step(own))
-        own, infos = self._converted(observations, infos)
-        return own, rewards, terminations, truncations, infos
-
-    def _converted(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> tuple[Any, Any]:
-        """Return the observations and infos of observed agents, with masks, if there are any."""
-        seen = [agent for agent in self._reader.agents if observations.get(agent) is not None]
-        own = {agent: self._reader.own(observations, agent, "of EqualSpaces") for agent in seen}
-        shown = {agent: dict(info or {}) for agent, info in infos.items()}
-        for agent in seen if self._reader.rows.n_masked_actions is not None else ():
-            mask = self._reader.mask(observations, infos, agent, "of EqualSpaces", agent in self.env.agents)
-            if mask is not None:
-                shown.setdefault(agent, {})[ACTION_MASK_KEY] = mask
-        return own, shown
 
 
 # ---- spaces of rows
@@ -338,6 +284,9 @@ def _with_parts(vector: spaces.Box, pictures: tuple[Part, ...], whole: Array) ->
 def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
     """
     Return the action space of rows.
+
+    Where agents differ, Discrete spaces are extended to the largest one; MultiDiscrete spaces, also beside Discrete
+    ones, to the largest number of choices of each dimension; vectors are padded.
 
     :raises ValueError: if actions are neither all discrete nor all vectors
     """

@@ -42,8 +42,10 @@ class SuperSuitVecEnv(TeamVecEnv):
     Stable-Baselines3 or this package uses, are renamed: ``"game_episode"``, ...
 
     Dicts and Tuples of observations become one vector, as by ``gymnasium.spaces.flatten``; agents with different spaces
-    get equal ones (:class:`EqualSpaces`). Discrete and MultiDiscrete are counted from 0 in rows, whatever the ``start``
-    of the game's space. Actions of a Box of integers may be given as floats, which are rounded.
+    get equal ones: observations are padded with zeros, discrete actions that an agent lacks are masked and refused, and
+    of a vector only the agent's own entries reach the game, clipped to its bounds. Discrete and MultiDiscrete are
+    counted from 0 in rows, whatever the ``start`` of the game's space. Actions of a Box of integers may be given as
+    floats, which are rounded.
 
     ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` and ``get_images`` take and return rows, as SB3's
     callers expect, and apply to the row's game. ``env_method`` without indices therefore calls a game's method N times:
