@@ -520,7 +520,7 @@ def test_names_of_agents(agents: Any) -> None:
     assert set(model.predict(dict.fromkeys(names, ZEROS))[0]) == set(names)
 
 
-def test_float64_becomes_float32_unless_asked() -> None:
+def test_float64_becomes_float32() -> None:
     class Double(Game):
         def observation_space(self, agent: Any) -> spaces.Space[Any]:
             return spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -529,8 +529,6 @@ def test_float64_becomes_float32_unless_asked() -> None:
             return np.full(2, 1 / 3)
 
     assert make_team_env(Double).reset()["team"].dtype == np.float32
-    kept = make_team_env(Double, float64=True).reset()
-    assert kept["obs"].dtype == np.float64 and kept["obs"][0, 0] == 1 / 3
 
 
 def test_the_audit_accepts_a_good_game_and_raises_the_errors_of_the_game() -> None:

@@ -40,7 +40,6 @@ class GameReader:
     :param active: whether rows have ``"active"``
     :param action_masks: ``"auto"`` for masks if any, True to require them, False for none
     :param state: whether rows have the game's state
-    :param float64: whether observations of float64 stay so
     :raises ValueError: if actions of different agents cannot be those of one policy, or a requested signal is missing
     """
 
@@ -50,14 +49,13 @@ class GameReader:
         active: bool = False,
         action_masks: AskMasks = "auto",
         state: bool = False,
-        float64: bool = False,
     ) -> None:
         self.agents = trial.agents
         #: Warnings about the game.
         self.notes = list(trial.notes)
         observed, acted, keys = trial.observed.values(), trial.actions, trial.mask_keys
         own_spaces = [without_mask(*entry) for entry in zip(observed, keys.values(), strict=True)]
-        own = own_space(own_spaces, float64)
+        own = own_space(own_spaces)
         if not has_pictures(own) and any(_is_picture(leaf) for space in own_spaces for _, leaf in innermost(space)):
             self.notes.append(
                 "the pictures in the agents' observations are read as plain numbers, without convolutions, because "
@@ -88,7 +86,7 @@ class GameReader:
                     f"or MultiBinary, got {env} with {getattr(env, 'state_space', 'no state_space')}; leave state out, "
                     "or give the environment both"
                 )
-            self._state = Leaf.of(space), own_space([space], float64)
+            self._state = Leaf.of(space), own_space([space])
         #: The form of the rows.
         self.rows = TeamSpaces(
             own,
@@ -199,15 +197,13 @@ class GameReader:
 # ---- spaces of rows
 
 
-def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Space[Any]:
+def own_space(observed: Sequence[spaces.Space[Any]]) -> spaces.Space[Any]:
     """
     Return the space of rows' own observations.
 
     Equal spaces of fixed shape stay, counted from 0, as Stable-Baselines3 encodes and samples them whatever their
     start. Boxes with equal numbers of axes are padded to the largest; all others become vectors, as
-    ``gymnasium.spaces.flatten_space`` makes them.
-
-    :param float64: whether Boxes of float64 stay so
+    ``gymnasium.spaces.flatten_space`` makes them. float64 becomes float32, which networks read.
     """
     first = observed[0]
     are_equal = all(space == first for space in observed)
@@ -221,7 +217,7 @@ def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Sp
     else:
         vectors = [_flat_space(space) for space in observed]
         own = vectors[0] if are_equal else _common_vector(vectors)
-    if isinstance(own, spaces.Box) and own.dtype == np.float64 and not float64:
+    if isinstance(own, spaces.Box) and own.dtype == np.float64:
         with np.errstate(over="ignore"):
             return spaces.Box(own.low.astype(np.float32), own.high.astype(np.float32), dtype=np.float32)
     return own
@@ -246,11 +242,7 @@ def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
     whole = np.zeros(flat.shape, dtype=np.bool_)
     for part in boxes:
         whole[part.start : part.stop] = wide_integers(part.space).reshape(-1)
-    flat = _with_parts(flat, pictures, whole)
-    if flat.dtype == np.float64 and not any(leaf.dtype == np.float64 for leaf in leaves):
-        # Mixed integers and float32 would give float64, which takes twice the memory.
-        return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-    return flat
+    return _with_parts(flat, pictures, whole)
 
 
 def _common_box(boxes: Sequence[Any]) -> spaces.Box:
