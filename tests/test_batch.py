@@ -45,15 +45,6 @@ def test_a_game_does_not_depend_on_its_neighbours(task: str, rules: Any) -> None
     np.testing.assert_array_equal([f[4] for f in among_strangers], [f[4] for f in together])
 
 
-def test_team_together_is_team_support_where_one_agent_collects() -> None:
-    params = HECOGridParams(**{**PARAMS.__dict__, "coordination": 1})
-    actions = np.random.default_rng(0).integers(0, 7, size=(120, 7, 5))
-    games = (play(GameBatch(task, params, 7), game_seeds(5, 7), actions) for task in ("TeamSupport", "TeamTogether"))
-    support, together = ([frame[:, -1] for frame in frames] for frames in games)
-    np.testing.assert_array_equal(support, together)
-    assert np.sum(support) > 0
-
-
 def test_game_seeds_do_not_depend_on_their_number_and_never_repeat() -> None:
     assert game_seeds(3, 10)[:4] == game_seeds(3, 4)
     assert game_seeds(3, 4, first=2) == game_seeds(3, 6)[2:]
